@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random-phase multisines: which lines, how large, with which phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class Grid(Enum):
+    """Which harmonics of the band are excited.
+
+    Notes
+    -----
+    Detection lines, the harmonics left out, show nonlinear distortion: see Pintelon & Schoukens,
+    *System Identification: A Frequency Domain Approach*, 2nd ed. (2012), section 4.3.
+    """
+
+    CUSTOM = "custom"
+    FULL = "full"
+    ODD = "odd"
+    ODD_RANDOM = "odd_random"
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One realisation of a multisine, ``u(t) = sum_k a_k cos(2 pi f_k t + phi_k)``.
+
+    Attributes
+    ----------
+    harmonics : (F,) int
+        Excited lines as multiples of ``sample_rate_hz / samples_per_period``, ascending.
+    amplitude_v : (F,) float
+        Peak amplitude of each line [V].
+    phase_rad : (F,) float
+        Phase of each line [rad], cosine convention.
+    sample_rate_hz : float
+    samples_per_period : int
+    periods : int
+        How many periods of this realisation are played.
+    realisation, realisations : int
+        Index of this realisation, from 0, and how many the measurement has.
+    grid : Grid
+    seed : int
+        Seed of the phases and of the random grid.
+    random_phases : bool
+        False where phases were compressed or given: such a signal is for linear work only, never for
+        best-linear-approximation or distortion statistics.
+    measurement_id, excitation_id : int
+        What records refer to.
+    label : str
+        What is measured, for people.
+    """
+
+    harmonics: IntArray
+    amplitude_v: FloatArray
+    phase_rad: FloatArray
+    sample_rate_hz: float
+    samples_per_period: int
+    periods: int = 1
+    realisation: int = 0
+    realisations: int = 1
+    grid: Grid = Grid.CUSTOM
+    seed: int = 0
+    random_phases: bool = True
+    measurement_id: int = 0
+    excitation_id: int = 0
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("harmonics", np.int64), ("amplitude_v", float), ("phase_rad", float)):
+            array = np.array(getattr(self, name), dtype=dtype)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        _check_period(self.sample_rate_hz, self.samples_per_period)
+        _check_harmonics(self.harmonics, self.samples_per_period)
+        for name in ("amplitude_v", "phase_rad"):
+            array = getattr(self, name)
+            if array.shape != self.harmonics.shape or not np.all(np.isfinite(array)):
+                raise ValueError(
+                    f"{name}: shape {array.shape}, expected {self.harmonics.shape} finite values"
+                )
+        for name in ("periods", "realisations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: {getattr(self, name)}, expected at least 1")
+
+    @property
+    def frequency_hz(self) -> FloatArray:
+        """(F,) excited lines [Hz]."""
+        return self.harmonics * (self.sample_rate_hz / self.samples_per_period)
+
+    @property
+    def level_v(self) -> float:
+        """Root mean square of the signal [V]."""
+        return float(np.sqrt(np.sum(self.amplitude_v**2) / 2))
+
+    @property
+    def period_s(self) -> float:
+        """Length of one period [s]."""
+        return self.samples_per_period / self.sample_rate_hz
+
+    def detection_harmonics(self) -> IntArray:
+        """Harmonics inside the excited band that are not excited."""
+        band = np.arange(self.harmonics[0], self.harmonics[-1] + 1)
+        return np.setdiff1d(band, self.harmonics, assume_unique=True)
+
+    def spectrum(self) -> npt.NDArray[np.complex128]:
+        """(N // 2 + 1,) one-sided spectrum [V], ``X[k] = (1/N) sum_n u[n] exp(-j 2 pi k n / N)``."""
+        spectrum = np.zeros(self.samples_per_period // 2 + 1, complex)
+        spectrum[self.harmonics] = 0.5 * self.amplitude_v * np.exp(1j * self.phase_rad)
+        return spectrum
+
+    def period(self) -> FloatArray:
+        """(N,) samples of one period [V]; energy on the excited lines only."""
+        n = self.samples_per_period
+        return np.fft.irfft(self.spectrum() * n, n)
+
+    def crest_factor(self) -> float:
+        """Peak over root mean square of the sampled period."""
+        return float(np.max(np.abs(self.period())) / self.level_v)
+
+
+def harmonics_on_grid(
+    low: int, high: int, grid: Grid, *, seed: int = 0, block_lines: int = 4
+) -> IntArray:
+    """Harmonics from `low` to `high` (both included) that a grid excites.
+
+    Parameters
+    ----------
+    low, high : int
+        First and last harmonic of the band.
+    grid : Grid
+        ``ODD_RANDOM`` leaves out one of every `block_lines` consecutive odd harmonics; a last,
+        incomplete block is excited whole.
+    seed : int
+        Decides which lines are left out. The same seed gives the same grid, whatever the phases.
+    block_lines : int
+        Odd lines per block, N_grid.
+
+    Returns
+    -------
+    (F,) int
+
+    Raises
+    ------
+    ValueError
+        If the band is empty on this grid, or the grid has no rule.
+    """
+    if grid is Grid.CUSTOM:
+        raise ValueError("grid: custom has no rule; accepted are full, odd, odd_random")
+    lines = np.arange(low, high + 1, dtype=np.int64)
+    if grid is not Grid.FULL:
+        lines = lines[lines % 2 == 1]
+    if grid is Grid.ODD_RANDOM:
+        if block_lines < 2:
+            raise ValueError(f"block_lines: {block_lines}, expected at least 2")
+        blocks = lines.size // block_lines
+        left_out = np.random.default_rng([seed, 0]).integers(block_lines, size=blocks)
+        lines = np.delete(lines, np.arange(blocks) * block_lines + left_out)
+    if lines.size == 0:
+        raise ValueError(f"band: harmonics {low}..{high} hold no line of the {grid.value} grid")
+    return lines
+
+
+def design_multisine(
+    *,
+    sample_rate_hz: float = 50e3,
+    samples_per_period: int = 20000,
+    band_hz: tuple[float, float] = (10.0, 10e3),
+    level_v: float = 1.0,
+    scale_by: str = "rms",
+    grid: Grid = Grid.FULL,
+    block_lines: int = 4,
+    relative_amplitude: npt.ArrayLike | None = None,
+    seed: int = 0,
+    realisation: int = 0,
+    realisations: int = 1,
+    periods: int = 1,
+    measurement_id: int = 0,
+    excitation_id: int = 0,
+    label: str = "",
+) -> Excitation:
+    """Random-phase multisine over a band.
+
+    Phases are independent and uniform on [0, 2 pi), a new draw for every `realisation` of the same
+    `seed`; the grid depends on the seed alone, so that realisations excite the same lines.
+
+    Parameters
+    ----------
+    sample_rate_hz, samples_per_period
+        The lines are multiples of their ratio. Defaults give 2.5 Hz (arXiv 1805.00682).
+    band_hz : (low, high)
+        Lines in this band, ends included, are excited.
+    level_v : float
+        Root mean square of the whole signal, or its peak [V].
+    scale_by : {"rms", "peak"}
+    grid, block_lines
+        See `harmonics_on_grid`.
+    relative_amplitude : (F,) array, optional
+        Shape of the amplitude over the excited lines; flat when absent.
+    seed, realisation, realisations, periods, measurement_id, excitation_id, label
+        See `Excitation`.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    section 2.6.2 (random-phase multisine).
+    """
+    _check_period(sample_rate_hz, samples_per_period)
+    resolution_hz = sample_rate_hz / samples_per_period
+    low_hz, high_hz = band_hz
+    if not (0 < low_hz <= high_hz < sample_rate_hz / 2):
+        raise ValueError(
+            f"band_hz: {low_hz:g}..{high_hz:g}, expected 0 < low <= high < {sample_rate_hz / 2:g}"
+        )
+    if not (np.isfinite(level_v) and level_v > 0):
+        raise ValueError(f"level_v: {level_v}, expected a positive voltage")
+    if scale_by not in ("rms", "peak"):
+        raise ValueError(f"scale_by: {scale_by!r}, accepted are 'rms' and 'peak'")
+    # 1e-9: a band edge that is a line stays in the band whatever the rounding of the division
+    low = int(np.ceil(low_hz / resolution_hz - 1e-9))
+    high = int(np.floor(high_hz / resolution_hz + 1e-9))
+    harmonics = harmonics_on_grid(low, high, grid, seed=seed, block_lines=block_lines)
+    shape = np.ones(harmonics.size)
+    if relative_amplitude is not None:
+        shape = np.asarray(relative_amplitude, float)
+        if shape.shape != harmonics.shape or not np.all(shape > 0) or np.any(np.isinf(shape)):
+            raise ValueError(
+                f"relative_amplitude: shape {shape.shape}, expected {harmonics.shape} positive values"
+            )
+    phase = np.random.default_rng([seed, 1, realisation]).uniform(0, 2 * np.pi, harmonics.size)
+    unscaled = Excitation(
+        harmonics=harmonics,
+        amplitude_v=shape,
+        phase_rad=phase,
+        sample_rate_hz=float(sample_rate_hz),
+        samples_per_period=int(samples_per_period),
+        periods=periods,
+        realisation=realisation,
+        realisations=realisations,
+        grid=grid,
+        seed=seed,
+        measurement_id=measurement_id,
+        excitation_id=excitation_id,
+        label=label,
+    )
+    return scaled_to(unscaled, level_v, scale_by)
+
+
+def scaled_to(excitation: Excitation, level_v: float, scale_by: str) -> Excitation:
+    """The same signal with the given root mean square or peak [V]."""
+    present = excitation.level_v
+    if scale_by == "peak":
+        present = float(np.max(np.abs(excitation.period())))
+    return replace(excitation, amplitude_v=excitation.amplitude_v * (level_v / present))
+
+
+def _check_period(sample_rate_hz: float, samples_per_period: int) -> None:
+    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
+        raise ValueError(f"sample_rate_hz: {sample_rate_hz}, expected a positive frequency")
+    if samples_per_period < 4:
+        raise ValueError(f"samples_per_period: {samples_per_period}, expected at least 4")
+
+
+def _check_harmonics(harmonics: IntArray, samples_per_period: int) -> None:
+    if harmonics.ndim != 1 or harmonics.size == 0:
+        raise ValueError(f"harmonics: shape {harmonics.shape}, expected (F,) with F >= 1")
+    last = (samples_per_period - 1) // 2
+    if harmonics[0] < 1 or harmonics[-1] > last or np.any(np.diff(harmonics) < 1):
+        raise ValueError(
+            f"harmonics: {harmonics[0]}..{harmonics[-1]}, expected ascending, from 1 to {last}"
+        )
