@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target that needs something sets it up first; what is there already is left alone.
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint setup lock clean
+
+help: ## Show this list
+	@echo "make TARGET [ARGS='...'] [PYTHON=python3.x]"
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1\t\2/p' $(firstword $(MAKEFILE_LIST))
+
+demo: setup ## Run the demonstration on the simulated bench; ARGS go to `tactile_resonance demo`
+	@tools/run.sh tactile_resonance demo $(ARGS)
+
+test: setup ## Run all tests with coverage; ARGS go to pytest
+	@tools/run.sh python -m pytest --cov --cov-report=term:skip-covered $(ARGS)
+
+lint: setup ## Check style (ruff) and types of the core (mypy)
+	@env -u PYTHONPATH .venv/bin/python -m ruff check
+	@env -u PYTHONPATH .venv/bin/python -m mypy
+
+setup: ## Make .venv and build the messages, where not done yet
+	@python=$$(tools/find_python.sh) && "$$python" -E -s -S tools/bootstrap.py
+
+lock: ## Renew requirements.lock from requirements.in and requirements-ros.in
+	@tools/lock.sh
+
+clean: ## Remove everything that the other targets made, the environment included
+	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf tactile_resonance.egg-info
+	find tactile_resonance test benchmarks tools launch -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Python metadata: the version comes from package.xml, the commands are listed here and nowhere else.
+
+``pip install .`` uses it for the core without ROS; CMakeLists.txt uses it for the scripts that ROS 2 runs.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from setuptools import find_namespace_packages, setup
+
+NAME = "tactile_resonance"
+HERE = Path(__file__).resolve().parent
+NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+
+manifest = ElementTree.parse(HERE / "package.xml").getroot()
+
+
+def shared(folder):
+    """Where setuptools installs each file of a folder: share/<name>/<folder>, as ROS 2 does."""
+    grouped = {}
+    for path in sorted((HERE / folder).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            relative = path.relative_to(HERE)
+            grouped.setdefault(f"share/{NAME}/{relative.parent.as_posix()}", []).append(relative.as_posix())
+    return list(grouped.items())
+
+
+setup(
+    name=NAME,
+    version=manifest.findtext("version"),
+    description=" ".join(manifest.findtext("description").split()),
+    license="Apache-2.0",
+    author=manifest.findtext("maintainer"),
+    author_email=manifest.find("maintainer").get("email"),
+    packages=find_namespace_packages(include=[NAME, f"{NAME}.*"], exclude=["*.__pycache__"]),
+    package_data={"": ["py.typed", "*.css", "*.html", "*.js", "*.json", "*.yaml"]},
+    data_files=shared("config"),
+    python_requires=">=3.10,<3.14",
+    install_requires=["numpy>=1.24,<3", "scipy>=1.10,<2", "matplotlib>=3.6,<4", "PyYAML>=6,<7", "tqdm>=4.60,<5"],
+    entry_points={
+        "console_scripts": [
+            f"{NAME} = {NAME}.cli:main",
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+        ]
+    },
+    zip_safe=False,
+)

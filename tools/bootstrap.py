@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Set up everything that `make demo` and `make test` need, and nothing twice.
+
+Run by the interpreter that tools/find_python.sh names, with the standard library alone. A stamp is
+written into .venv and into install/ once that part is complete and names all it was made from;
+without its stamp a part is made anew. So an interrupted set-up is resumed, and a moved or updated
+repository is noticed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import build
+import packages
+from console import LOGS, ROOT, SetupError, last_lines
+
+Stamp = dict[str, str | None]
+
+TOOLS = ROOT / "tools"
+THIS_PYTHON = f"{sys.version.split()[0]} {sys.executable}"
+PACKAGES_STAMP = packages.VENV / ".stamp.json"
+BUILD_STAMP = build.INSTALL / ".stamp.json"
+
+
+def main() -> int:
+    """Bring .venv and install/ up to date."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    LOGS.mkdir(exist_ok=True)
+    with (LOGS / "setup.lock").open("w") as lock:
+        os.set_inheritable(lock.fileno(), True)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print("-- waiting for another set-up of this repository to end")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        set_up()
+    return 0
+
+
+def set_up() -> None:
+    """Make what is missing or out of date: packages first, then the build."""
+    ros = packages.sourced_ros()
+    packages_key = wanted_packages(ros)
+    last = read(PACKAGES_STAMP)
+    if not ros and not os.environ.get("PYTHON"):
+        # A working .venv stays as it is when another Python has come first on PATH meanwhile.
+        packages_key["python"] = last.get("python", packages_key["python"])
+    packages_fit = last == packages_key and runs(packages.PYTHON)
+    if not packages_fit:
+        packages_key["python"] = THIS_PYTHON
+    build_key = wanted_build(packages_key)
+    built = read(BUILD_STAMP) if packages_fit and build.COLCON_BUILD.is_dir() else {}
+    if built == build_key:
+        return
+    build.check_tools()
+    if not packages_fit:
+        PACKAGES_STAMP.unlink(missing_ok=True)
+        packages.make(ros)
+        write(PACKAGES_STAMP, packages_key)
+    BUILD_STAMP.unlink(missing_ok=True)
+    build.build(anew=built.get("base") != build_key["base"])
+    write(BUILD_STAMP, build_key)
+
+
+def wanted_packages(ros: str | None) -> Stamp:
+    """What .venv depends on: its place (paths are baked in), Python, ROS 2, lock and recipe."""
+    return {
+        "root": str(ROOT),
+        "python": THIS_PYTHON,
+        "ros": ros,
+        "lock": contents([packages.LOCK, packages.ROS_FREE] if ros else [packages.LOCK]),
+        "recipe": contents([TOOLS / "packages.py"]),
+    }
+
+
+def wanted_build(packages_key: Stamp) -> Stamp:
+    """What install/ depends on.
+
+    `base` is what asks for a new build, `update` what another run of colcon takes in.
+    """
+    interfaces = files(build.INTERFACES)
+    named = ("CMakeLists.txt", "package.xml", "tools/build.py", "tools/environment.sh")
+    recipe = contents(ROOT / name for name in named)
+    changing = contents([*interfaces, ROOT / "setup.py"])
+    return {
+        "base": digest([json.dumps(packages_key), *map(str, interfaces), recipe]),
+        "update": digest([changing, *map(str, files(build.INSTALLED))]),
+    }
+
+
+def files(folders: Iterable[str]) -> list[Path]:
+    """All files in some folders of the repository, less what Python and editors leave there."""
+    found = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
+    litter = ("~", ".swp", ".pyc")
+    return sorted(path for path in found if not path.name.endswith(litter))
+
+
+def contents(paths: Iterable[Path]) -> str:
+    """One hash of the contents of files."""
+    return digest(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+
+
+def digest(parts: Iterable[str]) -> str:
+    """One hash of several texts."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def runs(python: Path) -> bool:
+    """Whether an interpreter works: the one behind a virtual environment can go away."""
+    try:
+        return subprocess.run([python, "-E", "-S", "-c", ""], check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def read(stamp: Path) -> Stamp:
+    """A stamp, empty if there is none."""
+    return json.loads(stamp.read_text()) if stamp.exists() else {}
+
+
+def write(stamp: Path, key: Stamp) -> None:
+    """Write a stamp whole or not at all."""
+    partial = stamp.with_suffix(".partial")
+    partial.write_text(json.dumps(key))
+    partial.replace(stamp)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except SetupError as error:
+        if error.log:
+            print(last_lines(error.log), file=sys.stderr)
+            print(f"   (all of it: {error.log.relative_to(ROOT)})", file=sys.stderr)
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("interrupted: run the same command again to go on", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The colcon build of the messages and commands into build/ and install/."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+from console import LOGS, ROOT, SetupError, run, step
+from packages import PYTHON
+
+BUILD = ROOT / "build"
+COLCON_BUILD = BUILD / "tactile_resonance"
+INSTALL = ROOT / "install"
+INTERFACES = ("msg", "srv", "action")
+INSTALLED = ("tactile_resonance", "config", "launch")
+
+# What cmake looks for, in its order.
+_COMPILERS = {
+    "C": ("CC", ("cc", "gcc", "clang"), "gcc"),
+    "C++": ("CXX", ("c++", "g++", "clang++"), "g++"),
+}
+_PROBE = """
+#include <Python.h>
+#include <string>
+int main() { return static_cast<int>(std::string().size()); }
+"""
+
+
+def check_tools() -> None:
+    """Find out before anything is installed whether messages can be compiled here."""
+    if not shutil.which("make"):
+        raise SetupError("make is missing: apt install make")
+    compiler = [find_compiler(language) for language in _COMPILERS][-1]
+    probe = BUILD / "probe"
+    probe.mkdir(parents=True, exist_ok=True)
+    source = probe / "probe.cpp"
+    source.write_text(_PROBE)
+    run(
+        [compiler, "-I", sysconfig.get_path("include"), source, "-o", probe / "probe"],
+        "compiler.log",
+        f"{compiler} cannot compile a program of one line: apt install g++ "
+        f"python{sys.version_info.major}.{sys.version_info.minor}-dev",
+    )
+
+
+def find_compiler(language: str) -> str:
+    """Path of the compiler that cmake will take."""
+    variable, names, package = _COMPILERS[language]
+    named = os.environ.get(variable)
+    for name in [shlex.split(named)[0]] if named else names:
+        if path := shutil.which(name):
+            return path
+    looked_for = f"${variable}={named}" if named else ", ".join(names)
+    raise SetupError(f"no {language} compiler found ({looked_for}): apt install {package}")
+
+
+def build(anew: bool) -> None:
+    """Build and install with colcon: `anew` from nothing, else on top of the last build."""
+    if anew:
+        shutil.rmtree(COLCON_BUILD, ignore_errors=True)
+        shutil.rmtree(INSTALL, ignore_errors=True)
+    with step("building messages and commands" + (" (about a minute)" if anew else "")):
+        colcon = ["colcon", "--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
+        # Python files are linked, so that what is edited in the source tree is what runs.
+        layout = ["--merge-install", "--symlink-install"]
+        cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"]
+        failure = "the messages could not be built"
+        run([*colcon, *layout, *cmake], "build.log", failure, _environment())
+        trial = ["python", "-c", "from tactile_resonance.msg import FRF; FRF()"]
+        failure = "the messages were built but cannot be imported"
+        run([ROOT / "tools" / "run.sh", *trial], "import.log", failure)
+
+
+def _environment() -> dict[str, str]:
+    """What tools/environment.sh makes of ours, less what would reach into the build."""
+    script = f'root={shlex.quote(str(ROOT))}; . "$root/tools/environment.sh"; exec env -0'
+    text = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout
+    env = dict(line.split("=", 1) for line in text.split("\0") if line)
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "CMAKE_GENERATOR", "DESTDIR"):
+        env.pop(name, None)
+    # The user's own colcon defaults (layout, build type, arguments) are for their workspaces.
+    return env | {"COLCON_HOME": str(BUILD / "colcon")}
