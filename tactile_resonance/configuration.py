@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the shared files (``config/``, ``launch/`` ...) are, in a source tree or installed."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE_NAME = "tactile_resonance"
+
+
+def share_path(relative: str | Path) -> Path:
+    """Return the path of a shared file or directory, e.g. ``share_path("config/tissues.yaml")``.
+
+    Looked for, in this order: beside the package in the source tree; in
+    ``share/tactile_resonance`` of every prefix in the environment variable ``AMENT_PREFIX_PATH``
+    (the ament index, read without importing ament); in ``share/tactile_resonance`` of
+    ``sys.prefix``.
+
+    Parameters
+    ----------
+    relative : str or Path
+        Path relative to the share directory; must not be absolute nor contain ``..``.
+
+    Raises
+    ------
+    ValueError
+        If `relative` is absolute or climbs out of the share directory.
+    FileNotFoundError
+        If no candidate exists; the message lists every place looked at.
+    """
+    relative = Path(relative)
+    if relative.is_absolute() or ".." in relative.parts:
+        raise ValueError(
+            f"relative: got {str(relative)!r}; accepted is a path inside the share directory, "
+            "such as 'config/tissues.yaml'"
+        )
+    candidates = [root / relative for root in _share_roots()]
+    for candidate in candidates:
+        if candidate.exists():
+            return candidate
+    places = "\n  ".join(str(candidate) for candidate in candidates)
+    raise FileNotFoundError(f"shared file {str(relative)!r} not found; looked at:\n  {places}")
+
+
+def _share_roots() -> Iterator[Path]:
+    yield Path(__file__).resolve().parent.parent
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix:
+            yield Path(prefix) / "share" / PACKAGE_NAME
+    yield Path(sys.prefix) / "share" / PACKAGE_NAME

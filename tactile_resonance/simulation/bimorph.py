@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bimorph sensor coupled to what it touches: exact poles, zeros, residues and response.
+
+Equations of motion (q modal coordinates, w tip deflection, v strain voltage, z_j Prony states):
+
+- ``q_i'' + 2 zeta w_i q_i' + w_i^2 q_i = chi_i (Ua - Us) - phi_i(L) f_c``, ``w = sum phi_i(L) q_i``
+- ``f_c = kinf w + sum k_j (w - z_j) + c w' + m w''``, ``tau_j z_j' = w - z_j``
+- ``Us = v + gamma Ua``, ``v' = sum chi_i q_i' / Ct - Us / (R Ct)``
+
+Actuator and sensor layer are collocated. Piezoelectric beam equations: Erturk & Inman,
+*Piezoelectric Energy Harvesting* (2011), ch. 3; here one layer drives and the other senses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tactile_resonance.simulation.beam import BeamModes, sensor_modes
+from tactile_resonance.simulation.contact import Contact
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.modal import ComplexArray, FloatArray, PoleResidueModel
+from tactile_resonance.simulation.parameters import SensorParameters
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One resonance: the pole with positive imaginary part, and its residue in G."""
+
+    pole_rad_s: complex
+    residue_rad_s: complex
+
+    @property
+    def f0_hz(self) -> float:
+        """Undamped natural frequency |pole| / 2 pi [Hz]."""
+        return abs(self.pole_rad_s) / (2 * np.pi)
+
+    @property
+    def damping_ratio(self) -> float:
+        """``-Re(pole) / |pole|``."""
+        return -self.pole_rad_s.real / abs(self.pole_rad_s)
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledBimorph:
+    """The linear sensor, in air (`contact` None) or on tissue. G = Us / Ua.
+
+    Attributes
+    ----------
+    beam : BeamModes
+    input_resistance_ohm : float
+    feedthrough : float
+        gamma, the limit of G at infinite frequency.
+    contact : Contact or None
+    """
+
+    beam: BeamModes
+    input_resistance_ohm: float
+    feedthrough: float
+    contact: Contact | None
+
+    @cached_property
+    def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """(A (N, N), B (N,), C (N,), D) from actuator voltage to sensor voltage.
+
+        States ``w_i q_i``, ``q_i'``, ``sqrt(Ct) v``, ``sqrt(k_j) z_j``: their squares are energies,
+        which keeps the eigenvalue problem well conditioned.
+        """
+        beam, contact = self.beam, self.contact
+        natural, phi, chi = beam.natural_rad_s, beam.tip_deflection, beam.coupling  # (n,) each
+        n = natural.size
+        stiffness = np.zeros(0) if contact is None else contact.prony_stiffness_n_per_m  # (j,)
+        size = 2 * n + 1 + stiffness.size
+        q, dq, v, z = slice(0, n), slice(n, 2 * n), 2 * n, slice(2 * n + 1, size)
+        root_c = np.sqrt(beam.capacitance_f)
+        leak = 1 / (self.input_resistance_ohm * beam.capacitance_f)
+
+        a, b, c = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+        a[q, dq] = np.diag(natural)
+        a[dq, q] = -np.diag(natural)
+        a[dq, dq] = -np.diag(2 * beam.damping_ratio * natural)
+        a[dq, v] = -chi / root_c
+        b[dq] = chi * (1 - self.feedthrough)
+        a[v, dq] = chi / root_c
+        a[v, v] = -leak
+        b[v] = -self.feedthrough * leak * root_c
+        c[v] = 1 / root_c
+        if contact is not None:
+            root_k = np.sqrt(stiffness)
+            rate = 1 / np.asarray(contact.tissue.prony_times_s)  # (j,)
+            glassy = contact.equilibrium_stiffness_n_per_m + stiffness.sum()
+            a[dq, q] -= glassy * np.outer(phi, phi / natural)
+            a[dq, z] = np.outer(phi, root_k)
+            a[dq, dq] -= contact.radiation_damping_ns_per_m * np.outer(phi, phi)
+            a[z, q] = np.outer(rate * root_k, phi / natural)
+            a[z, z] = -np.diag(rate)
+            # radiation mass: M = I + m phi phi^T, inverted by Sherman-Morrison
+            mass = contact.radiation_mass_kg
+            share = mass / (1 + mass * (phi @ phi))
+            a[dq] -= share * np.outer(phi, phi @ a[dq])
+            b[dq] -= share * phi * (phi @ b[dq])
+        return a, b, c, self.feedthrough
+
+    @cached_property
+    def _expansion(self) -> tuple[ComplexArray, ComplexArray]:
+        """All poles and residues, sorted by imaginary, then real part."""
+        a, b, c, _ = self.state_space
+        poles, vectors = np.linalg.eig(a)
+        residues = (c @ vectors) * np.linalg.solve(vectors, b.astype(complex))
+        order = np.lexsort((poles.real, poles.imag))
+        return poles[order].astype(complex), residues[order]
+
+    @property
+    def poles_rad_s(self) -> ComplexArray:
+        """All poles [rad/s], shape (N,), conjugates included, by imaginary, then real part."""
+        return self._expansion[0]
+
+    @property
+    def residues_rad_s(self) -> ComplexArray:
+        """Residues of G at `poles_rad_s`, ``G = gamma + sum r_k / (s - p_k)`` [V/V rad/s]."""
+        return self._expansion[1]
+
+    @cached_property
+    def zeros_rad_s(self) -> ComplexArray:
+        """All zeros of G [rad/s], shape (N,), sorted like the poles; one is at the origin."""
+        a, b, c, d = self.state_space
+        zeros = np.linalg.eigvals(a - np.outer(b, c) / d).astype(complex)
+        return zeros[np.lexsort((zeros.real, zeros.imag))]
+
+    @cached_property
+    def modal(self) -> PoleResidueModel:
+        """The system in poles and residues, poles of the upper half plane and the real axis."""
+        keep = self.poles_rad_s.imag >= 0
+        return PoleResidueModel(self.poles_rad_s[keep], self.residues_rad_s[keep], self.feedthrough)
+
+    def response(self, s_rad_s: ArrayLike) -> ComplexArray:
+        """Return G(s) at complex s [rad/s] in closed form, independent of the state space.
+
+        At s = 0, G = 0 is returned (the input resistance discharges the sensing layer).
+        """
+        s = np.asarray(s_rad_s, dtype=complex)
+        at_rest = s == 0
+        s = np.where(at_rest, 1.0, s)
+        strain, loaded, _ = self._loop(s)
+        return np.where(at_rest, 0.0, (strain + self.feedthrough) / loaded)
+
+    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Return G(j 2 pi f), of the shape of `frequency_hz`, in closed form."""
+        return self.response(2j * np.pi * np.asarray(frequency_hz, dtype=float))
+
+    def characteristic(self, s_rad_s: ArrayLike) -> ComplexArray:
+        """Return the characteristic polynomial at complex s [rad/s], up to a constant factor.
+
+        ``(1 + k*(s) H_tip(s)) (1 + alpha(s) / Ct + 1 / (s R Ct))`` - a rank-one change of the free
+        beam by the tissue, another by the electric load - times the denominators of the uncoupled
+        parts, so that it is zero exactly at the poles and finite everywhere.
+        """
+        s = np.asarray(s_rad_s, dtype=complex)
+        _, loaded, touched = self._loop(s)
+        relative = s[..., None] / self.beam.natural_rad_s
+        uncoupled = relative**2 + 2 * self.beam.damping_ratio * relative + 1  # (..., n)
+        value = loaded * touched * s * np.prod(uncoupled, axis=-1)
+        if self.contact is not None:
+            times = np.asarray(self.contact.tissue.prony_times_s)
+            value = value * np.prod(1 + s[..., None] * times, axis=-1)
+        return np.asarray(value)
+
+    def _loop(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return ``alpha/Ct``, ``1 + alpha/Ct + 1/(s R Ct)`` and ``1 + k* H_tip`` at s != 0."""
+        beam = self.beam
+        natural, phi, chi = beam.natural_rad_s, beam.tip_deflection, beam.coupling
+        ss = s[..., None]
+        modal = 1 / (ss**2 + 2 * beam.damping_ratio * natural * ss + natural**2)  # (..., n)
+        charge, cross, receptance = modal @ chi**2, modal @ (chi * phi), modal @ phi**2
+        k = np.zeros_like(s) if self.contact is None else self.contact.dynamic_stiffness(s)
+        touched = 1 + k * receptance
+        strain = (charge - cross**2 * k / touched) / beam.capacitance_f
+        leak = 1 / (s * self.input_resistance_ohm * beam.capacitance_f)
+        return strain, 1 + strain + leak, touched
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """All resonances, by natural frequency."""
+        upper = self.poles_rad_s.imag > 0
+        pairs = zip(self.poles_rad_s[upper], self.residues_rad_s[upper], strict=True)
+        modes = [Mode(complex(pole), complex(residue)) for pole, residue in pairs]
+        return tuple(sorted(modes, key=lambda mode: mode.f0_hz))
+
+    def mode_near(self, frequency_hz: float) -> Mode:
+        """Return the resonance whose natural frequency is nearest to `frequency_hz`."""
+        require(bool(frequency_hz > 0), "frequency_hz", frequency_hz, "a number above 0")
+        return min(self.modes, key=lambda mode: abs(mode.f0_hz - frequency_hz))
+
+
+def couple(sensor: SensorParameters, contact: Contact | None) -> CoupledBimorph:
+    """Return the linear sensor in air (`contact` None) or on tissue."""
+    electric = sensor.electric
+    return CoupledBimorph(
+        sensor_modes(sensor), electric.input_resistance_ohm, electric.feedthrough, contact
+    )
+
+
+def refine_pole(
+    sensor: CoupledBimorph, start_rad_s: complex, *, tolerance: float = 1e-13
+) -> complex:
+    """Return the root of the characteristic function next to a start value (secant method).
+
+    Independent of the eigenvalues of the state matrix, hence a check of them.
+
+    Raises
+    ------
+    RuntimeError
+        If the search does not converge.
+    """
+    s0, s1 = start_rad_s, start_rad_s * (1 + 1e-6)
+    f0, f1 = (complex(sensor.characteristic(s)) for s in (s0, s1))
+    for _ in range(100):
+        if f1 == f0 or abs(s1 - s0) <= tolerance * abs(s1):
+            return s1
+        s0, s1, f0 = s1, s1 - f1 * (s1 - s0) / (f1 - f0), f1
+        f1 = complex(sensor.characteristic(s1))
+    raise RuntimeError(f"no pole found from {start_rad_s!r} in 100 steps")

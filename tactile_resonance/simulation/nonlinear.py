@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sensor with a static nonlinearity in its drive, in steady state and from rest.
+
+The strain dynamics S (the linear sensor without its feedthrough) are driven by
+``u + a2 u^2 + a3 u^3 + g2 s^2 + g3 s^3``, s the strain voltage; ``Us = s + gamma u``.
+What depends on u alone is periodic and treated exactly, as further lines. What depends on s is
+found by fixed-point (Picard) iteration, over the period in steady state, and window by window when
+the record starts from rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.lines import Lines, sample_period
+from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
+from tactile_resonance.simulation.parameters import NonlinearParameters
+from tactile_resonance.simulation.response import ResponseStream
+from tactile_resonance.simulation.volterra import WindowKernel
+
+# The cube of a signal reaches three times its highest line; with four times the sample rate no
+# product of the drive folds back into the band of the drive.
+OVERSAMPLING = 4
+WINDOW = 512  # fine samples per window: short, so that the iteration contracts fast
+TOLERANCE = 1e-13
+
+
+class DriveTooStrongError(ValueError):
+    """No response of the nonlinear sensor to this drive was found; it may well have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearSteadyState:
+    """One period in steady state.
+
+    Attributes
+    ----------
+    sensor_v : (samples_per_period,) array
+        Sensor voltage Us [V].
+    strain_v : (samples_per_period,) array
+        Strain voltage s [V].
+    iterations : int
+        Fixed-point iterations needed.
+    """
+
+    sensor_v: FloatArray
+    strain_v: FloatArray
+    iterations: int
+
+
+def effective_drive(lines: Lines, nonlinear: NonlinearParameters) -> Lines:
+    """Return ``u + a2 u^2 + a3 u^3`` as lines on a grid `OVERSAMPLING` times as fine."""
+    fine = lines.resampled(OVERSAMPLING)
+    a2, a3 = nonlinear.actuator_quadratic_per_v, nonlinear.actuator_cubic_per_v2
+    if a2 == 0.0 and a3 == 0.0:
+        return fine
+    u = sample_period(fine)
+    spectrum = scipy.fft.rfft(u + a2 * u**2 + a3 * u**3)
+    highest = (3 if a3 else 2) * int(lines.harmonics[-1])  # below samples / 2
+    phasor = spectrum[: highest + 1] * (2 / u.size)
+    phasor[0] /= 2
+    return Lines(np.arange(highest + 1), phasor, fine.sample_rate_hz, fine.samples_per_period)
+
+
+def strain_term(strain_v: FloatArray, nonlinear: NonlinearParameters) -> FloatArray:
+    """Return ``g2 s^2 + g3 s^3`` [V]."""
+    g2, g3 = nonlinear.strain_quadratic_per_v, nonlinear.strain_cubic_per_v2
+    return (g2 + g3 * strain_v) * strain_v * strain_v
+
+
+def nonlinear_steady_state(
+    model: PoleResidueModel,
+    nonlinear: NonlinearParameters,
+    lines: Lines,
+    *,
+    max_iterations: int = 200,
+) -> NonlinearSteadyState:
+    """Return one period of the nonlinear sensor in steady state.
+
+    Parameters
+    ----------
+    model : PoleResidueModel
+        The linear sensor, feedthrough as direct term.
+    nonlinear : NonlinearParameters
+    lines : Lines
+        The drive.
+
+    Raises
+    ------
+    DriveTooStrongError
+        If the iteration does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance,
+        exceeds 1, as for a narrow-band drive of 4 V rms.
+    """
+    drive = effective_drive(lines, nonlinear)
+    count = drive.samples_per_period
+    frequency_hz = np.arange(count // 2 + 1) * (drive.sample_rate_hz / count)
+    response = model.without_direct_term().frequency_response(frequency_hz)
+    response[-1] = 0.0  # half the sample rate has no phase
+    linear = sample_period(drive, response[drive.harmonics])
+    strain = linear
+    scale = float(np.abs(linear).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        for iteration in range(1, max_iterations + 1):
+            feedback = response * scipy.fft.rfft(strain_term(strain, nonlinear))
+            following = linear + scipy.fft.irfft(feedback, count)
+            change = float(np.abs(following - strain).max())
+            strain = following
+            if change <= TOLERANCE * scale:
+                coarse = strain[::OVERSAMPLING]
+                sensor = coarse + model.direct * sample_period(lines)
+                return NonlinearSteadyState(sensor, coarse, iteration)
+            if not change < 1e3 * scale:
+                break
+    raise DriveTooStrongError(_refusal(lines, f"no steady state in {iteration} iterations"))
+
+
+class NonlinearStream:
+    """The nonlinear sensor's response, from rest, to one excitation after another.
+
+    Counterpart of `ResponseStream`, sample for sample the same when all coefficients are 0. The
+    strain term is integrated exactly for its cubic interpolation between fine samples.
+
+    Parameters
+    ----------
+    model : PoleResidueModel
+        The linear sensor, feedthrough as direct term.
+    nonlinear : NonlinearParameters
+    delay_s : float
+        As in `ResponseStream`.
+    """
+
+    def __init__(
+        self, model: PoleResidueModel, nonlinear: NonlinearParameters, *, delay_s: float = 0.0
+    ) -> None:
+        self._nonlinear = nonlinear
+        self._strain_model = model.without_direct_term()
+        self._driven = ResponseStream(self._strain_model, delay_s=delay_s)
+        nothing = np.zeros(0, dtype=complex)
+        self._through = ResponseStream(
+            PoleResidueModel(nothing, nothing, model.direct), delay_s=delay_s
+        )
+        self._drive: tuple[Lines, Lines] | None = None  # lines and their effective drive
+        self._state = np.zeros(model.poles_rad_s.size, dtype=complex)  # due to the strain term
+        self._past = np.zeros(WindowKernel.PAST)  # last values of the strain term
+        self._kernels: dict[tuple[int, float], WindowKernel] = {}
+
+    def play(self, lines: Lines, samples: int | None = None) -> FloatArray:
+        """Return the response to the next samples of an excitation, as `ResponseStream.play`.
+
+        Raises
+        ------
+        DriveTooStrongError
+            If the response grows beyond bounds.
+        """
+        samples = lines.samples_per_period if samples is None else samples
+        through = self._through.play(lines, samples)
+        if self._drive is None or not lines.same_signal(self._drive[0]):
+            self._drive = (lines, effective_drive(lines, self._nonlinear))
+        driven = self._driven.play(self._drive[1], samples * OVERSAMPLING)
+        strain = self._march(driven, lines.sample_rate_hz * OVERSAMPLING, lines)
+        return strain[::OVERSAMPLING] + through
+
+    def silence(self, samples: int, sample_rate_hz: float) -> FloatArray:
+        """Return the response over `samples` samples of zero excitation."""
+        through = self._through.silence(samples, sample_rate_hz)
+        fine_rate_hz = sample_rate_hz * OVERSAMPLING
+        driven = self._driven.silence(samples * OVERSAMPLING, fine_rate_hz)
+        return self._march(driven, fine_rate_hz, None)[::OVERSAMPLING] + through
+
+    def skip(self, lines: Lines, periods: int) -> None:
+        """Advance whole periods; a nonlinear response has to be computed all the same."""
+        require(periods >= 0, "periods", periods, "0 or above")
+        for _ in range(periods):
+            self.play(lines)
+
+    def _march(self, driven: FloatArray, rate_hz: float, lines: Lines | None) -> FloatArray:
+        """Add the feedback of the strain term to the driven strain, window by window."""
+        strain = np.empty_like(driven)
+        for begin in range(0, driven.size, WINDOW):
+            window = driven[begin : begin + WINDOW]
+            strain[begin : begin + WINDOW] = self._solve_window(window, rate_hz, lines)
+        return strain
+
+    def _solve_window(self, driven: FloatArray, rate_hz: float, lines: Lines | None) -> FloatArray:
+        kernel = self._kernel(driven.size, rate_hz)
+        known = driven + kernel.history(self._state, self._past)
+        strain = known
+        scale = float(np.abs(known).max())
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(100):
+                term = strain_term(strain, self._nonlinear)
+                following = known + kernel.convolve(term)
+                change = float(np.abs(following - strain).max())
+                strain = following
+                if change <= TOLERANCE * scale:
+                    self._state, self._past = kernel.advance(self._state, self._past, term)
+                    return strain
+                if not change < 1e3 * scale:
+                    break
+        raise DriveTooStrongError(_refusal(lines, "its response grows beyond bounds"))
+
+    def _kernel(self, size: int, rate_hz: float) -> WindowKernel:
+        key = (size, rate_hz)
+        if key not in self._kernels:
+            self._kernels[key] = WindowKernel(self._strain_model, size, 1 / rate_hz)
+        return self._kernels[key]
+
+
+def _refusal(lines: Lines | None, reason: str) -> str:
+    level = "silence after a drive"
+    if lines is not None:
+        rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
+        count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
+        level = f"{rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz"
+    return (
+        f"amplitude_v: got {level}; accepted is a drive weak enough for the sensor's nonlinearity "
+        f"({reason}); lower the level or spread it over more lines"
+    )

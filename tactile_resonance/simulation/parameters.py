@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the simulated sensor, read from ``config/sensors/bimorph.yaml``.
+
+Sources and honesty marks of the default values stand beside them in that file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.simulation.fields import (
+    known_keys,
+    read_dataclass,
+    read_yaml,
+    require,
+    section,
+)
+
+
+def _positive(owner: object, *names: str) -> None:
+    for name in names:
+        value = getattr(owner, name)
+        require(0.0 < value < float("inf"), name, value, "a number above 0")
+
+
+@dataclass(frozen=True)
+class BeamParameters:
+    """Symmetric three-layer cantilever (piezo, shim, piezo); one layer drives, the other senses."""
+
+    free_length_m: float
+    width_m: float
+    piezo_thickness_m: float
+    shim_thickness_m: float
+    piezo_modulus_pa: float
+    shim_modulus_pa: float
+    piezo_density_kg_per_m3: float
+    shim_density_kg_per_m3: float
+    d31_m_per_v: float
+    relative_permittivity_t33: float
+    modal_damping_ratio: float
+    mode_count: int
+
+    def __post_init__(self) -> None:
+        _positive(
+            self, "free_length_m", "width_m", "piezo_thickness_m", "shim_thickness_m",
+            "piezo_modulus_pa", "shim_modulus_pa", "piezo_density_kg_per_m3",
+            "shim_density_kg_per_m3", "relative_permittivity_t33",
+        )  # fmt: skip
+        require(self.d31_m_per_v != 0.0, "d31_m_per_v", self.d31_m_per_v, "a number other than 0")
+        zeta = self.modal_damping_ratio
+        require(0.0 < zeta < 1.0, "modal_damping_ratio", zeta, "above 0 and below 1")
+        require(1 <= self.mode_count <= 40, "mode_count", self.mode_count, "1 to 40")
+
+
+@dataclass(frozen=True)
+class TipParameters:
+    """Spherical tip at the free end; `mass_kg` may be 0 for a bare cantilever."""
+
+    radius_m: float
+    mass_kg: float
+
+    def __post_init__(self) -> None:
+        _positive(self, "radius_m")
+        require(self.mass_kg >= 0.0, "mass_kg", self.mass_kg, "0 or above")
+
+
+@dataclass(frozen=True)
+class ElectricParameters:
+    """Load of the sensing layer and capacitive feedthrough ``gamma = Cs / (Cp + Cs)``."""
+
+    input_resistance_ohm: float
+    feedthrough: float
+
+    def __post_init__(self) -> None:
+        _positive(self, "input_resistance_ohm")
+        require(0.0 < self.feedthrough < 1.0, "feedthrough", self.feedthrough, "above 0, below 1")
+
+
+@dataclass(frozen=True)
+class NonlinearParameters:
+    """Static nonlinearity ``u + a2 u^2 + a3 u^3 + g2 s^2 + g3 s^3``, s the strain voltage."""
+
+    actuator_cubic_per_v2: float
+    strain_cubic_per_v2: float
+    actuator_quadratic_per_v: float = 0.0
+    strain_quadratic_per_v: float = 0.0
+
+
+@dataclass(frozen=True)
+class AcquisitionParameters:
+    """Noise and converters.
+
+    Noise is white: its rms scales with the square root of half the sample rate over
+    `sensor_noise_bandwidth_hz`. The drive passes `actuator_divider` before its converter.
+    """
+
+    sensor_noise_v: float
+    sensor_noise_bandwidth_hz: float
+    adc_bits: int
+    adc_range_v: float
+    actuator_divider: float = 1.0
+
+    def __post_init__(self) -> None:
+        require(self.sensor_noise_v >= 0.0, "sensor_noise_v", self.sensor_noise_v, "0 or above")
+        _positive(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
+        require(8 <= self.adc_bits <= 31, "adc_bits", self.adc_bits, "8 to 31")
+
+    def noise_rms_v(self, sample_rate_hz: float) -> float:
+        """Return the rms of the sensor noise [V] in the full band of a sample rate."""
+        return self.sensor_noise_v * (sample_rate_hz / 2 / self.sensor_noise_bandwidth_hz) ** 0.5
+
+    @property
+    def sensor_scale_v(self) -> float:
+        """Volts per count of the sensor channel."""
+        return 2 * self.adc_range_v / 2**self.adc_bits
+
+    @property
+    def actuator_scale_v(self) -> float:
+        """Volts per count of the actuator channel, referred to the sensor's terminals."""
+        return self.sensor_scale_v * self.actuator_divider
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """Everything about the sensor that does not depend on what it touches."""
+
+    beam: BeamParameters
+    tip: TipParameters
+    electric: ElectricParameters
+    nonlinear: NonlinearParameters
+    acquisition: AcquisitionParameters
+
+
+def read_sensor(path: Path | None = None) -> SensorParameters:
+    """Read sensor parameters; without a path, those of ``config/sensors/bimorph.yaml``.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, or a field is missing, unknown or out of range.
+    """
+    path = share_path("config/sensors/bimorph.yaml") if path is None else Path(path)
+    content = read_yaml(path)
+    known_keys(content, {f.name for f in fields(SensorParameters)}, path.name)
+
+    where = path.name
+    return SensorParameters(
+        beam=read_dataclass(BeamParameters, section(content, "beam", where), f"{where}: beam"),
+        tip=read_dataclass(TipParameters, section(content, "tip", where), f"{where}: tip"),
+        electric=read_dataclass(
+            ElectricParameters, section(content, "electric", where), f"{where}: electric"
+        ),
+        nonlinear=read_dataclass(
+            NonlinearParameters, section(content, "nonlinear", where), f"{where}: nonlinear"
+        ),
+        acquisition=read_dataclass(
+            AcquisitionParameters, section(content, "acquisition", where), f"{where}: acquisition"
+        ),
+    )

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles, zeros and response of the coupled sensor, and the published table of one mode."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.simulation.bimorph import refine_pole
+
+# f0 Hz, damping ratio, Re and Im of the pole rad/s, peak dB over 200-300 Hz: computed figures of
+# the project's physics reference, one unit in the last digit each
+UNITS = np.array([0.01, 1e-4, 0.1, 0.1, 0.1])
+TABLE = {
+    None: (246.60, 0.0119, -18.5, 1549.3, -6.2),
+    "gel10": (253.83, 0.0336, -53.6, 1594.0, -15.3),
+    "gel12": (256.31, 0.0361, -58.1, 1609.4, -16.0),
+    "gel14": (259.07, 0.0390, -63.5, 1626.6, -16.8),
+    "gel16": (262.18, 0.0425, -70.0, 1645.8, -17.7),
+    "cortex": (247.99, 0.0489, -76.3, 1556.3, -18.0),
+    "white": (249.73, 0.0511, -80.1, 1567.1, -18.4),
+    "liver": (252.10, 0.0462, -73.2, 1582.3, -17.7),
+}
+
+
+@pytest.fixture(params=list(TABLE), ids=str)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def coupled(name, bench, library):
+    return bench.coupled(None if name is None else library[name])
+
+
+def test_mode_is_that_of_the_reference_table(name, coupled):
+    mode = coupled.mode_near(250.0)
+    response = coupled.frequency_response(np.linspace(200, 300, 20001))
+    found = np.array(
+        [
+            mode.f0_hz,
+            mode.damping_ratio,
+            mode.pole_rad_s.real,
+            mode.pole_rad_s.imag,
+            20 * np.log10(np.abs(response).max()),
+        ]
+    )
+    units_off = np.round(found / UNITS) - np.round(np.array(TABLE[name]) / UNITS)
+    assert np.all(np.abs(units_off) <= 1), (found, TABLE[name])
+
+
+def test_order_and_other_modes(name, coupled):
+    assert coupled.poles_rad_s.size == (21 if name is None else 27)
+    higher = [mode.f0_hz for mode in coupled.modes if mode.f0_hz > 300][:7]
+    assert higher == pytest.approx([704, 1402, 2346, 3537, 4977, 6665, 8602], rel=0.01)
+    lowest = coupled.modes[0].f0_hz
+    if name is None:
+        assert lowest == pytest.approx(38, abs=0.5)
+    elif name.startswith("gel"):
+        assert 81 <= round(lowest) <= 104
+
+
+def test_poles_are_stable_and_come_in_pairs(coupled):
+    poles = coupled.poles_rad_s
+    assert np.all(poles.real < 0)
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(poles.conj()), rtol=1e-12)
+
+
+def test_poles_equal_a_root_search(coupled):
+    poles = coupled.modal.poles_rad_s
+    found = np.array([refine_pole(coupled, complex(pole) * (1 + 1e-3)) for pole in poles])
+    np.testing.assert_allclose(found, poles, rtol=1e-9)
+
+
+def test_no_pole_is_missing(coupled):
+    # the characteristic polynomial over the product of (s - pole) is the same number everywhere
+    rng = np.random.default_rng(1)
+    s = 10 ** rng.uniform(0, 5, 50) * np.exp(1j * rng.uniform(0.1, 3.0, 50))
+    logs = np.log(coupled.characteristic(s)) - np.log(s[:, None] - coupled.poles_rad_s).sum(axis=1)
+    np.testing.assert_allclose(np.exp(logs - logs[0]), 1, rtol=1e-9)
+
+
+def test_state_space_and_residues_give_the_closed_form_response(coupled):
+    rng = np.random.default_rng(2)
+    frequency = 10 ** rng.uniform(-1, 5, 200)
+    expected = coupled.frequency_response(frequency)
+    np.testing.assert_allclose(coupled.modal.frequency_response(frequency), expected, rtol=1e-9)
+    a, b, c, d = coupled.state_space
+    for f, value in zip(frequency[:20], expected[:20], strict=True):
+        direct = c @ np.linalg.solve(2j * np.pi * f * np.eye(b.size) - a, b) + d
+        assert direct == pytest.approx(value, rel=1e-9)
+    assert complex(coupled.frequency_response(0.0)) == 0
+    assert abs(complex(coupled.modal.frequency_response(0.0))) < 1e-12
+
+
+def test_zeros_annul_the_response(coupled):
+    zeros = coupled.zeros_rad_s
+    assert np.abs(zeros).min() < 1e-6  # the input resistance drains the sensing layer
+    others = zeros[np.abs(zeros) > 1e-3]
+    near = np.abs(coupled.response(others * (1 + 1e-3)))
+    assert np.all(np.abs(coupled.response(others)) < 1e-6 * near)
+
+
+def test_collocated_poles_and_zeros_interlace_in_air(bench):
+    coupled = bench.coupled(None)
+    poles = np.sort(coupled.poles_rad_s.imag[coupled.poles_rad_s.imag > 0])
+    zeros = np.sort(coupled.zeros_rad_s.imag[coupled.zeros_rad_s.imag > 1e-3])
+    merged = np.concatenate([poles, zeros])
+    kinds = np.concatenate([np.zeros(poles.size), np.ones(zeros.size)])[np.argsort(merged)]
+    assert np.all(np.diff(kinds) != 0)
+
+
+def test_frequency_and_damping_rise_with_concentration_and_the_peak_falls(bench, library):
+    frequency = np.linspace(200, 300, 2001)
+    found = []
+    for percent in np.arange(9, 18.1, 0.5):
+        coupled = bench.coupled(library.gelatine(percent))
+        mode = coupled.mode_near(255)
+        peak = np.abs(coupled.frequency_response(frequency)).max()
+        found.append((mode.f0_hz, mode.damping_ratio, -peak))
+    assert np.all(np.diff(found, axis=0) > 0)
+
+
+def test_preload_sensitivity_is_the_published_one(bench, library):
+    low, high = (
+        bench.coupled(library["gel10"], force_n=force).mode_near(254) for force in (9.5e-3, 10.5e-3)
+    )
+    assert high.f0_hz - low.f0_hz == pytest.approx(0.22, abs=0.02)
+    assert high.damping_ratio - low.damping_ratio == pytest.approx(0.0013, abs=0.0001)
+
+
+@pytest.mark.parametrize(
+    ("name", "shift_hz", "tolerance_hz", "shift_damping"),
+    [("gel10", 0.10, 0.01, None), ("cortex", -0.73, 0.03, 0.0066)],
+)
+def test_creep_under_force_hold_moves_the_pole(
+    bench, library, name, shift_hz, tolerance_hz, shift_damping
+):
+    early, late = (
+        bench.coupled(library[name], hold_time_s=time).mode_near(250) for time in (1.0, 4.2)
+    )
+    assert late.f0_hz - early.f0_hz == pytest.approx(shift_hz, abs=tolerance_hz)
+    if shift_damping is not None:
+        found = late.damping_ratio - early.damping_ratio
+        assert found == pytest.approx(shift_damping, abs=2e-4)
+
+
+def test_ten_to_twelve_per_cent_changes_the_response_as_published(bench, library):
+    frequency = np.arange(200, 300.1, 2.5)
+    ten, twelve = (
+        bench.coupled(library[n]).frequency_response(frequency) for n in ("gel10", "gel12")
+    )
+    change = np.sqrt(np.sum(np.abs(twelve - ten) ** 2) / np.sum(np.abs(ten) ** 2))
+    assert change == pytest.approx(0.19, abs=0.01)
+
+
+def test_faint_contact_tends_to_the_free_sensor(bench, library):
+    free = bench.coupled(None).mode_near(250).pole_rad_s
+    faint = bench.coupled(library["gel10"], force_n=1e-15).mode_near(250).pole_rad_s
+    assert abs(faint - free) < 1e-3 * abs(free)
