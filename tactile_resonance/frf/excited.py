@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which harmonics an input record excites."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft, ndimage, stats
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+GAP_DB = 15.0
+"""A step this large between neighbouring sorted levels parts excited lines from distortion [dB]."""
+
+_FALSE_ALARM = 1e-4  # probability that any pure-noise line of a record passes for a signal
+_NOISE_BINS = 16  # bins wanted for the noise level at a line
+_STRAY_SHARE = 0.03  # even lines, relative to the odd ones, up to which a grid is called odd
+
+
+def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntArray:
+    """Excited harmonics of a multisine, from its input record alone.
+
+    A line is a candidate if it stands above the noise around it. The candidates, sorted by level,
+    are then cut at the first step of `gap_db` from the top: what lies below is distortion of the
+    input (generator, amplifier), not excitation. So the levels of excited lines may span any range
+    as long as no step between two neighbouring levels reaches `gap_db`. Where nearly all of these
+    lines are odd (97 %), the grid is odd, and the few even lines are interference (mains hum).
+
+    Parameters
+    ----------
+    u : (..., P, N) float
+        Input: P consecutive periods of N samples. All leading axes (realisations) excite the same
+        lines; their powers are averaged.
+    gap_db : float
+        Smallest step in level between excited lines and distortion [dB].
+
+    Returns
+    -------
+    (F,) int
+        Ascending, zero frequency and the Nyquist line never among them.
+
+    Raises
+    ------
+    ValueError
+        If samples are not finite, no line is above the noise, or, for a single period, no step of
+        `gap_db` parts lines from noise.
+
+    Notes
+    -----
+    For P >= 2 the noise level is that of the bins between harmonics, taken locally (coloured
+    noise). For P = 1 there are none: the noise level is that of the weaker half of the lines, so
+    that fewer than half of the lines up to the Nyquist frequency may be excited.
+    """
+    u = np.asarray(u)
+    if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:
+        raise ValueError(f"u: shape {u.shape}, expected (..., P, N) with N >= 4")
+    if not np.all(np.isfinite(u)):
+        raise ValueError("u: holds samples that are not finite, expected a complete record")
+    if not gap_db > 0:
+        raise ValueError(f"gap_db: {gap_db}, expected a positive step in decibels")
+    periods, samples = u.shape[-2:]
+    record = u.reshape(-1, periods * samples)  # (M, P N)
+    record = record - np.mean(record, axis=-1, keepdims=True)  # its leakage is not noise
+    spectrum = fft.rfft(record, axis=-1)  # (M, P N // 2 + 1)
+    power = np.mean(spectrum.real.astype(float) ** 2 + spectrum.imag.astype(float) ** 2, axis=0)
+    harmonics = np.arange(1, (samples - 1) // 2 + 1)  # (H,)
+    line_power = power[harmonics * periods]  # (H,)
+    records = record.shape[0]
+    threshold = (
+        _noise_threshold_single_period(line_power, records)
+        if periods == 1
+        else _noise_threshold_between(power, harmonics, periods, records)
+    )
+    candidate = line_power > threshold
+    if not np.any(candidate):
+        raise ValueError("u: no line stands above the noise, expected a multisine; give the lines")
+    level_db = 10 * np.log10(np.maximum(line_power, np.finfo(float).tiny))
+    odd = harmonics % 2 == 1
+    # an odd grid is looked for first, so that hum on an even line cannot pass for excitation
+    cut_db = _cut_level(level_db, candidate, odd, gap_db, needs_step=periods == 1)
+    if cut_db is not None:
+        excited = candidate & (level_db > cut_db)
+        if np.sum(excited & ~odd) <= _STRAY_SHARE * np.sum(excited & odd):
+            return harmonics[excited & odd].astype(np.int64)
+    cut_db = _cut_level(level_db, candidate, np.ones_like(odd), gap_db, needs_step=periods == 1)
+    if cut_db is None:
+        raise ValueError(
+            f"u: a single period, and no step of {gap_db:g} dB between excited lines and noise; "
+            "give the excited harmonics"
+        )
+    return harmonics[candidate & (level_db > cut_db)].astype(np.int64)
+
+
+def _cut_level(
+    level_db: FloatArray,
+    candidate: npt.NDArray[np.bool_],
+    among: npt.NDArray[np.bool_],
+    gap_db: float,
+    *,
+    needs_step: bool,
+) -> float | None:
+    """Middle of the first step of `gap_db` from the top [dB], among some of the lines.
+
+    Without such a step every candidate is excited (minus infinity), or, where the noise level is
+    only guessed (`needs_step`), nothing can be told (None).
+    """
+    sorted_db = -np.sort(-level_db[candidate & among])
+    if sorted_db.size == 0:
+        return None
+    if needs_step and np.any(among & ~candidate):
+        sorted_db = np.append(sorted_db, np.max(level_db[among & ~candidate]))
+    steps = np.flatnonzero(-np.diff(sorted_db) >= gap_db)
+    if steps.size:
+        return float(np.mean(sorted_db[steps[0] : steps[0] + 2]))
+    return None if needs_step else -np.inf
+
+
+def _noise_threshold_between(
+    power: FloatArray, harmonics: IntArray, periods: int, records: int
+) -> FloatArray:
+    """(H,) level that a line of noise alone hardly exceeds, from the bins between harmonics."""
+    # (H, P - 1): the bins that follow each harmonic, and as many before the first
+    first = np.concatenate([[0], harmonics]) * periods + 1
+    between = power[np.minimum(first[:, None] + np.arange(periods - 1), power.size - 1)]
+    around = -(-_NOISE_BINS // (2 * (periods - 1)))  # harmonics on either side
+    mean = np.mean(between, axis=-1)  # (H + 1,), between harmonic h and h + 1
+    # average over the `around` intervals before and after each harmonic
+    width = 2 * around
+    local = ndimage.uniform_filter1d(mean, width, mode="nearest", origin=0)[1:]
+    bins = width * (periods - 1)
+    # the ratio of two exponential means is F distributed
+    quantile = stats.f.isf(_FALSE_ALARM / harmonics.size, 2 * records, 2 * bins * records)
+    return np.asarray(quantile * local)
+
+
+def _noise_threshold_single_period(line_power: FloatArray, records: int) -> float:
+    """Level that a line of noise alone hardly exceeds, from the weaker half of the lines."""
+    # the lower quartile over all lines is the median of the weaker half; were half of the lines
+    # excited, it is still a level that noise reaches
+    noise = np.quantile(line_power, 0.25)
+    low = stats.gamma.ppf(0.25, records) / records
+    high = stats.gamma.isf(_FALSE_ALARM / line_power.size, records) / records
+    return float(noise * high / low)

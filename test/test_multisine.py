@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from tactile_resonance.multisine import Grid, design_multisine, harmonics_on_grid
+
+
+def test_default_is_the_papers_signal():
+    """10 Hz-10 kHz in steps of 2.5 Hz at 50 kHz (arXiv 1805.00682)."""
+    excitation = design_multisine()
+    assert excitation.harmonics[0] == 4
+    assert excitation.harmonics[-1] == 4000
+    assert excitation.harmonics.size == 3997
+    assert excitation.frequency_hz[0] == pytest.approx(10.0, rel=1e-15)
+
+
+@pytest.mark.parametrize("grid", [Grid.FULL, Grid.ODD, Grid.ODD_RANDOM])
+def test_energy_is_on_the_excited_lines_only(grid):
+    excitation = design_multisine(
+        sample_rate_hz=1000.0, samples_per_period=500, band_hz=(10, 300), grid=grid, seed=7
+    )
+    spectrum = np.fft.rfft(excitation.period()) / 500
+    lines = excitation.harmonics
+    others = np.delete(spectrum, lines)
+    assert np.max(np.abs(others)) < 1e-15
+    np.testing.assert_allclose(2 * np.abs(spectrum[lines]), excitation.amplitude_v, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.exp(1j * np.angle(spectrum[lines])), np.exp(1j * excitation.phase_rad), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("scale_by", "measure"), [("rms", np.std), ("peak", lambda x: max(abs(x)))])
+def test_level_is_what_was_asked_for(scale_by, measure):
+    excitation = design_multisine(level_v=2.5, scale_by=scale_by, seed=3)
+    assert measure(excitation.period()) == pytest.approx(2.5, rel=1e-12)
+
+
+def test_shaped_amplitude_keeps_its_shape():
+    shape = np.linspace(1, 3, 3997)
+    excitation = design_multisine(relative_amplitude=shape, level_v=1.0)
+    np.testing.assert_allclose(excitation.amplitude_v / excitation.amplitude_v[0], shape)
+    assert excitation.level_v == pytest.approx(1.0)
+
+
+def test_odd_random_grid_leaves_out_one_of_each_block():
+    harmonics = harmonics_on_grid(1, 799, Grid.ODD_RANDOM, seed=5, block_lines=4)
+    assert np.all(harmonics % 2 == 1)
+    per_block = np.bincount((harmonics - 1) // 8, minlength=100)
+    assert np.all(per_block == 3)
+    left_out = np.setdiff1d(np.arange(1, 800, 2), harmonics)
+    places = np.bincount(((left_out - 1) // 2) % 4, minlength=4)
+    # 100 draws of four places: beyond 25 +- 20 with a probability below 1e-5
+    assert np.all(np.abs(places - 25) < 20)
+
+
+def test_realisations_share_lines_but_not_phases_and_seeds_repeat():
+    make = dict(grid=Grid.ODD_RANDOM, seed=11, realisations=2)
+    first = design_multisine(realisation=0, **make)
+    second = design_multisine(realisation=1, **make)
+    np.testing.assert_array_equal(first.harmonics, second.harmonics)
+    assert np.max(np.abs(first.phase_rad - second.phase_rad)) > 1
+    again = design_multisine(realisation=1, **make)
+    np.testing.assert_array_equal(second.phase_rad, again.phase_rad)
+
+
+def test_phases_are_uniform():
+    """Mean of exp(j phi) over n phases has variance 1/n: here below 4.2 of its std (99.99 %)."""
+    phases = np.concatenate([design_multisine(seed=s).phase_rad for s in range(20)])
+    assert abs(np.mean(np.exp(1j * phases))) < 4.2 / np.sqrt(phases.size)
+    assert abs(np.mean(np.exp(2j * phases))) < 4.2 / np.sqrt(phases.size)
+
+
+def test_crest_factor_of_random_phases_is_near_four():
+    """Gaussian-like: about sqrt(2 ln(2 N / sqrt(...))), 3.6-4.8 for 20000 samples."""
+    factors = [design_multisine(seed=s).crest_factor() for s in range(10)]
+    assert 3.5 < np.mean(factors) < 4.6
+
+
+def test_detection_harmonics_are_those_left_out():
+    excitation = design_multisine(grid=Grid.ODD, band_hz=(10, 100))
+    np.testing.assert_array_equal(excitation.detection_harmonics() % 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"band_hz": (0.0, 100.0)}, "band_hz: 0..100"),
+        ({"band_hz": (10.0, 30e3)}, "band_hz"),
+        ({"band_hz": (10.1, 10.2)}, "hold no line"),
+        ({"level_v": 0.0}, "level_v: 0.0"),
+        ({"level_v": float("nan")}, "level_v: nan"),
+        ({"sample_rate_hz": 0.0}, "sample_rate_hz: 0.0"),
+        ({"scale_by": "mean"}, "scale_by: 'mean'"),
+        ({"relative_amplitude": np.ones(3)}, "relative_amplitude"),
+        ({"grid": Grid.CUSTOM}, "grid: custom"),
+        ({"periods": 0}, "periods: 0"),
+    ],
+)
+def test_bad_input_names_the_field(change, message):
+    with pytest.raises(ValueError, match=message):
+        design_multisine(**change)
