@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole recording to FRF and poles, through the functions the nodes use, and its JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.frf.averaging import average_periods
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.identification.band import strongest_resonance_band
+from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.recording.recording import Recording
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """FRF and poles of a recording.
+
+    Attributes
+    ----------
+    frf : FRF
+        At all excited lines.
+    poles : Poles
+    warnings : tuple of str
+        What a reader should know before relying on the figures.
+    timing_s : dict
+        Seconds per stage.
+    """
+
+    frf: FRF
+    poles: Poles
+    warnings: tuple[str, ...]
+    timing_s: dict[str, float]
+
+
+def analyse(
+    recording: Recording,
+    *,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+) -> Analysis:
+    """FRF at all excited lines, poles in a band.
+
+    Parameters
+    ----------
+    recording : Recording
+    band_hz : (low, high), optional
+        Around the strongest resonance when absent, with a warning that says which.
+    structure : ModelStructure, optional
+
+    Raises
+    ------
+    ValueError
+        If the band holds too few lines for the model.
+    """
+    structure = structure or ModelStructure()
+    warnings = []
+    start = time.perf_counter()
+    harmonics = recording.excited_harmonics
+    if harmonics is None:
+        harmonics = find_excited_harmonics(recording.u)
+        warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
+    found = time.perf_counter()
+    # two periods: none can be spared, and a transient would show in the difference between them
+    unsettled = 1 if recording.u.shape[-2] > 2 else 0
+    frf = average_periods(
+        recording.u,
+        recording.y,
+        sample_rate_hz=recording.sample_rate_hz,
+        harmonics=harmonics,
+        unsettled_periods=unsettled,
+    )
+    estimated = time.perf_counter()
+    if band_hz is None:
+        band_hz = strongest_resonance_band(frf)
+        warnings.append(
+            f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
+        )
+    poles = identify_poles(frf, band_hz, structure)
+    identified = time.perf_counter()
+    if poles.status is PolesStatus.TOO_FEW_LINES:
+        raise ValueError(f"band: {poles.message}")
+    if frf.status is not FrfStatus.OK:
+        warnings.append(f"frf: {frf.message}")
+    if poles.message:
+        warnings.append(f"poles: {poles.message}")
+    return Analysis(
+        frf,
+        poles,
+        tuple(warnings),
+        {
+            "excited_lines": found - start,
+            "frf": estimated - found,
+            "poles": identified - estimated,
+        },
+    )
+
+
+def analysis_as_json(analysis: Analysis) -> str:
+    """JSON text of an analysis, as the README describes it; NaN becomes null."""
+    frf, poles = analysis.frf, analysis.poles
+    content = {
+        "frf": {
+            "frequency_hz": frf.frequency_hz.tolist(),
+            "real": frf.g.real.tolist(),
+            "imag": frf.g.imag.tolist(),
+            "variance": _list(frf.variance),
+        },
+        "poles": [
+            {
+                "real_rad_s": float(pole.real),
+                "imag_rad_s": float(pole.imag),
+                "f0_hz": float(poles.f0_hz[k]),
+                "damping_ratio": float(poles.damping_ratio[k]),
+                "covariance": _list(None if poles.covariance is None else poles.covariance[k]),
+                "total_covariance": _list(
+                    None if poles.total_covariance is None else poles.total_covariance[k]
+                ),
+            }
+            for k, pole in enumerate(poles.poles_rad_s)
+        ],
+        "band_hz": list(poles.band_hz),
+        "lines": poles.lines,
+        "order": poles.structure.order,
+        "numerator_order": poles.structure.numerator_order,
+        "cost": _number(poles.cost),
+        "expected_cost": _number(poles.expected_cost),
+        "condition_number": _number(poles.condition_number),
+        "variance_model": poles.variance_model,
+        "status": poles.status.value,
+        "warnings": list(analysis.warnings),
+        "timing_s": analysis.timing_s,
+    }
+    return json.dumps(content, indent=1, allow_nan=False)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _list(array: npt.NDArray[np.floating] | None) -> list | None:
+    return None if array is None or not np.all(np.isfinite(array)) else array.tolist()
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

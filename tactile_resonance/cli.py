@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tactile_resonance command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+# One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they give.
+# Before numpy is imported, which reads it once.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from tactile_resonance.commands import analyze, demo  # noqa: E402
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
+    parser = argparse.ArgumentParser(
+        prog="tactile_resonance",
+        description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for command in (demo, analyze):
+        command.add_parser(commands)
+    parsed = parser.parse_args(arguments)
+    try:
+        return parsed.run(parsed)
+    except (ValueError, OSError) as error:
+        print(f"tactile_resonance: {_one_line(error)}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("tactile_resonance: interrupted", file=sys.stderr)
+        return 130
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance analyze`: FRF and poles of a recorded measurement."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.analysis import Analysis, analyse, analysis_as_json, write_whole
+from tactile_resonance.identification.result import PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.recording.files import read_recording
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "analyze",
+        help="FRF and poles of a recorded measurement",
+        description="Estimate the frequency response of a periodic record and the poles of one band of it.",
+    )
+    parser.add_argument("record", type=Path, help=".npz, .mat or .csv file")
+    parser.add_argument("--u", default="u", metavar="FIELD", help="actuator field (default: u)")
+    parser.add_argument("--y", default="y", metavar="FIELD", help="sensor field (default: y)")
+    parser.add_argument("--sample-rate", type=float, metavar="HZ", help="wins over the file's")
+    parser.add_argument("--samples-per-period", type=int, metavar="N", help="wins over the file's")
+    parser.add_argument(
+        "--periods",
+        type=int,
+        metavar="P",
+        help="use the first P periods; where the period is not known, the record has P of them",
+    )
+    parser.add_argument(
+        "--segments",
+        type=parse_segments,
+        metavar="START:STOP,...",
+        help="cut realisations out of a longer recording (samples, stop excluded)",
+    )
+    parser.add_argument(
+        "--band",
+        type=float,
+        nargs=2,
+        metavar=("LO", "HI"),
+        help="[Hz] of the fit; default: around the strongest resonance",
+    )
+    parser.add_argument(
+        "--order", type=int, default=2, help="of the denominator, two per mode (default: 2)"
+    )
+    parser.add_argument(
+        "--numerator-order",
+        type=int,
+        help="default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
+    parser.set_defaults(run=run)
+
+
+def parse_segments(text: str) -> list[tuple[int, int]]:
+    """'0:10,20:30' as [(0, 10), (20, 30)]."""
+    try:
+        pairs = [part.split(":") for part in text.split(",")]
+        return [(int(start), int(stop)) for start, stop in pairs]
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}, expected START:STOP,START:STOP,... in samples"
+        ) from None
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, analyse, then write: nothing is written unless all went well."""
+    _check_outputs(options)
+    recording = read_recording(
+        options.record,
+        u=options.u,
+        y=options.y,
+        sample_rate_hz=options.sample_rate,
+        samples_per_period=options.samples_per_period,
+        periods=options.periods,
+        segments=options.segments,
+    )
+    structure = ModelStructure.with_residual(options.order)
+    if options.numerator_order is not None:
+        structure = ModelStructure(options.order, options.numerator_order)
+    band_hz = None
+    if options.band is not None:
+        low_hz, high_hz = options.band
+        nyquist_hz = recording.sample_rate_hz / 2
+        if not 0 <= low_hz < high_hz <= nyquist_hz:
+            raise ValueError(
+                f"band: {low_hz:g} {high_hz:g}, expected 0 <= LO < HI <= {nyquist_hz:g} Hz"
+            )
+        band_hz = (low_hz, high_hz)
+    analysis = analyse(recording, band_hz=band_hz, structure=structure)
+    print(as_text(analysis))
+    if options.json:
+        write_whole(options.json, analysis_as_json(analysis).encode())
+    if options.plot:
+        # drawing libraries take half a second to load: only who wants a figure waits for it
+        from tactile_resonance.report.analysis_figure import draw_analysis
+        from tactile_resonance.report.drawing import save_figure
+
+        save_figure(draw_analysis(analysis, options.record.name), options.plot)
+    return 0
+
+
+def as_text(analysis: Analysis) -> str:
+    """What a person reads first."""
+    frf, poles = analysis.frf, analysis.poles
+    lines = [
+        f"FRF: {frf.frequency_hz.size} lines, {frf.frequency_hz[0]:g}-{frf.frequency_hz[-1]:g} Hz, "
+        f"{frf.realisations} x {frf.periods} periods, {frf.method}",
+        f"fit: {poles.lines} lines, {poles.band_hz[0]:g}-{poles.band_hz[1]:g} Hz, orders "
+        f"{poles.structure.numerator_order}/{poles.structure.order}, cost {poles.cost:.4g} "
+        f"(expected {poles.expected_cost:.4g}), variance {poles.variance_model}",
+    ]
+    for k, pole in enumerate(poles.poles_rad_s):
+        f0_std = damping_std = float("nan")
+        covariance = (
+            poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        )
+        if covariance is not None:
+            f0_std, damping_std = np.sqrt(np.diag(covariance[k]))
+        lines.append(
+            f"mode: f0 {poles.f0_hz[k]:.4f} +- {f0_std:.2g} Hz, damping ratio "
+            f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, pole {pole.real:.3f} "
+            f"+- j{pole.imag:.3f} rad/s"
+        )
+    if poles.status is not PolesStatus.OK:
+        lines.append(f"status: {poles.status.value}")
+    lines += [f"note: {warning}" for warning in analysis.warnings]
+    return "\n".join(lines)
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse an impossible output before any work is done."""
+    for name in ("json", "plot"):
+        path = getattr(options, name)
+        if path is not None and not path.parent.is_dir():
+            raise ValueError(f"{name}: {path}, expected a file in a folder that exists")
+    accepted = (".png", ".pdf", ".svg")
+    if options.plot is not None and options.plot.suffix.lower() not in accepted:
+        raise ValueError(f"plot: {options.plot}, accepted are {', '.join(accepted)}")

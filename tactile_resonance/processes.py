@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting node processes and leaving none behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+GRACE_S = 5.0
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+class NodeProcesses:
+    """Nodes of this package as processes; a context that ends them all.
+
+    Parameters
+    ----------
+    log_folder : Path
+        Receives the output of each node.
+    """
+
+    def __init__(self, log_folder: Path) -> None:
+        self._log_folder = log_folder
+        self._processes: dict[str, subprocess.Popen] = {}
+
+    def __enter__(self) -> NodeProcesses:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self, node: str, parameters: Mapping[str, object] | None = None) -> None:
+        """Start ``python -m tactile_resonance.nodes.<node>`` with parameters of its own.
+
+        The node is told to end should this process die, and does not hear the terminal's Ctrl-C: this
+        process ends it in order.
+        """
+        command = [sys.executable, "-m", f"tactile_resonance.nodes.{node}", "--ros-args"]
+        for name, value in (parameters or {}).items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ["-p", f"{name}:={text}"]
+        self._log_folder.mkdir(parents=True, exist_ok=True)
+        with (self._log_folder / f"{node}.log").open("wb") as log:
+            self._processes[node] = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+            )
+
+    def check(self) -> None:
+        """RuntimeError if a node has ended by itself, with the last line it printed."""
+        for node, process in self._processes.items():
+            if process.poll() is not None:
+                lines = (self._log_folder / f"{node}.log").read_text(errors="replace").split("\n")
+                last = next((line for line in reversed(lines) if line.strip()), "no output")
+                raise RuntimeError(
+                    f"{node} ended with exit status {process.returncode}: {last.strip()}"
+                )
+
+    def stop(self) -> None:
+        """Interrupt, and kill what has not ended within the grace period."""
+        for process in self._processes.values():
+            _signal(process, signal.SIGINT)
+        deadline = time.monotonic() + GRACE_S
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                _signal(process, signal.SIGKILL)
+                process.wait()
+        self._processes.clear()
+
+
+def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
+    """ROS_DOMAIN_ID where it is set, else one whose first discovery port nobody uses.
+
+    Ports follow the DDS interoperability wire protocol (OMG DDSI-RTPS 2.2, section 9.6.1.1): unicast
+    discovery of participant 0 listens on 7400 + 250 domain + 10.
+    """
+    if environment.get("ROS_DOMAIN_ID"):
+        return int(environment["ROS_DOMAIN_ID"])
+    first = os.getpid() % 100
+    for step in range(100):
+        domain = 1 + (first + step) % 100  # 1..100: portable, below the ephemeral ports
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", 7410 + 250 * domain))
+            except OSError:
+                continue
+        return domain
+    raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
+
+
+def _end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _signal(process: subprocess.Popen, number: int) -> None:
+    if process.poll() is None:
+        process.send_signal(number)

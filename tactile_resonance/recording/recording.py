@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole periods of both channels, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Periodic record of both channels.
+
+    Attributes
+    ----------
+    u, y : (M, P, N) float
+        Actuator and sensor [V]: M realisations of P consecutive periods of N samples.
+    sample_rate_hz : float
+    excited_harmonics : (F,) int or None
+        Multiples of ``sample_rate_hz / N``; None where the record does not say.
+    """
+
+    u: npt.NDArray[np.floating]
+    y: npt.NDArray[np.floating]
+    sample_rate_hz: float
+    excited_harmonics: npt.NDArray[np.int64] | None = None
+
+    @property
+    def resolution_hz(self) -> float:
+        """Distance of the lines [Hz]."""
+        return self.sample_rate_hz / self.u.shape[-1]
+
+
+def make_recording(
+    u: npt.ArrayLike,
+    y: npt.ArrayLike,
+    *,
+    sample_rate_hz: float,
+    samples_per_period: int | None = None,
+    periods: int | None = None,
+    segments: Sequence[tuple[int, int]] | None = None,
+    excited_harmonics: npt.ArrayLike | None = None,
+    u_name: str = "u",
+    y_name: str = "y",
+) -> Recording:
+    """Check what was read and give it the axes of a `Recording`.
+
+    Parameters
+    ----------
+    u, y : (samples,), (P, N) or (M, P, N)
+    sample_rate_hz : float
+    samples_per_period : int, optional
+        Needed for one-dimensional channels unless `periods` divides them.
+    periods : int, optional
+        How many periods to use, from the first. Where `samples_per_period` is not known: into how many
+        periods a one-dimensional channel divides.
+    segments : [(start, stop)], optional
+        Samples cut out of one-dimensional channels, one realisation each.
+    excited_harmonics : (F,) int, optional
+    u_name, y_name : str
+        What the fields are called, for messages.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+    """
+    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
+        raise ValueError(f"sample_rate_hz: {sample_rate_hz:g}, expected a positive frequency")
+    channels = [_as_samples(x, name) for x, name in ((u, u_name), (y, y_name))]
+    if channels[0].shape != channels[1].shape:
+        raise ValueError(
+            f"{y_name}: shape {channels[1].shape}, expected that of {u_name}, {channels[0].shape}"
+        )
+    if segments is not None:
+        channels = [_cut(x, segments, name) for x, name in zip(channels, (u_name, y_name))]
+    n = _period_length(channels[0].shape, samples_per_period, periods, u_name)
+    channels = [x.reshape((1,) * (3 - x.ndim) + x.shape) for x in channels]  # (M, P, N) or (M, 1, n)
+    channels = [x.reshape(x.shape[0], -1, n) for x in channels]
+    if periods is not None:
+        if not 1 <= periods <= channels[0].shape[1]:
+            raise ValueError(
+                f"periods: {periods}, accepted is 1..{channels[0].shape[1]}, the periods recorded"
+            )
+        channels = [x[:, :periods] for x in channels]
+    for x, name in zip(channels, (u_name, y_name)):
+        _check_samples(x, name)
+    realisations, used = channels[0].shape[:2]
+    if realisations < 2 and used < 2:
+        raise ValueError(
+            f"periods: {used} period of {realisations} realisation, expected at least 2 periods or "
+            "2 realisations: one alone has no covariance"
+        )
+    return Recording(
+        channels[0], channels[1], float(sample_rate_hz), _harmonics(excited_harmonics, n)
+    )
+
+
+def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name}: values of type {array.dtype}, expected real numbers [V]")
+    array = np.squeeze(array) if array.ndim == 2 and 1 in array.shape else array
+    if array.ndim not in (1, 2, 3) or array.size == 0:
+        raise ValueError(
+            f"{name}: shape {array.shape}, accepted are (samples,), (periods, samples per period) and "
+            "(realisations, periods, samples per period)"
+        )
+    return array if array.dtype.kind == "f" else array.astype(float)
+
+
+def _cut(
+    samples: npt.NDArray[np.floating], segments: Sequence[tuple[int, int]], name: str
+) -> npt.NDArray[np.floating]:
+    """(M, 1, length) one segment a realisation."""
+    if samples.ndim != 1:
+        raise ValueError(f"segments: {name} has shape {samples.shape}, expected (samples,)")
+    for start, stop in segments:
+        if not 0 <= start < stop <= samples.size:
+            raise ValueError(
+                f"segments: {start}:{stop}, expected 0 <= START < STOP <= {samples.size}"
+            )
+    lengths = {stop - start for start, stop in segments}
+    if len(lengths) != 1:
+        raise ValueError(f"segments: lengths {sorted(lengths)}, expected one length for all")
+    return np.stack([samples[start:stop] for start, stop in segments])[:, None]
+
+
+def _period_length(
+    shape: tuple[int, ...], samples_per_period: int | None, periods: int | None, name: str
+) -> int:
+    cut_in_periods = len(shape) > 1 and shape[-2] > 1
+    if samples_per_period is None:
+        if cut_in_periods:
+            return shape[-1]
+        if periods is None:
+            raise ValueError(
+                f"samples_per_period: missing, needed because {name} has shape {shape}"
+            )
+        if periods < 1 or shape[-1] % periods:
+            raise ValueError(f"periods: {periods}, expected a divisor of {shape[-1]} samples")
+        return shape[-1] // periods
+    if samples_per_period < 4:
+        raise ValueError(f"samples_per_period: {samples_per_period}, expected at least 4")
+    if cut_in_periods and shape[-1] != samples_per_period:
+        raise ValueError(
+            f"samples_per_period: {samples_per_period}, but {name} has shape {shape}: expected "
+            f"{shape[-1]}"
+        )
+    if shape[-1] % samples_per_period:
+        raise ValueError(
+            f"{name}: {shape[-1]} samples, expected a multiple of the period of "
+            f"{samples_per_period} samples"
+        )
+    return samples_per_period
+
+
+def _check_samples(samples: npt.NDArray[np.floating], name: str) -> None:
+    """Every sample finite, no realisation constant."""
+    bad = samples.size - int(np.count_nonzero(np.isfinite(samples)))
+    if bad:
+        raise ValueError(f"{name}: {bad} samples are NaN or infinite, expected finite voltages")
+    flat = np.ptp(samples, axis=(1, 2)) == 0
+    if np.any(flat):
+        raise ValueError(
+            f"{name}: constant ({samples[np.argmax(flat)].flat[0]:g} V), expected a channel that moves"
+        )
+
+
+def _harmonics(values: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
+    if values is None:
+        return None
+    array = np.asarray(values).ravel()
+    last = (n - 1) // 2
+    whole = array.dtype.kind in "iuf" and np.all(np.mod(array, 1) == 0)
+    if not whole or array.size == 0 or array.min() < 1 or array.max() > last:
+        raise ValueError(
+            f"excited_harmonics: {array[:5]}..., expected whole numbers from 1 to {last}"
+        )
+    return np.unique(array.astype(np.int64))

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the figures share: decibels, ellipses, saving, the mark on simulated results."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy import stats
+
+from tactile_resonance.analysis import write_whole
+
+SIMULATED = "simulated, not measured"
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Figure that never opens a window."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write the figure, whole or not at all; the suffix decides the format."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix.lstrip(".") or "png", dpi=150)
+    write_whole(path, buffer.getvalue())
+
+
+def decibel(power: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """10 log10 of a power; NaN where it is not positive."""
+    power = np.asarray(power, float)
+    return 10 * np.log10(np.where(power > 0, power, np.nan))
+
+
+def draw_ellipse(
+    axes: Axes,
+    centre: npt.ArrayLike,
+    covariance: npt.NDArray[np.float64],
+    probability: float = 0.95,
+    **style,
+) -> None:
+    """Ellipse that holds the truth with the given probability if errors are Gaussian.
+
+    Parameters
+    ----------
+    centre : (2,) float
+    covariance : (2, 2) float
+    """
+    radius = np.sqrt(stats.chi2.ppf(probability, 2))
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, 100)
+    circle = np.stack([np.cos(angle), np.sin(angle)])  # (2, 100)
+    points = np.asarray(centre)[:, None] + vectors @ (
+        radius * np.sqrt(np.maximum(values, 0))[:, None] * circle
+    )
+    axes.plot(*points, **style)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+import scipy.io
+
+from tactile_resonance.recording.files import read_recording
+from tactile_resonance.recording.recording import make_recording
+
+RNG = np.random.default_rng(0)
+U, Y = RNG.standard_normal((2, 24))
+
+
+def test_shapes_become_realisations_periods_samples():
+    for shape in ((24,), (4, 6), (2, 2, 6)):
+        recording = make_recording(
+            U.reshape(shape), Y.reshape(shape), sample_rate_hz=10.0, samples_per_period=6
+        )
+        np.testing.assert_array_equal(recording.u.ravel(), U)
+        assert recording.u.shape == ((2, 2, 6) if len(shape) == 3 else (1, 4, 6))
+
+
+def test_segments_become_realisations():
+    recording = make_recording(
+        U, Y, sample_rate_hz=10.0, samples_per_period=4, segments=[(1, 9), (12, 20)]
+    )
+    assert recording.u.shape == (2, 2, 4)
+    np.testing.assert_array_equal(recording.y[1].ravel(), Y[12:20])
+
+
+def test_periods_divide_or_limit():
+    divided = make_recording(U, Y, sample_rate_hz=10.0, periods=3)
+    assert divided.u.shape == (1, 3, 8)
+    limited = make_recording(U, Y, sample_rate_hz=10.0, samples_per_period=4, periods=2)
+    np.testing.assert_array_equal(limited.u.ravel(), U[:8])
+
+
+def test_single_precision_is_not_copied():
+    u, y = U.astype(np.float32), Y.astype(np.float32)
+    recording = make_recording(u, y, sample_rate_hz=10.0, samples_per_period=6)
+    assert recording.u.dtype == np.float32
+    assert np.shares_memory(recording.u, u)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sample_rate_hz": 0.0}, "sample_rate_hz: 0, expected a positive"),
+        ({"sample_rate_hz": float("nan")}, "sample_rate_hz: nan"),
+        ({"samples_per_period": 5}, "u: 24 samples, expected a multiple of the period of 5"),
+        ({"samples_per_period": 0}, "samples_per_period: 0"),
+        ({"samples_per_period": None}, "samples_per_period: missing"),
+        ({"samples_per_period": 24}, "periods: 1 period of 1 realisation"),
+        ({"samples_per_period": None, "periods": 7}, "periods: 7, expected a divisor"),
+        ({"periods": 9}, r"periods: 9, accepted is 1\.\.4"),
+        ({"segments": [(0, 30)]}, "segments: 0:30"),
+        ({"segments": [(0, 6), (6, 18)]}, r"segments: lengths \[6, 12\]"),
+        ({"y": Y[:-1]}, r"y: shape \(23,\), expected that of u"),
+        ({"y": np.where(np.arange(24) == 3, np.nan, Y)}, "y: 1 samples are NaN or infinite"),
+        ({"u": np.where(np.arange(24) == 3, np.inf, U)}, "u: 1 samples are NaN or infinite"),
+        ({"u": np.full(24, 0.5)}, r"u: constant \(0.5 V\)"),
+        ({"u": np.array(["a"] * 24)}, "u: values of type"),
+        ({"u": U * 1j}, "u: values of type complex"),
+        ({"excited_harmonics": [0, 1]}, "excited_harmonics"),
+        ({"excited_harmonics": [1.5]}, "excited_harmonics"),
+        ({"excited_harmonics": [3]}, "excited_harmonics"),
+    ],
+)
+def test_bad_input_names_field_and_value(change, message):
+    good = {"u": U, "y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}
+    with pytest.raises(ValueError, match=message):
+        make_recording(**(good | change))
+
+
+@pytest.fixture
+def fields():
+    return {"u": U, "y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}
+
+
+def test_npz_mat_and_csv_hold_the_same(tmp_path, fields):
+    np.savez(tmp_path / "a.npz", **fields)
+    scipy.io.savemat(tmp_path / "a.mat", fields)
+    table = np.column_stack([np.arange(24) / 10.0, U, Y])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,u,y", comments="")
+    for name in ("a.npz", "a.mat", "a.csv"):
+        recording = read_recording(tmp_path / name, samples_per_period=6)
+        assert recording.sample_rate_hz == pytest.approx(10.0)
+        np.testing.assert_allclose(recording.u.ravel(), U, rtol=1e-15)
+        np.testing.assert_allclose(recording.y.ravel(), Y, rtol=1e-15)
+
+
+def test_files_that_are_no_record(tmp_path, fields):
+    cases = {
+        "empty.npz": (b"", "empty file"),
+        "text.npz": (b"hello", "no .npz record"),
+        "text.mat": (b"hello world " * 50, "no .mat record"),
+        "text.csv": (b"hello\nworld\n", "no .csv record"),
+        "binary.csv": (bytes(range(256)), "no .csv record"),
+        "text.txt": (b"hello", "accepted are .npz, .mat and .csv"),
+    }
+    for name, (content, message) in cases.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            read_recording(tmp_path / name)
+    np.savez(tmp_path / "objects.npz", u=np.array([{}]), y=Y)
+    with pytest.raises(ValueError, match="no .npz record"):
+        read_recording(tmp_path / "objects.npz")
+
+
+def test_missing_fields_are_named_with_those_present(tmp_path, fields):
+    for name in ("u", "y", "sample_rate_hz", "samples_per_period"):
+        left = {key: value for key, value in fields.items() if key != name}
+        np.savez(tmp_path / "a.npz", **left)
+        with pytest.raises(ValueError, match=name):
+            read_recording(tmp_path / "a.npz")

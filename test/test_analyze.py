@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The analyze command as a user meets it: a process, its streams, its files."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tactile_resonance import cli
+from tactile_resonance.multisine import design_multisine
+
+F0_HZ, DAMPING, RATE_HZ, N = 250.0, 0.03, 5000.0, 2000
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "tactile_resonance.cli", "analyze", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def record(periods=6, noise=1e-3, seed=0):
+    excitation = design_multisine(
+        sample_rate_hz=RATE_HZ, samples_per_period=N, band_hz=(100, 400), level_v=1.0, seed=seed
+    )
+    s = 2j * np.pi * excitation.frequency_hz
+    w0 = 2 * np.pi * F0_HZ
+    g = 0.02 + 100 * s / (s**2 + 2 * DAMPING * w0 * s + w0**2)
+    spectrum = excitation.spectrum()
+    spectrum[excitation.harmonics] *= g
+    rng = np.random.default_rng(seed)
+    u = np.tile(excitation.period(), periods)
+    y = np.tile(np.fft.irfft(spectrum * N, N), periods) + noise * rng.standard_normal(periods * N)
+    return {"u": u, "y": y, "sample_rate_hz": RATE_HZ, "samples_per_period": N}
+
+
+@pytest.fixture
+def good(tmp_path):
+    path = tmp_path / "good.npz"
+    np.savez(path, **record())
+    return path
+
+
+def test_json_and_figure_of_a_record(good, tmp_path):
+    out, figure = tmp_path / "out.json", tmp_path / "out.png"
+    answer = run(good, "--band", 200, 300, "--json", out, "--plot", figure)
+    assert answer.returncode == 0, answer.stderr
+    assert "mode: f0 " in answer.stdout
+    content = json.loads(out.read_text())
+    pole = content["poles"][0]
+    covariance = np.array(pole["covariance"])
+    assert abs(pole["f0_hz"] - F0_HZ) < 4 * np.sqrt(covariance[0, 0])
+    assert abs(pole["damping_ratio"] - DAMPING) < 4 * np.sqrt(covariance[1, 1])
+    assert np.hypot(pole["real_rad_s"], pole["imag_rad_s"]) == pytest.approx(
+        2 * np.pi * pole["f0_hz"]
+    )
+    assert set(content) >= {"frf", "poles", "cost", "expected_cost", "status", "warnings", "timing_s"}
+    frf = content["frf"]
+    assert len({len(frf[key]) for key in ("frequency_hz", "real", "imag", "variance")}) == 1
+    assert frf["frequency_hz"][0] == 100.0
+    assert content["status"] == "ok"
+    assert figure.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_band_is_found_when_none_is_given(good):
+    answer = run(good)
+    assert answer.returncode == 0, answer.stderr
+    assert "band: chosen around the strongest resonance" in answer.stdout
+    assert re.search(r"mode: f0 2(50\.0|49\.9)", answer.stdout)
+
+
+def damaged(**changes):
+    content = record() | changes
+    return {key: value for key, value in content.items() if value is not None}
+
+
+BAD = {
+    "missing sensor": (damaged(y=None), (), "y: no such field"),
+    "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y: 12000 samples are NaN or infinite"),
+    "constant": (damaged(u=np.ones(6 * N)), (), r"u: constant (1 V)"),
+    "one period": (damaged(samples_per_period=6 * N), (), "periods: 1 period of 1 realisation"),
+    "narrow band": (damaged(), ("--band", 249, 251), "band: 1 lines in 249-251 Hz"),
+    "band reversed": (damaged(), ("--band", 300, 200), "band: 300 200"),
+    "no rate": (damaged(sample_rate_hz=None), (), "sample_rate_hz: missing"),
+    "zero rate": (damaged(sample_rate_hz=0.0), (), "sample_rate_hz: 0"),
+    "zero rate option": (damaged(), ("--sample-rate", 0), "sample_rate_hz: 0"),
+    "broken period": (damaged(samples_per_period=1999), (), "expected a multiple of the period"),
+    "order": (damaged(), ("--order", 0), "order: 0"),
+    "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "json: /nonexistent"),
+    "figure kind": (damaged(), ("--plot", "out.docx"), "plot: out.docx"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gives_one_line_and_no_file(case, tmp_path, capsys):
+    content, options, message = BAD[case]
+    path, out = tmp_path / "bad.npz", tmp_path / "out.json"
+    np.savez(path, **content)
+    if "--json" not in options:
+        options = (*options, "--json", out)
+    assert cli.main(["analyze", str(path), *map(str, options)]) != 0
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1, printed.err
+    assert message in printed.err
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_silverbox_as_the_issue_of_a_user(shared_data, tmp_path):
+    """Reference: f0 69.536 +- 0.012 Hz, damping ratio 0.04877 +- 0.00016."""
+    ends = [48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196]
+    answer = run(
+        shared_data / "silverbox" / "SNLS80mV.mat",
+        *("--u", "V1", "--y", "V2", "--sample-rate", 610.3515625, "--samples-per-period", 8192),
+        *("--segments", ",".join(f"{end - 8192}:{end}" for end in ends)),
+        *("--band", 40, 110, "--json", tmp_path / "out.json"),
+    )
+    assert answer.returncode == 0, answer.stderr
+    pole = json.loads((tmp_path / "out.json").read_text())["poles"][0]
+    assert abs(pole["f0_hz"] - 69.536) < 3 * 0.012
+    assert abs(pole["damping_ratio"] - 0.04877) < 3 * 0.00016
