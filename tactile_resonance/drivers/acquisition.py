@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every acquisition device promises, and what its blocks hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind
+
+
+class DeviceError(RuntimeError):
+    """The device refuses or failed; the message says why, and the hardware is left stopped."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What a reader of the samples must know of the device.
+
+    Attributes
+    ----------
+    name : str
+    simulated : bool
+    input_kind : InputKind
+        Whether the actuator channel is measured at the sensor's terminals.
+    between_samples : BetweenSamples
+    output_peak_v : float
+        Largest voltage it can put out.
+    latency_s : float
+        From the start of the output to its arrival in the input; NaN where unknown.
+    channel_delay_s : float
+        Of the sensor channel behind the actuator channel; NaN where unknown.
+    anti_alias_filter : str
+        For people; empty where unknown.
+    """
+
+    name: str
+    simulated: bool
+    input_kind: InputKind
+    between_samples: BetweenSamples
+    output_peak_v: float
+    latency_s: float = float("nan")
+    channel_delay_s: float = float("nan")
+    anti_alias_filter: str = ""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One period of both channels.
+
+    Attributes
+    ----------
+    index : int
+        From 0 since the excitation started, without gaps.
+    time_ns : int
+        First sample (UNIX time) [ns].
+    actuator, sensor : Channel
+    contact : Contact or None
+        Where a replay knows it; None where the block was taken just now.
+    """
+
+    index: int
+    time_ns: int
+    actuator: Channel
+    sensor: Channel
+    contact: Contact | None = None
+
+
+class AcquisitionDevice(Protocol):
+    """One output and two inputs on one clock.
+
+    Calls come in the order configure, then for each excitation arm, play, read_block (once a period), and
+    stop at any time. All raise `DeviceError`.
+    """
+
+    def configure(self, sample_rate_hz: float) -> DeviceInfo:
+        """Set the sample clock; say what the device is."""
+        ...
+
+    def arm(self, excitation: Excitation) -> None:
+        """Load the output and make the inputs ready; nothing moves yet."""
+        ...
+
+    def play(self) -> None:
+        """Start output and inputs together, from rest."""
+        ...
+
+    def read_block(self, timeout_s: float) -> Block:
+        """The next period. No block is skipped: a device that lost one raises."""
+        ...
+
+    def stop(self) -> None:
+        """Output to zero, inputs off; harmless when nothing plays."""
+        ...

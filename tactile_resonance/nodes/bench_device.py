@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated bench as an acquisition device: plays through the services of fake_hardware_node."""
+
+from __future__ import annotations
+
+import queue
+import time
+
+from rclpy.client import Client
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from tactile_resonance import msg
+from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.nodes.conversions import excitation_to_message, record_from_message
+from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.record import BetweenSamples, InputKind
+from tactile_resonance.srv import Play
+
+ANSWER_TIMEOUT_S = 10.0
+POLL_S = 5e-4
+
+
+class BenchDevice:
+    """Keeps the contract of `AcquisitionDevice`; called from a thread other than the executor's."""
+
+    def __init__(self, node: Node, frame_id: str) -> None:
+        self._node = node
+        self._frame_id = frame_id
+        self._play_client = node.create_client(Play, "bench/play")
+        self._stop_client = node.create_client(Trigger, "bench/stop")
+        self._blocks: queue.SimpleQueue[msg.Record] = queue.SimpleQueue()
+        self._armed: Excitation | None = None
+        self._next_index = 0
+        node.create_subscription(msg.Record, "bench/block", self._blocks.put, RESULTS)
+
+    def configure(self, sample_rate_hz: float) -> DeviceInfo:
+        if not self._play_client.wait_for_service(timeout_sec=ANSWER_TIMEOUT_S):
+            raise DeviceError(
+                f"device: no bench answers on {self._play_client.srv_name}, start fake_hardware_node"
+            )
+        return DeviceInfo(
+            name="simulated bench",
+            simulated=True,
+            input_kind=InputKind.MEASURED,
+            between_samples=BetweenSamples.BAND_LIMITED,
+            output_peak_v=float("inf"),
+            latency_s=0.0,
+            channel_delay_s=0.0,
+            anti_alias_filter="ideal",
+        )
+
+    def arm(self, excitation: Excitation) -> None:
+        self._armed = excitation
+        self._next_index = 0
+
+    def play(self) -> None:
+        if self._armed is None:
+            raise DeviceError("device: nothing armed to play")
+        request = Play.Request(
+            excitation=excitation_to_message(self._armed, time.time_ns(), self._frame_id)
+        )
+        answer = self._call(self._play_client, request)
+        if not answer.accepted:
+            raise DeviceError(f"device: the bench refuses: {answer.message}")
+
+    def read_block(self, timeout_s: float) -> Block:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                message = self._blocks.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise DeviceError(f"device: no block within {timeout_s:g} s") from None
+            # blocks of an excitation that was stopped may still be under way
+            if self._armed and message.excitation_id == self._armed.excitation_id:
+                break
+        if message.block_index != self._next_index:
+            raise DeviceError(
+                f"device: block {self._next_index} lost, got {message.block_index}"
+            )
+        self._next_index += 1
+        record = record_from_message(message)
+        return Block(record.block_index, record.origin.time_ns, record.actuator, record.sensor)
+
+    def stop(self) -> None:
+        self._armed = None
+        if self._stop_client.service_is_ready():
+            self._call(self._stop_client, Trigger.Request())
+
+    def _call(self, client: Client, request: object):
+        """Call a service from a worker thread while the executor's thread spins."""
+        future = client.call_async(request)
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
+        while not future.done():
+            if time.monotonic() > deadline:
+                future.cancel()
+                raise DeviceError(f"device: no answer on {client.srv_name}")
+            time.sleep(POLL_S)
+        return future.result()

@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between core objects and messages, in one place and without loops over samples.
+
+Arrays are filled in place (``array.frombytes``) and read as views of the message's memory
+(``numpy.frombuffer``): assigning a numpy array to a message field checks it element by element, hundreds of
+times slower.
+"""
+
+from __future__ import annotations
+
+import array
+from enum import Enum
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+
+from tactile_resonance import msg
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.multisine import Excitation, Grid
+from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
+
+GRIDS = {
+    Grid.CUSTOM: msg.Excitation.GRID_CUSTOM,
+    Grid.FULL: msg.Excitation.GRID_FULL,
+    Grid.ODD: msg.Excitation.GRID_ODD,
+    Grid.ODD_RANDOM: msg.Excitation.GRID_ODD_RANDOM,
+}
+INPUT_KINDS = {
+    InputKind.MEASURED: msg.Record.INPUT_MEASURED,
+    InputKind.COMMANDED: msg.Record.INPUT_COMMANDED,
+}
+BETWEEN_SAMPLES = {
+    BetweenSamples.BAND_LIMITED: msg.Record.BAND_LIMITED,
+    BetweenSamples.ZERO_ORDER_HOLD: msg.Record.ZERO_ORDER_HOLD,
+}
+FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
+POLES_STATUS = {status: getattr(msg.Poles, f"STATUS_{status.name}") for status in PolesStatus}
+
+E = TypeVar("E", bound=Enum)
+
+
+def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -> msg.Excitation:
+    """Message of an excitation designed at `time_ns`."""
+    message = msg.Excitation(
+        measurement_id=excitation.measurement_id,
+        excitation_id=excitation.excitation_id,
+        realisation=excitation.realisation,
+        realisations=excitation.realisations,
+        periods=excitation.periods,
+        grid=GRIDS[excitation.grid],
+        seed=excitation.seed,
+        sample_rate_hz=excitation.sample_rate_hz,
+        samples_per_period=excitation.samples_per_period,
+        level_v=excitation.level_v,
+        random_phases=excitation.random_phases,
+        label=excitation.label,
+    )
+    message.header.stamp = time_message(time_ns)
+    message.header.frame_id = frame_id
+    _fill(message.harmonics, excitation.harmonics, np.uint32)
+    _fill(message.amplitude_v, excitation.amplitude_v, float)
+    _fill(message.phase_rad, excitation.phase_rad, float)
+    return message
+
+
+def excitation_from_message(message: msg.Excitation) -> Excitation:
+    """Excitation of a message.
+
+    Raises
+    ------
+    ValueError
+        If its fields contradict each other.
+    """
+    return Excitation(
+        harmonics=_view(message.harmonics),
+        amplitude_v=_view(message.amplitude_v),
+        phase_rad=_view(message.phase_rad),
+        sample_rate_hz=message.sample_rate_hz,
+        samples_per_period=message.samples_per_period,
+        periods=message.periods,
+        realisation=message.realisation,
+        realisations=message.realisations,
+        grid=_key(GRIDS, message.grid, "grid"),
+        seed=message.seed,
+        random_phases=message.random_phases,
+        measurement_id=message.measurement_id,
+        excitation_id=message.excitation_id,
+        label=message.label,
+    )
+
+
+def record_to_message(record: Record) -> msg.Record:
+    """Message of a record."""
+    message = msg.Record(
+        realisation=record.realisation,
+        block_index=record.block_index,
+        sample_rate_hz=record.sample_rate_hz,
+        samples_per_period=record.samples_per_period,
+        actuator_saturated=record.actuator.saturated,
+        sensor_saturated=record.sensor.saturated,
+        input_kind=INPUT_KINDS[record.input_kind],
+        between_samples=BETWEEN_SAMPLES[record.between_samples],
+        channel_delay_s=record.channel_delay_s,
+        anti_alias_filter=record.anti_alias_filter,
+    )
+    for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
+        if channel.is_counts:
+            _fill(getattr(message, f"{name}_counts"), channel.samples, np.int32)
+            setattr(message, f"{name}_scale_v", channel.scale_v)
+            setattr(message, f"{name}_offset_v", channel.offset_v)
+        else:
+            _fill(getattr(message, f"{name}_v"), channel.samples, float)
+    _write_origin(message, record.origin)
+    return message
+
+
+def record_from_message(message: msg.Record) -> Record:
+    """Record of a message; its samples are views of the message's memory."""
+    channels = []
+    for name in ("actuator", "sensor"):
+        counts = _view(getattr(message, f"{name}_counts"))
+        volts = _view(getattr(message, f"{name}_v"))
+        if (counts.size > 0) == (volts.size > 0):
+            raise ValueError(
+                f"{name}: {counts.size} counts and {volts.size} voltages, expected one of the two"
+            )
+        saturated = getattr(message, f"{name}_saturated")
+        if counts.size:
+            scale_v = getattr(message, f"{name}_scale_v")
+            offset_v = getattr(message, f"{name}_offset_v")
+            channels.append(Channel(counts, scale_v, offset_v, saturated))
+        else:
+            channels.append(Channel(volts, saturated=saturated))
+    return Record(
+        actuator=channels[0],
+        sensor=channels[1],
+        sample_rate_hz=message.sample_rate_hz,
+        samples_per_period=message.samples_per_period,
+        realisation=message.realisation,
+        block_index=message.block_index,
+        input_kind=_key(INPUT_KINDS, message.input_kind, "input_kind"),
+        between_samples=_key(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
+        channel_delay_s=message.channel_delay_s,
+        anti_alias_filter=message.anti_alias_filter,
+        origin=_read_origin(message),
+    )
+
+
+def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
+    """Message of an FRF with (F,) arrays."""
+    message = msg.FRF(
+        noise_dof=frf.noise_dof,
+        total_dof=frf.total_dof,
+        periods=frf.periods,
+        realisations=frf.realisations,
+        method=frf.method,
+        level_v=level_v,
+        saturated=saturated,
+        status=FRF_STATUS[frf.status],
+        message=frf.message,
+    )
+    _write_origin(message, origin)
+    _fill(message.frequency_hz, frf.frequency_hz, float)
+    _fill_complex(message, "", frf.g)
+    for name in ("variance_noise", "variance_total"):
+        variance = getattr(frf, name)
+        if variance is not None:
+            _fill(getattr(message, name), variance, float)
+    if frf.spectra is not None:
+        _fill_complex(message, "sensor_", frf.spectra[0])
+        _fill_complex(message, "actuator_", frf.spectra[1])
+    if frf.spectra_covariance is not None:
+        _fill(message.sensor_variance, frf.spectra_covariance[0, 0].real, float)
+        _fill(message.actuator_variance, frf.spectra_covariance[1, 1].real, float)
+        _fill_complex(message, "covariance_", frf.spectra_covariance[0, 1])
+    return message
+
+
+def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
+    """FRF of a message, and what it belongs to."""
+    spectra = covariance = None
+    if len(message.sensor_real):
+        spectra = np.stack([_complex(message, "sensor_"), _complex(message, "actuator_")])
+    if len(message.sensor_variance):
+        cross = _complex(message, "covariance_")
+        covariance = np.array(
+            [
+                [_view(message.sensor_variance), cross],
+                [cross.conj(), _view(message.actuator_variance)],
+            ]
+        )
+    frf = FRF(
+        frequency_hz=_view(message.frequency_hz),
+        g=_complex(message, ""),
+        variance_noise=_optional(message.variance_noise),
+        variance_total=_optional(message.variance_total),
+        noise_dof=message.noise_dof,
+        total_dof=message.total_dof,
+        spectra=spectra,
+        spectra_covariance=covariance,
+        periods=message.periods,
+        realisations=message.realisations,
+        method=message.method,
+        status=_key(FRF_STATUS, message.status, "status"),
+        message=message.message,
+    )
+    return frf, _read_origin(message)
+
+
+def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
+    """Message of poles."""
+    message = msg.Poles(
+        order=poles.structure.order,
+        numerator_order=poles.structure.numerator_order,
+        band_low_hz=float(poles.band_hz[0]),
+        band_high_hz=float(poles.band_hz[1]),
+        lines=poles.lines,
+        cost=float(poles.cost),
+        expected_cost=float(poles.expected_cost),
+        condition_number=float(poles.condition_number),
+        method=poles.method,
+        status=POLES_STATUS[poles.status],
+        message=poles.message,
+    )
+    _write_origin(message, origin)
+    _fill(message.real_rad_s, poles.poles_rad_s.real, float)
+    _fill(message.imag_rad_s, poles.poles_rad_s.imag, float)
+    _fill(message.f0_hz, poles.f0_hz, float)
+    _fill(message.damping_ratio, poles.damping_ratio, float)
+    _fill(message.residue_real, poles.residues.real, float)
+    _fill(message.residue_imag, poles.residues.imag, float)
+    for name in ("covariance", "total_covariance"):
+        covariance = getattr(poles, name)
+        if covariance is not None:
+            _fill(getattr(message, name), covariance, float)
+    return message
+
+
+def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
+    """Poles of a message, and what they belong to; the fitted model itself does not travel."""
+    real = _view(message.real_rad_s)
+    n = real.size
+
+    def blocks(values: array.array) -> npt.NDArray[np.float64] | None:
+        return _view(values).reshape(n, 2, 2) if len(values) else None
+
+    structure = ModelStructure()
+    if message.order:
+        structure = ModelStructure(message.order, message.numerator_order)
+    poles = Poles(
+        poles_rad_s=real + 1j * _view(message.imag_rad_s),
+        f0_hz=_view(message.f0_hz),
+        damping_ratio=_view(message.damping_ratio),
+        residues=_view(message.residue_real) + 1j * _view(message.residue_imag),
+        covariance=blocks(message.covariance),
+        total_covariance=blocks(message.total_covariance),
+        structure=structure,
+        band_hz=(message.band_low_hz, message.band_high_hz),
+        lines=message.lines,
+        cost=message.cost,
+        expected_cost=message.expected_cost,
+        condition_number=message.condition_number,
+        method=message.method,
+        status=_key(POLES_STATUS, message.status, "status"),
+        message=message.message,
+    )
+    return poles, _read_origin(message)
+
+
+def time_message(time_ns: int) -> Time:
+    """UNIX time as a stamp."""
+    return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+
+
+def time_from_message(stamp: Time) -> int:
+    """Stamp as UNIX time [ns]."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def pose_to_message(contact: Contact) -> PoseStamped:
+    """Tip pose; an empty frame where the position is unknown."""
+    message = PoseStamped()
+    if contact.position_m is None:
+        return message
+    message.header.stamp = time_message(contact.time_ns)
+    message.header.frame_id = contact.frame_id
+    point, turn = message.pose.position, message.pose.orientation
+    point.x, point.y, point.z = contact.position_m
+    turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
+    return message
+
+
+def contact_from_message(message: PoseStamped, force_n: float, force_std_n: float) -> Contact:
+    """Contact of a tip pose and a force."""
+    if not message.header.frame_id:
+        return Contact(force_n, force_std_n)
+    point, turn = message.pose.position, message.pose.orientation
+    return Contact(
+        force_n,
+        force_std_n,
+        (point.x, point.y, point.z),
+        (turn.x, turn.y, turn.z, turn.w),
+        message.header.frame_id,
+        time_from_message(message.header.stamp),
+    )
+
+
+def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> None:
+    message.header.stamp = time_message(origin.time_ns)
+    message.header.frame_id = origin.frame_id
+    for name in ("measurement_id", "excitation_id", "final", "label", "simulated"):
+        setattr(message, name, getattr(origin, name))
+    message.tip_pose = pose_to_message(origin.contact)
+    message.contact_force_n = float(origin.contact.force_n)
+    message.contact_force_std_n = float(origin.contact.force_std_n)
+
+
+def _read_origin(message: msg.Record | msg.FRF | msg.Poles) -> Origin:
+    return Origin(
+        measurement_id=message.measurement_id,
+        excitation_id=message.excitation_id,
+        time_ns=time_from_message(message.header.stamp),
+        final=message.final,
+        frame_id=message.header.frame_id,
+        label=message.label,
+        simulated=message.simulated,
+        contact=contact_from_message(
+            message.tip_pose, message.contact_force_n, message.contact_force_std_n
+        ),
+    )
+
+
+def _fill(target: array.array, values: npt.NDArray, dtype: npt.DTypeLike) -> None:
+    target.frombytes(np.ascontiguousarray(values, dtype).ravel().view(np.uint8))
+
+
+def _fill_complex(message: object, prefix: str, values: npt.NDArray[np.complex128]) -> None:
+    _fill(getattr(message, f"{prefix}real"), values.real, float)
+    _fill(getattr(message, f"{prefix}imag"), values.imag, float)
+
+
+def _view(values: array.array) -> npt.NDArray:
+    return np.frombuffer(values, dtype=values.typecode)
+
+
+def _optional(values: array.array) -> npt.NDArray[np.float64] | None:
+    return _view(values) if len(values) else None
+
+
+def _complex(message: object, prefix: str) -> npt.NDArray[np.complex128]:
+    real = _view(getattr(message, f"{prefix}real"))
+    return real + 1j * _view(getattr(message, f"{prefix}imag"))
+
+
+def _key(table: dict[E, int], value: int, name: str) -> E:
+    for key, number in table.items():
+        if number == value:
+            return key
+    raise ValueError(f"{name}: {value}, accepted are {sorted(table.values())}")

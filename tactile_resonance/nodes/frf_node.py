@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records -> FRF, streaming."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+from tactile_resonance import msg
+from tactile_resonance.frf.measurement import MeasurementFrf
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.nodes.conversions import (
+    excitation_from_message,
+    frf_to_message,
+    record_from_message,
+)
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
+from tactile_resonance.record import Record
+
+
+MOST_WAITING = 64
+
+
+class FrfNode(Node):
+    """After every record the FRF of its measurement so far; one measurement at a time."""
+
+    def __init__(self) -> None:
+        super().__init__("frf_node")
+        self._publisher = self.create_publisher(msg.FRF, "frf", RESULTS)
+        self._excitations: dict[int, Excitation] = {}
+        self._waiting: list[Record] = []
+        self._measurement = MeasurementFrf(0)
+        self.create_subscription(msg.Excitation, "excitation", self._on_excitation, EXCITATIONS)
+        self.create_subscription(msg.Record, "record", self._on_record, RESULTS)
+
+    def _on_excitation(self, message: msg.Excitation) -> None:
+        try:
+            excitation = excitation_from_message(message)
+        except ValueError as error:
+            self.get_logger().error(f"excitation {message.excitation_id}: {error}")
+            return
+        if excitation.realisation == 0:
+            self._excitations.clear()
+        self._excitations[excitation.excitation_id] = excitation
+        # excitation and record travel on topics of their own: a record may come first
+        waiting, self._waiting = self._waiting, []
+        for record in waiting:
+            self._take(record)
+
+    def _on_record(self, message: msg.Record) -> None:
+        try:
+            self._take(record_from_message(message))
+        except ValueError as error:
+            self.get_logger().error(f"record of excitation {message.excitation_id}: {error}")
+
+    def _take(self, record: Record) -> None:
+        excitation = self._excitations.get(record.origin.excitation_id)
+        if excitation is None:
+            self._waiting.append(record)
+            if len(self._waiting) > MOST_WAITING:
+                lost = self._waiting.pop(0)
+                self.get_logger().error(
+                    f"no excitation {lost.origin.excitation_id} arrived: block {lost.block_index} not used"
+                )
+            return
+        if record.origin.measurement_id != self._measurement.measurement_id:
+            self._measurement = MeasurementFrf(record.origin.measurement_id)
+        self._measurement.add(record, excitation)
+        self._publisher.publish(
+            frf_to_message(
+                self._measurement.frf(),
+                self._measurement.origin(),
+                excitation.level_v,
+                self._measurement.saturated,
+            )
+        )
+
+
+def main() -> None:
+    """Console script."""
+    run_node(FrfNode)
+
+
+if __name__ == "__main__":
+    main()

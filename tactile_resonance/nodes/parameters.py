@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declaring ROS parameters with description, range and a reason where a value is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    Attributes
+    ----------
+    name : str
+        With its unit.
+    default : bool, int, float or str
+    description : str
+    low, high : float or None
+        Range of a number, ends included.
+    choices : tuple of str
+        What a string may be; any where empty.
+    read_only : bool
+        Only the launch decides.
+    """
+
+    name: str
+    default: bool | int | float | str
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows; ROS itself enforces the range."""
+        descriptor = ParameterDescriptor(description=self.description, read_only=self.read_only)
+        if self.choices:
+            descriptor.additional_constraints = f"one of {', '.join(self.choices)}"
+        if self.low is not None and self.high is not None:
+            if isinstance(self.default, int):
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(self.low), to_value=int(self.high))
+                ]
+            else:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(self.low), to_value=float(self.high))
+                ]
+        return descriptor
+
+
+def declare(node: Node, parameters: Sequence[Parameter]) -> None:
+    """Declare all; what is set later is checked against the choices."""
+    choices = {p.name: p.choices for p in parameters if p.choices}
+
+    def check(changes: Sequence) -> SetParametersResult:
+        for change in changes:
+            accepted = choices.get(change.name)
+            if accepted and change.value not in accepted:
+                reason = f"{change.name}: {change.value!r}, accepted are {', '.join(accepted)}"
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    for parameter in parameters:
+        node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+
+
+def values(node: Node, *names: str) -> tuple:
+    """Present values of several parameters."""
+    return tuple(node.get_parameter(name).value for name in names)

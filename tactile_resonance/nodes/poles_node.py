@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FRF -> poles."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+from tactile_resonance import msg
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.nodes.conversions import frf_from_message, poles_to_message
+from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.running import RESULTS, run_node
+
+PARAMETERS = (
+    Parameter("band_low_hz", 200.0, "Lower end of the band of the fit [Hz].", 0.0, 1e6),
+    Parameter("band_high_hz", 300.0, "Upper end of the band of the fit [Hz].", 0.0, 1e6),
+    Parameter("order", 2, "Order of the denominator: two poles per mode.", 1, 20),
+    Parameter(
+        "residual_terms",
+        6,
+        "Real polynomial terms beside the modes, for those outside the band; 1 is the bare "
+        "second-order model.",
+        0,
+        20,
+    ),
+)
+
+
+class PolesNode(Node):
+    """Every FRF that arrives becomes poles, with the same header."""
+
+    def __init__(self) -> None:
+        super().__init__("poles_node")
+        declare(self, PARAMETERS)
+        self._publisher = self.create_publisher(msg.Poles, "poles", RESULTS)
+        self.create_subscription(msg.FRF, "frf", self._on_frf, RESULTS)
+
+    def _on_frf(self, message: msg.FRF) -> None:
+        frf, origin = frf_from_message(message)
+        self._publisher.publish(poles_to_message(self._identify(frf), origin))
+
+    def _identify(self, frf: FRF) -> Poles:
+        """Poles, or the reason why there are none: a reader waits for an answer to every FRF."""
+        low_hz, high_hz, order, terms = values(
+            self, "band_low_hz", "band_high_hz", "order", "residual_terms"
+        )
+        if frf.status is FrfStatus.FAILED:
+            return Poles(status=PolesStatus.FAILED, message=frf.message)
+        try:
+            structure = ModelStructure.with_residual(order, terms)
+            return identify_poles(frf, (low_hz, high_hz), structure)
+        except ValueError as error:
+            return Poles(status=PolesStatus.FAILED, message=str(error))
+
+
+def main() -> None:
+    """Console script."""
+    run_node(PolesNode)
+
+
+if __name__ == "__main__":
+    main()

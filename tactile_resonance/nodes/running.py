@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all nodes share: qualities of service, and spinning until asked to stop."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+# Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
+RESULTS = QoSProfile(
+    depth=256, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
+# Static metadata and maps: late readers get the last one.
+LATCHED = QoSProfile(
+    depth=1,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+# Excitations: late readers get those of the measurement under way, however many realisations it has.
+EXCITATIONS = QoSProfile(
+    depth=64,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+# Poses and wrenches: the newest counts.
+STREAM = QoSProfile(
+    depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+
+def run_node(make: Callable[[], Node]) -> None:
+    """Spin one node until it is interrupted or ROS shuts down."""
+    try:
+        with rclpy.init():
+            node = make()
+            try:
+                rclpy.spin(node)
+            finally:
+                node.destroy_node()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ValueError, OSError) as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        sys.exit(1)

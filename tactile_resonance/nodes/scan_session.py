@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A client of the nodes: puts the tip on a point, measures, waits for the poles."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
+
+from tactile_resonance import msg
+from tactile_resonance.action import Measure
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.nodes.conversions import (
+    frf_from_message,
+    poles_from_message,
+    pose_to_message,
+)
+from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM
+from tactile_resonance.record import Contact, Origin
+
+Progress = Callable[[int, int], None]
+
+
+class NoAnswer(RuntimeError):
+    """Something that should have come from a node did not come in time."""
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """What came back for one point.
+
+    Attributes
+    ----------
+    origin : Origin
+    frf : FRF
+    poles : Poles
+    truth : Poles
+        All modes of the simulated sensor at that point.
+    """
+
+    origin: Origin
+    frf: FRF
+    poles: Poles
+    truth: Poles
+
+
+class ScanSession:
+    """Context that joins the nodes' domain; not for use beside another executor.
+
+    Parameters
+    ----------
+    check : callable
+        Called while waiting; raises when waiting has become pointless.
+    """
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self._check = check
+        self._context = rclpy.Context()
+        self._frfs: dict[int, msg.FRF] = {}
+        self._poles: dict[int, msg.Poles] = {}
+        self._truth: msg.Poles | None = None
+        self._progress: Progress = lambda done, planned: None
+
+    def __enter__(self) -> ScanSession:
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("scan_session", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._pose = self._node.create_publisher(PoseStamped, "tcp_pose", STREAM)
+        self._measure = ActionClient(self._node, Measure, "measure")
+        subscribe = self._node.create_subscription
+        subscribe(msg.FRF, "frf", lambda m: self._keep_final(self._frfs, m), RESULTS)
+        subscribe(msg.Poles, "poles", lambda m: self._keep_final(self._poles, m), RESULTS)
+        subscribe(msg.Poles, "bench/truth", self._on_truth, LATCHED)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def wait_for_nodes(self, timeout_s: float) -> None:
+        """Until the action and all topics of the stream have somebody at both ends."""
+        count = self._node.count_publishers, self._node.count_subscribers
+
+        def complete() -> bool:
+            ends = {"excitation": 1, "record": 1, "frf": 2, "poles": 1, "bench/block": 1}
+            return self._measure.server_is_ready() and all(
+                count[0](topic) >= 1 and count[1](topic) >= readers
+                for topic, readers in ends.items()
+            )
+
+        self._wait(complete, timeout_s, "the nodes to find each other")
+
+    def warm_up(self, position_m: tuple[float, float, float], attempts: int = 10) -> PointResult:
+        """Measure briefly until poles come back: only then has every node heard every other.
+
+        The graph tells that publishers and subscribers exist, not that each pair has matched; records
+        published before that reach nobody.
+        """
+        for _ in range(attempts - 1):
+            try:
+                goal = Measure.Goal(label="warm-up", periods=3)
+                return self.measure(position_m, goal, lambda done, planned: None, answer_timeout_s=1.0)
+            except NoAnswer:
+                self._check()
+        goal = Measure.Goal(label="warm-up", periods=3)
+        return self.measure(position_m, goal, lambda done, planned: None)
+
+    def measure(
+        self,
+        position_m: tuple[float, float, float],
+        goal: Measure.Goal,
+        progress: Progress,
+        timeout_s: float = 60.0,
+        answer_timeout_s: float = 10.0,
+    ) -> PointResult:
+        """Put the tip there, measure, wait for the final poles.
+
+        Raises
+        ------
+        NoAnswer
+            If the measurement fails or takes longer than `timeout_s`, or its poles do not follow within
+            `answer_timeout_s`.
+        """
+        self._progress = progress
+        self._place(position_m)
+        truth = self._truth
+        goal_future = self._measure.send_goal_async(goal, feedback_callback=self._on_feedback)
+        handle = self._result(goal_future, timeout_s, "the goal to be taken")
+        answer = self._result(handle.get_result_async(), timeout_s, "the measurement")
+        if answer.result.outcome != Measure.Result.DONE:
+            raise NoAnswer(f"measurement of {goal.label}: {answer.result.message}")
+        key = answer.result.measurement_id
+        self._wait(lambda: key in self._poles and key in self._frfs, answer_timeout_s, "poles")
+        poles, origin = poles_from_message(self._poles.pop(key))
+        frf, _ = frf_from_message(self._frfs.pop(key))
+        return PointResult(origin, frf, poles, poles_from_message(truth)[0])
+
+    def _place(self, position_m: tuple[float, float, float]) -> None:
+        """Say where the tip is until the bench's truth carries that very pose."""
+        now_ns = time.time_ns()
+        pose = pose_to_message(
+            Contact(position_m=position_m, frame_id="table", time_ns=now_ns)
+        )
+
+        def there() -> bool:
+            self._pose.publish(pose)
+            return self._truth is not None and self._truth.tip_pose == pose
+
+        self._wait(there, 10.0, "the bench to take up the pose")
+
+    def _on_truth(self, message: msg.Poles) -> None:
+        self._truth = message
+
+    def _on_feedback(self, message: object) -> None:
+        self._progress(message.feedback.blocks, message.feedback.blocks_planned)
+
+    @staticmethod
+    def _keep_final(kept: dict, message: msg.FRF | msg.Poles) -> None:
+        if message.final:
+            kept[message.measurement_id] = message
+
+    def _result(self, future: Future, timeout_s: float, what: str):
+        self._wait(future.done, timeout_s, what)
+        return future.result()
+
+    def _wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not done():
+            self._check()
+            if time.monotonic() > deadline:
+                raise NoAnswer(f"waited {timeout_s:g} s for {what}")
+            self._executor.spin_once(timeout_sec=0.05)
