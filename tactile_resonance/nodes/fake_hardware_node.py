@@ -30,6 +30,7 @@ from tactile_resonance.simulation.acquisition import BenchEffects, Block, Channe
 from tactile_resonance.simulation.bench import BenchRun, SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
+from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.srv import Play
 
 PARAMETERS = (
@@ -58,6 +59,8 @@ class FakeHardwareNode(Node):
 
     def __init__(self) -> None:
         super().__init__("fake_hardware_node")
+        self._playing: threading.Thread | None = None
+        self._stop = threading.Event()
         declare(self, PARAMETERS)
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
@@ -66,9 +69,7 @@ class FakeHardwareNode(Node):
         )
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
-        self._tissue = None
-        self._playing: threading.Thread | None = None
-        self._stop = threading.Event()
+        self._tissue: Tissue | None = None
         self._blocks = self.create_publisher(msg.Record, "bench/block", RESULTS)
         self._truth = self.create_publisher(msg.Poles, "bench/truth", LATCHED)
         self._wrench = self.create_publisher(WrenchStamped, "wrench", STREAM)

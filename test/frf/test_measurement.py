@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from tactile_resonance.frf.averaging import average_periods
+from tactile_resonance.frf.measurement import MeasurementFrf
+from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.record import Channel, Contact, Origin, Record
+
+N, RATE_HZ = 200, 1000.0
+RNG = np.random.default_rng(0)
+
+
+def excitation(realisation=0):
+    return design_multisine(
+        sample_rate_hz=RATE_HZ,
+        samples_per_period=N,
+        band_hz=(50, 200),
+        realisation=realisation,
+        realisations=2,
+    )
+
+
+def record(samples_u, samples_y, realisation, index, force_n=0.01, saturated=False):
+    return Record(
+        actuator=Channel(samples_u.ravel()),
+        sensor=Channel(samples_y.ravel(), saturated=saturated),
+        sample_rate_hz=RATE_HZ,
+        samples_per_period=N,
+        realisation=realisation,
+        block_index=index,
+        origin=Origin(
+            time_ns=10**9 * (10 * realisation) + index * 200_000_000,
+            contact=Contact(force_n=force_n),
+        ),
+    )
+
+
+@pytest.fixture
+def channels():
+    """(2, 2, 4, N): channel, realisation, period."""
+    u = np.stack([np.tile(excitation(m).period(), (4, 1)) for m in range(2)])
+    y = 0.5 * np.roll(u, 2, axis=-1)
+    return np.stack([u, y]) + 1e-3 * RNG.standard_normal((2, 2, 4, N))
+
+
+def test_block_by_block_is_all_at_once(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for m in range(2):
+        for p in range(4):
+            measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
+    frf = measurement.frf()
+    alone = average_periods(u, y, sample_rate_hz=RATE_HZ, harmonics=excitation().harmonics)
+    np.testing.assert_allclose(frf.g, alone.g, rtol=1e-13)
+    assert (frf.realisations, frf.periods) == (2, 3)
+
+
+def test_a_realisation_under_way_waits(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(4):
+        measurement.add(record(u[0, p], y[0, p], 0, p), excitation(0))
+    before = measurement.frf()
+    measurement.add(record(u[1, 0], y[1, 0], 1, 0), excitation(1))
+    np.testing.assert_array_equal(measurement.frf().g, before.g)
+
+
+def test_blocks_of_several_periods(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for block in range(2):
+        part = slice(2 * block, 2 * block + 2)
+        measurement.add(record(u[0, part], y[0, part], 0, block), excitation(0))
+    assert measurement.frf().periods == 3
+    assert measurement.frf().status is FrfStatus.OK
+
+
+def test_a_lost_block_is_said_and_what_follows_left_out(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in (0, 1, 3):
+        measurement.add(record(u[0, p], y[0, p], 0, p), excitation(0))
+    frf = measurement.frf()
+    assert frf.status is FrfStatus.SUSPECT
+    assert "blocks lost before block 3" in frf.message
+    assert frf.periods == 2
+
+
+def test_nothing_but_later_blocks_is_a_failure_with_a_reason(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    measurement.add(record(u[0, 1], y[0, 1], 0, 1), excitation(0))
+    frf = measurement.frf()
+    assert frf.status is FrfStatus.FAILED
+    assert "blocks lost" in frf.message
+
+
+def test_saturation_is_said(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(3):
+        measurement.add(record(u[0, p], y[0, p], 0, p, saturated=p == 1), excitation(0))
+    assert measurement.saturated
+    assert "sensor saturated" in measurement.frf().message
+
+
+def test_origin_is_the_middle_and_the_mean(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(4):
+        measurement.add(record(u[0, p], y[0, p], 0, p, force_n=0.01 + 0.001 * p), excitation(0))
+    origin = measurement.origin()
+    assert origin.time_ns == 400_000_000
+    assert origin.contact.force_n == pytest.approx(0.0115)
+
+
+def test_a_record_that_does_not_fit_is_refused(channels):
+    u, y = channels
+    with pytest.raises(ValueError, match="199 and 200 samples, expected whole periods of 200"):
+        MeasurementFrf(1).add(record(u[0, 0, :-1], y[0, 0], 0, 0), excitation(0))

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stream of nodes, seen by a program of its own that only listens."""
+
+import time
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+
+from tactile_resonance import msg
+from tactile_resonance.action import Measure
+from tactile_resonance.frf.averaging import average_periods
+from tactile_resonance.nodes.conversions import (
+    excitation_from_message,
+    frf_from_message,
+    poles_from_message,
+    record_from_message,
+)
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
+from tactile_resonance.nodes.scan_session import NoAnswer, ScanSession
+from tactile_resonance.processes import NodeProcesses
+
+NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+GEL_10 = (0.0, 0.0, 0.0)
+GEL_16 = (0.18, 0.0, 0.0)
+
+
+class Listener:
+    """Collects what is published, as a user's own node would."""
+
+    def __enter__(self):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("listener", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.heard = {"excitation": [], "record": [], "frf": [], "poles": []}
+        types = (msg.Excitation, msg.Record, msg.FRF, msg.Poles)
+        for (topic, list_), kind in zip(self.heard.items(), types):
+            qos = EXCITATIONS if topic == "excitation" else RESULTS
+            self.node.create_subscription(kind, topic, list_.append, qos)
+        return self
+
+    def __exit__(self, *_):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def listen(self, until, timeout_s=10.0):
+        deadline = time.monotonic() + timeout_s
+        while not until() and time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.05)
+        assert until(), {topic: len(list_) for topic, list_ in self.heard.items()}
+
+    def join(self, session):
+        """Measure until a whole measurement has been heard: only then has everybody found the listener."""
+        for _ in range(20):
+            key = session.warm_up(GEL_10).origin.measurement_id
+            for _ in range(10):
+                self.executor.spin_once(timeout_sec=0.05)
+            if [len(self.of(topic, key)) for topic in self.heard] == [1, 3, 3, 3]:
+                return
+        raise AssertionError("the listener does not hear the nodes")
+
+    def of(self, topic, measurement_id):
+        return [m for m in self.heard[topic] if m.measurement_id == measurement_id]
+
+
+@pytest.fixture
+def session(domain, tmp_path):
+    with NodeProcesses(tmp_path) as nodes:
+        for node in NODES:
+            nodes.start(node, {"speed": 0.0} if node == "fake_hardware_node" else None)
+        with ScanSession(nodes.check) as session:
+            session.wait_for_nodes(30.0)
+            session.warm_up(GEL_10)
+            yield session
+
+
+def quiet(done, planned):
+    pass
+
+
+def test_messages_of_a_measurement(session):
+    with Listener() as listener:
+        listener.join(session)
+        before_ns = time.time_ns()
+        goal = Measure.Goal(label="here", periods=5, realisations=2, seed=3, level_v=0.5)
+        result = session.measure(GEL_10, goal, quiet)
+        key = result.origin.measurement_id
+        listener.listen(lambda: listener.of("poles", key) and listener.of("poles", key)[-1].final)
+        excitations = [excitation_from_message(m) for m in listener.of("excitation", key)]
+        messages = listener.of("record", key)
+        frfs, poles = listener.of("frf", key), listener.of("poles", key)
+
+    # every block arrived, in order, none twice
+    assert [(m.realisation, m.block_index) for m in messages] == [
+        (m, p) for m in range(2) for p in range(5)
+    ]
+    assert [m.final for m in messages] == [False] * 9 + [True]
+    assert len(frfs) == len(poles) == 10
+    assert [e.realisation for e in excitations] == [0, 1]
+    assert excitations[0].level_v == pytest.approx(0.5)
+
+    # stamps: records lie one period apart; results carry the middle of what they rest on
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
+    assert np.all(np.abs(np.diff(stamps[:5]) - 400_000_000) <= 1)
+    assert stamps[0] > before_ns
+    middle = (stamps[0] + stamps[-1] + 400_000_000) // 2
+    last, last_poles = frfs[-1], poles[-1]
+    assert abs(last.header.stamp.sec * 10**9 + last.header.stamp.nanosec - middle) <= 1
+    assert last_poles.header.stamp == last.header.stamp
+    for message in (*messages, *frfs, *poles):
+        assert message.header.frame_id == "tip"
+        assert message.label == "here"
+        assert message.simulated
+        assert message.contact_force_n == pytest.approx(0.01)
+        assert message.tip_pose.header.frame_id == "table"
+        assert message.tip_pose.pose.position.x == 0.0
+
+    # the FRF of the node is that of the same records in process
+    records = [record_from_message(m) for m in messages]
+    u, y = (
+        np.stack([getattr(r, name).volts() for r in records]).reshape(2, 5, -1)
+        for name in ("actuator", "sensor")
+    )
+    frf, _ = frf_from_message(last)
+    alone = average_periods(u, y, sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
+    np.testing.assert_allclose(frf.g, alone.g, rtol=1e-12)
+    np.testing.assert_allclose(frf.variance_total, alone.variance_total, rtol=1e-9)
+    assert (frf.periods, frf.realisations) == (4, 2)
+    assert last.level_v == pytest.approx(0.5)
+
+    # and the poles are those of the tissue under the tip
+    estimate, _ = poles_from_message(last_poles)
+    truth = min(result.truth.f0_hz, key=lambda f: abs(f - 250))
+    std = np.sqrt(estimate.total_covariance[0, 0, 0])
+    assert abs(estimate.f0_hz[0] - truth) < 5 * std
+    assert 0.001 < std < 0.1
+
+
+def test_tissue_follows_the_tip_and_noise_repeats(session):
+    def poles(position):
+        goal = Measure.Goal(periods=4, seed=5)
+        return session.measure(position, goal, quiet).poles
+
+    first, second, again = poles(GEL_10), poles(GEL_16), poles(GEL_10)
+    assert second.f0_hz[0] - first.f0_hz[0] > 8
+    assert second.damping_ratio[0] - first.damping_ratio[0] > 0.008
+    np.testing.assert_array_equal(again.poles_rad_s, first.poles_rad_s)
+
+
+def test_level_above_the_sensors_limit_is_refused(session):
+    with pytest.raises(NoAnswer, match="level_v: 9, the sensor bears at most 4 V rms"):
+        session.measure(GEL_10, Measure.Goal(level_v=9.0), quiet)
+    # and the next one is measured as if nothing had happened
+    assert session.measure(GEL_10, Measure.Goal(periods=3), quiet).poles.f0_hz.size == 1
+
+
+def test_a_node_that_ended_is_named(domain, tmp_path):
+    with NodeProcesses(tmp_path) as nodes:
+        nodes.start("fake_hardware_node", {"scene": "nowhere.yaml"})
+        deadline = time.monotonic() + 30
+        with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*nowhere.yaml"):
+            while time.monotonic() < deadline:
+                nodes.check()
+                time.sleep(0.1)

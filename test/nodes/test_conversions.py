@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects survive the way through messages and their serialisation bit by bit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not here")
+serialization = pytest.importorskip("rclpy.serialization")
+msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
+from tactile_resonance.identification.result import Poles, PolesStatus  # noqa: E402
+from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
+from tactile_resonance.nodes import conversions  # noqa: E402
+from tactile_resonance.record import (  # noqa: E402
+    BetweenSamples,
+    Channel,
+    Contact,
+    InputKind,
+    Origin,
+    Record,
+)
+
+RNG = np.random.default_rng(0)
+CONTACT = Contact(
+    0.0101, 2e-4, (0.1, -0.2, 0.3), (0.0, 0.6, 0.0, 0.8), "table", 1_700_000_000_123_456_789
+)
+ORIGIN = Origin(
+    measurement_id=2**50 + 1,
+    excitation_id=2**51 + 3,
+    time_ns=1_700_000_000_987_654_321,
+    final=True,
+    frame_id="sensor_2/tip",
+    label="gelatine 12 %, point 3",
+    simulated=True,
+    contact=CONTACT,
+)
+
+
+def through_the_wire(message):
+    data = serialization.serialize_message(message)
+    return serialization.deserialize_message(data, type(message))
+
+
+def assert_equal(a, b):
+    """Field by field, arrays element by element, NaN equal to NaN."""
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if dataclasses.is_dataclass(x):
+            assert_equal(x, y)
+        elif x is None or y is None:
+            assert x is y, field.name
+        else:
+            np.testing.assert_array_equal(x, y, err_msg=field.name)
+
+
+def test_excitation():
+    excitation = design_multisine(
+        grid=Grid.ODD_RANDOM,
+        seed=2**40,
+        realisation=2,
+        realisations=5,
+        periods=3,
+        measurement_id=7,
+        excitation_id=9,
+        label="x",
+    )
+    message = conversions.excitation_to_message(excitation, 1_500_000_000, "tip")
+    assert message.header.frame_id == "tip"
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1, 500_000_000)
+    assert message.level_v == excitation.level_v
+    assert_equal(conversions.excitation_from_message(through_the_wire(message)), excitation)
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        Channel(RNG.integers(-(2**15), 2**15, 1000, dtype=np.int32), 3e-4, 0.01, True),
+        Channel(RNG.standard_normal(1000)),
+    ],
+    ids=["counts", "volts"],
+)
+def test_record(channel):
+    record = Record(
+        actuator=channel,
+        sensor=Channel(RNG.standard_normal(1000)),
+        sample_rate_hz=50e3,
+        samples_per_period=500,
+        realisation=3,
+        block_index=17,
+        input_kind=InputKind.COMMANDED,
+        between_samples=BetweenSamples.ZERO_ORDER_HOLD,
+        channel_delay_s=1e-6,
+        anti_alias_filter="none",
+        origin=ORIGIN,
+    )
+    message = through_the_wire(conversions.record_to_message(record))
+    assert message.simulated
+    assert_equal(conversions.record_from_message(message), record)
+
+
+def test_record_with_two_or_no_representations_is_refused():
+    message = conversions.record_to_message(
+        Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4)
+    )
+    message.sensor_v = []
+    with pytest.raises(ValueError, match="sensor: 0 counts and 0 voltages"):
+        conversions.record_from_message(message)
+
+
+def complex_normal(*shape):
+    return RNG.standard_normal(shape) + 1j * RNG.standard_normal(shape)
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_frf(complete):
+    covariance = complex_normal(2, 2, 30)
+    covariance = covariance + np.conj(np.swapaxes(covariance, 0, 1))  # Hermitian
+    frf = FRF(
+        frequency_hz=np.sort(RNG.uniform(1, 100, 30)),
+        g=complex_normal(30),
+        variance_noise=RNG.uniform(size=30) if complete else None,
+        variance_total=RNG.uniform(size=30) if complete else None,
+        noise_dof=7,
+        total_dof=3,
+        spectra=complex_normal(2, 30) if complete else None,
+        spectra_covariance=covariance if complete else None,
+        periods=4,
+        realisations=2,
+        method="m",
+        status=FrfStatus.SUSPECT,
+        message="why",
+    )
+    message = through_the_wire(conversions.frf_to_message(frf, ORIGIN, 1.5, True))
+    assert (message.level_v, message.saturated) == (1.5, True)
+    back, origin = conversions.frf_from_message(message)
+    assert_equal(back, frf)
+    assert_equal(origin, ORIGIN)
+
+
+@pytest.mark.parametrize("modes", [0, 1, 3])
+def test_poles(modes):
+    poles = Poles(
+        poles_rad_s=complex_normal(modes),
+        f0_hz=RNG.uniform(size=modes),
+        damping_ratio=RNG.uniform(size=modes),
+        residues=complex_normal(modes),
+        covariance=RNG.standard_normal((modes, 2, 2)) if modes else None,
+        total_covariance=None,
+        band_hz=(200.0, 300.0),
+        lines=41,
+        cost=12.0,
+        method="m",
+        status=PolesStatus.MODEL_ERROR,
+        message="why",
+    )
+    message = through_the_wire(conversions.poles_to_message(poles, ORIGIN))
+    back, origin = conversions.poles_from_message(message)
+    assert_equal(back, poles)
+    assert_equal(origin, ORIGIN)
+
+
+def test_unknown_position_is_an_empty_frame():
+    message = conversions.poles_to_message(Poles(), Origin())
+    assert message.tip_pose.header.frame_id == ""
+    assert np.isnan(message.contact_force_n)
+    assert conversions.poles_from_message(message)[1].contact.position_m is None
+
+
+def test_every_status_has_its_constant():
+    for table in (
+        conversions.GRIDS,
+        conversions.INPUT_KINDS,
+        conversions.BETWEEN_SAMPLES,
+        conversions.FRF_STATUS,
+        conversions.POLES_STATUS,
+    ):
+        assert len(set(table.values())) == len(table) == len(type(next(iter(table))))
+    message = conversions.poles_to_message(Poles(), Origin())
+    message.status = 77
+    with pytest.raises(ValueError, match="status: 77, accepted are"):
+        conversions.poles_from_message(message)
+
+
+def test_reading_makes_no_copy():
+    message = through_the_wire(
+        conversions.record_to_message(Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4))
+    )
+    record = conversions.record_from_message(message)
+    message.sensor_v[2] = 5.0
+    assert record.sensor.samples[2] == 5.0

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration file and the declarations agree; what is out of range is refused with a reason."""
+
+import os
+
+import pytest
+import yaml
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+import rclpy  # noqa: E402
+from rclpy.parameter import Parameter as RosParameter  # noqa: E402
+
+from tactile_resonance.configuration import share_path  # noqa: E402
+from tactile_resonance.nodes import (  # noqa: E402
+    excitation_node,
+    fake_hardware_node,
+    poles_node,
+)
+from tactile_resonance.processes import free_domain_id  # noqa: E402
+
+NODES = {
+    "excitation_node": excitation_node.ExcitationNode,
+    "poles_node": poles_node.PolesNode,
+    "fake_hardware_node": fake_hardware_node.FakeHardwareNode,
+}
+DECLARED = {
+    "excitation_node": excitation_node.PARAMETERS,
+    "poles_node": poles_node.PARAMETERS,
+    "fake_hardware_node": fake_hardware_node.PARAMETERS,
+}
+
+
+@pytest.fixture
+def ros():
+    with rclpy.init(domain_id=free_domain_id(os.environ)):
+        yield
+
+
+def test_file_holds_every_declared_parameter_at_its_default():
+    content = yaml.safe_load(share_path("config/nodes.yaml").read_text())
+    for node, parameters in DECLARED.items():
+        assert content[f"/**/{node}"]["ros__parameters"] == {p.name: p.default for p in parameters}
+
+
+def test_every_parameter_is_described():
+    for parameters in DECLARED.values():
+        for parameter in parameters:
+            assert parameter.description.endswith(".")
+            if isinstance(parameter.default, float) or type(parameter.default) is int:
+                assert parameter.low <= parameter.default <= parameter.high
+
+
+@pytest.mark.parametrize(
+    ("node", "name", "value"),
+    [
+        ("excitation_node", "level_v", -1.0),
+        ("excitation_node", "grid", "even"),
+        ("excitation_node", "max_level_v", 10.0),
+        ("excitation_node", "periods", 0),
+        ("poles_node", "order", 21),
+        ("fake_hardware_node", "speed", -1.0),
+    ],
+)
+def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
+    made = NODES[node]()
+    try:
+        before = made.get_parameter(name).value
+        (result,) = made.set_parameters([RosParameter(name, value=value)])
+        assert not result.successful
+        assert name in result.reason
+        assert made.get_parameter(name).value == before
+    finally:
+        made.destroy_node()
