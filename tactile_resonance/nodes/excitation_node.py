@@ -66,6 +66,10 @@ PARAMETERS = (
 )
 
 
+# How long a client may take to fetch a result.
+RESULT_TIMEOUT_S = 900
+
+
 class Cancelled(Exception):
     """The goal was cancelled."""
 
@@ -97,6 +101,7 @@ class ExcitationNode(Node):
             "measure",
             self._on_goal,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
+            result_timeout=RESULT_TIMEOUT_S,
         )
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -108,21 +113,37 @@ class ExcitationNode(Node):
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
-        finished: Future = Future(executor=self.executor)
+        outcome: list[Measure.Result | Exception] = []
+        finished: Future = Future()
+
+        # A future set from another thread may never wake its coroutine; a guard condition wakes the
+        # executor, which sets it here.
+        def wake() -> None:
+            if outcome and not finished.done():
+                finished.set_result(outcome[0])
+
+        guard = self.create_guard_condition(wake)
 
         def work() -> None:
             try:
-                finished.set_result(self._measure(goal))
-            except BaseException as error:  # noqa: BLE001 - whatever it is, the client must hear of it
-                finished.set_exception(error)
+                outcome.append(self._measure(goal))
+            except Exception as error:  # noqa: BLE001 - whatever it is, the client must hear of it
+                outcome.append(error)
+            guard.trigger()
 
         threading.Thread(target=work, name="measure", daemon=True).start()
-        return await finished
+        result = await finished
+        self.destroy_guard_condition(guard)
+        if isinstance(result, Exception):
+            raise result
+        # in this thread and at once: a goal that is over may expire before its result is taken
+        end = {Measure.Result.DONE: goal.succeed, Measure.Result.CANCELLED: goal.canceled}
+        end.get(result.outcome, goal.abort)()
+        return result
 
     def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
         result = Measure.Result()
         if not self._busy.acquire(blocking=False):
-            goal.abort()
             result.outcome = Measure.Result.REFUSED
             result.message = "a measurement is running, cancel it or wait for its result"
             return result
@@ -133,7 +154,6 @@ class ExcitationNode(Node):
             self._check_output(excitations, info)
         except (ValueError, DeviceError) as error:
             self._busy.release()
-            goal.abort()
             result.outcome = Measure.Result.REFUSED
             result.message = str(error)
             self.get_logger().error(f"refused: {error}")
@@ -141,14 +161,11 @@ class ExcitationNode(Node):
         try:
             for excitation in excitations:
                 self._play(goal, excitation, info, result)
-            goal.succeed()
             result.outcome = Measure.Result.DONE
         except Cancelled:
-            goal.canceled()
             result.outcome = Measure.Result.CANCELLED
             result.message = f"cancelled after {result.blocks} blocks"
         except DeviceError as error:
-            goal.abort()
             result.outcome = Measure.Result.FAILED
             result.message = str(error)
             self.get_logger().error(f"failed: {error}")

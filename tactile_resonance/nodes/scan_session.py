@@ -99,20 +99,22 @@ class ScanSession:
 
         self._wait(complete, timeout_s, "the nodes to find each other")
 
-    def warm_up(self, position_m: tuple[float, float, float], attempts: int = 10) -> PointResult:
+    def warm_up(self, position_m: tuple[float, float, float], attempts: int = 5) -> PointResult:
         """Measure briefly until poles come back: only then has every node heard every other.
 
         The graph tells that publishers and subscribers exist, not that each pair has matched; records
         published before that reach nobody.
         """
-        for _ in range(attempts - 1):
-            try:
-                goal = Measure.Goal(label="warm-up", periods=3)
-                return self.measure(position_m, goal, lambda done, planned: None, answer_timeout_s=1.0)
-            except NoAnswer:
-                self._check()
         goal = Measure.Goal(label="warm-up", periods=3)
-        return self.measure(position_m, goal, lambda done, planned: None)
+        for attempt in range(attempts):
+            try:
+                return self.measure(
+                    position_m, goal, lambda done, planned: None, timeout_s=10, answer_timeout_s=2
+                )
+            except NoAnswer:
+                if attempt == attempts - 1:
+                    raise
+        raise AssertionError("unreachable")
 
     def measure(
         self,

@@ -19,7 +19,7 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_session import NoAnswer, ScanSession
-from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.processes import NodeProcesses, free_domain_id
 
 NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
 GEL_10 = (0.0, 0.0, 0.0)
@@ -57,19 +57,26 @@ class Listener:
         """Measure until a whole measurement has been heard: only then has everybody found the listener."""
         for _ in range(20):
             key = session.warm_up(GEL_10).origin.measurement_id
-            for _ in range(10):
+            deadline = time.monotonic() + 1.0
+            while time.monotonic() < deadline:
                 self.executor.spin_once(timeout_sec=0.05)
-            if [len(self.of(topic, key)) for topic in self.heard] == [1, 3, 3, 3]:
-                return
+                if [len(self.of(topic, key)) for topic in self.heard] == [1, 3, 3, 3]:
+                    return
         raise AssertionError("the listener does not hear the nodes")
 
     def of(self, topic, measurement_id):
         return [m for m in self.heard[topic] if m.measurement_id == measurement_id]
 
 
-@pytest.fixture
-def session(domain, tmp_path):
-    with NodeProcesses(tmp_path) as nodes:
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """Nodes that run, and a client of theirs; shared, for starting takes longer than measuring."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        NodeProcesses(tmp_path_factory.mktemp("log")) as nodes,
+    ):
+        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         for node in NODES:
             nodes.start(node, {"speed": 0.0} if node == "fake_hardware_node" else None)
         with ScanSession(nodes.check) as session:
@@ -89,7 +96,11 @@ def test_messages_of_a_measurement(session):
         goal = Measure.Goal(label="here", periods=5, realisations=2, seed=3, level_v=0.5)
         result = session.measure(GEL_10, goal, quiet)
         key = result.origin.measurement_id
-        listener.listen(lambda: listener.of("poles", key) and listener.of("poles", key)[-1].final)
+        listener.listen(
+            lambda: all(
+                any(m.final for m in listener.of(topic, key)) for topic in ("record", "frf", "poles")
+            )
+        )
         excitations = [excitation_from_message(m) for m in listener.of("excitation", key)]
         messages = listener.of("record", key)
         frfs, poles = listener.of("frf", key), listener.of("poles", key)
