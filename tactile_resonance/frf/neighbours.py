@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bins around an excited line that carry noise and transient only, and the fit to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.frf.result import ComplexArray, FloatArray
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbourhood:
+    """Excited lines that share one pattern of neighbouring bins, hence one projector.
+
+    Attributes
+    ----------
+    lines : (L,) int
+        Indices of these lines among the plan's harmonics, ascending.
+    centre_bins : (L,) int
+        Bin of each line in the spectrum of the whole record.
+    offsets : (W,) int
+        0 first, then the neighbouring bins relative to the line.
+    projector : (1 + dof, W) float
+        Its first row takes the bins of `offsets` to the line without its transient; the others to
+        residuals whose sum of products is the covariance of that.
+    """
+
+    lines: IntArray
+    centre_bins: IntArray
+    offsets: IntArray
+    projector: FloatArray
+
+    @cached_property
+    def first_bin(self) -> int:
+        """Bin of the first line."""
+        return int(self.centre_bins[0])
+
+    @cached_property
+    def step(self) -> int | None:
+        """Bins from line to line; None where they lie irregularly."""
+        steps = np.unique(np.diff(self.centre_bins))
+        if steps.size > 1:
+            return None
+        return int(steps[0]) if steps.size else 1
+
+    def gather(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
+        """(..., W, L) bins around each line, from the spectrum (..., K) of the whole record."""
+        if self.step is None:
+            return np.take(spectrum, self.centre_bins + self.offsets[:, None], axis=-1)
+        lines = self.centre_bins.size
+        bins = np.empty((*spectrum.shape[:-1], self.offsets.size, lines), spectrum.dtype)
+        # one strided slice per offset is faster than an index per bin
+        extent = self.step * (lines - 1) + 1
+        for row, offset in enumerate(self.offsets.tolist()):
+            first = self.first_bin + offset
+            bins[..., row, :] = spectrum[..., first : first + extent : self.step]
+        return bins
+
+    def project(self, bins: npt.NDArray[np.complexfloating]) -> ComplexArray:
+        """(..., 1 + dof, L) projector times the bins (..., W, L), C-contiguous."""
+        # a real matrix times complex numbers: real and imaginary parts are just more columns
+        real = bins.view(bins.real.dtype)  # (..., W, 2 L)
+        product = np.matmul(self.projector.astype(real.dtype, copy=False), real)
+        return product.view(bins.dtype)
+
+
+def neighbourhoods(
+    harmonics: IntArray, samples_per_period: int, periods: int, order: int, dof: int, scale: float
+) -> tuple[Neighbourhood, ...]:
+    """Group lines by their neighbouring bins.
+
+    Neighbours are the nearest bins that are no harmonic. Harmonics that are not excited do not
+    count: they carry the periodic part of nonlinear distortion, which is not noise. Zero frequency,
+    the Nyquist bin and whatever lies beyond do not count either (beyond, the spectrum only repeats
+    itself), so lines at the ends of the spectrum have more neighbours on one side.
+
+    Parameters
+    ----------
+    harmonics : (F,) int
+        Excited lines, ascending.
+    samples_per_period, periods, order, dof : int
+        See `local_polynomial.LocalPolynomialPlan`.
+    scale : float
+        Factor on the line, e.g. 1 / (N P).
+
+    Raises
+    ------
+    ValueError
+        If the record has too few bins between harmonics.
+    """
+    count = neighbour_count(order, dof)
+    last = (periods * samples_per_period - 1) // 2  # below the Nyquist bin
+    available = last - last // periods
+    if available < count:
+        raise ValueError(
+            f"order, dof: {order}, {dof} need {count} bins between harmonics, a record of "
+            f"{periods} x {samples_per_period} samples has {available}; lower either, or record more"
+        )
+    inner = _nearest(0, -count * 2, count * 2, periods, count)
+    centre = harmonics.astype(np.int64) * periods
+    is_inner = (centre + inner.min() >= 1) & (centre + inner.max() <= last)
+    patterns: dict[tuple[int, ...], list[int]] = {}
+    for line in np.flatnonzero(~is_inner):
+        offsets = _nearest(int(centre[line]), 1, last, periods, count)
+        patterns.setdefault(tuple(offsets), []).append(int(line))
+    groups = [(inner, np.flatnonzero(is_inner))] if np.any(is_inner) else []
+    groups += [(np.array(offsets), np.array(lines)) for offsets, lines in patterns.items()]
+    return tuple(
+        Neighbourhood(
+            lines=lines.astype(np.int64),
+            centre_bins=centre[lines],
+            offsets=np.concatenate([[0], offsets]).astype(np.int64),
+            projector=scale * extrapolation_projector(offsets, order),
+        )
+        for offsets, lines in groups
+    )
+
+
+def neighbour_count(order: int, dof: int) -> int:
+    """Neighbouring bins used: at least ``dof + order + 1``, and even: as many on either side."""
+    return 2 * -(-(dof + order + 1) // 2)
+
+
+def extrapolation_projector(offsets: npt.NDArray[np.integer], order: int) -> FloatArray:
+    """Projector of a polynomial fit to neighbouring bins, extrapolated to the line.
+
+    Parameters
+    ----------
+    offsets : (B,) int
+        Bins relative to the line.
+    order : int
+        Order of the polynomial.
+
+    Returns
+    -------
+    (1 + B - order - 1, 1 + B) float
+        Row 0: the line minus the extrapolated polynomial. Rows i > 0: residuals, scaled so that
+        ``sum_i r_i conj(s_i)`` is an unbiased covariance of row 0 applied to two channels. For
+        white noise of variance v per bin that is ``v (1 + c)``, c from the extrapolation.
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    chapter 7 (local polynomial method, periodic signals); Pintelon, Barbe, Vandersteen &
+    Schoukens, MSSP 25 (2011) 2683-2704.
+    """
+    position = offsets / np.max(np.abs(offsets))  # well conditioned powers
+    powers = position[:, None] ** np.arange(order + 1)  # (B, order + 1)
+    q, r = np.linalg.qr(powers, mode="complete")
+    extrapolation = q[:, : order + 1] @ np.linalg.solve(r[: order + 1].T, np.eye(order + 1)[0])
+    residual_dof = offsets.size - order - 1
+    # variance of the line's own noise (1) and of the extrapolated polynomial
+    mean_variance = 1 + extrapolation @ extrapolation
+    projector = np.zeros((1 + residual_dof, 1 + offsets.size))
+    projector[0, 0] = 1
+    projector[0, 1:] = -extrapolation
+    projector[1:, 1:] = q[:, order + 1 :].T * np.sqrt(mean_variance / residual_dof)
+    return projector
+
+
+def _nearest(centre: int, first: int, last: int, periods: int, count: int) -> IntArray:
+    """Offsets of the `count` bins of first..last nearest to `centre` that are no harmonic."""
+    # enough even when all lie on one side and every second is a harmonic
+    reach = 2 * count + periods
+    bins = np.arange(max(first, centre - reach), min(last, centre + reach) + 1)
+    bins = bins[bins % periods != 0]
+    order = np.argsort(np.abs(bins - centre), kind="stable")[:count]
+    return np.sort(bins[order] - centre)
