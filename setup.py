@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Python metadata: the version comes from package.xml, the commands are listed here and nowhere else.
+"""Python metadata: the version comes from package.xml, the commands are listed here only.
 
-``pip install .`` uses it for the core without ROS; CMakeLists.txt uses it for the scripts that ROS 2 runs.
+``pip install .`` uses it for the core without ROS, hence without nodes; CMakeLists.txt asks it for
+the scripts that ROS 2 runs.
 """
 
+import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from setuptools import find_namespace_packages, setup
 NAME = "tactile_resonance"
 HERE = Path(__file__).resolve().parent
 NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+BUILT_FOR_ROS = "TACTILE_RESONANCE_BUILT_FOR_ROS" in os.environ  # set by CMakeLists.txt
 
 manifest = ElementTree.parse(HERE / "package.xml").getroot()
 
@@ -22,7 +25,8 @@ def shared(folder):
     for path in sorted((HERE / folder).rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             relative = path.relative_to(HERE)
-            grouped.setdefault(f"share/{NAME}/{relative.parent.as_posix()}", []).append(relative.as_posix())
+            target = f"share/{NAME}/{relative.parent.as_posix()}"
+            grouped.setdefault(target, []).append(relative.as_posix())
     return list(grouped.items())
 
 
@@ -37,11 +41,17 @@ setup(
     package_data={"": ["py.typed", "*.css", "*.html", "*.js", "*.json", "*.yaml"]},
     data_files=shared("config"),
     python_requires=">=3.10,<3.14",
-    install_requires=["numpy>=1.24,<3", "scipy>=1.10,<2", "matplotlib>=3.6,<4", "PyYAML>=6,<7", "tqdm>=4.60,<5"],
+    install_requires=[
+        "numpy>=1.24,<3",
+        "scipy>=1.10,<2",
+        "matplotlib>=3.6,<4",
+        "PyYAML>=6,<7",
+        "tqdm>=4.60,<5",
+    ],
     entry_points={
         "console_scripts": [
             f"{NAME} = {NAME}.cli:main",
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES if BUILT_FOR_ROS),
         ]
     },
     zip_safe=False,

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of the stream; with `use_mock_hardware` the simulated bench too."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 PACKAGE = "tactile_resonance"
 STREAM = ("excitation_node", "frf_node", "poles_node")

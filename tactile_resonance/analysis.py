@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.averaging import average_periods
+from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.excited import find_excited_harmonics
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.faults import find_faults
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -48,6 +49,7 @@ def analyse(
     *,
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
+    frf_method: str = "local polynomial",
 ) -> Analysis:
     """FRF at all excited lines, poles in a band.
 
@@ -57,6 +59,8 @@ def analyse(
     band_hz : (low, high), optional
         Around the strongest resonance when absent, with a warning that says which.
     structure : ModelStructure, optional
+    frf_method : str
+        See `frf.estimate.estimate_frf`.
 
     Raises
     ------
@@ -71,15 +75,20 @@ def analyse(
         harmonics = find_excited_harmonics(recording.u)
         warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
     found = time.perf_counter()
-    # two periods: none can be spared, and a transient would show in the difference between them
-    unsettled = 1 if recording.u.shape[-2] > 2 else 0
-    frf = average_periods(
+    frf = estimate_frf(
         recording.u,
         recording.y,
         sample_rate_hz=recording.sample_rate_hz,
         harmonics=harmonics,
-        unsettled_periods=unsettled,
+        method=frf_method,
     )
+    frf = find_faults(
+        recording.u,
+        recording.y,
+        sample_rate_hz=recording.sample_rate_hz,
+        harmonics=harmonics,
+        transient_removed=recording.u.shape[-2] > 1,
+    ).marked(frf)
     estimated = time.perf_counter()
     if band_hz is None:
         band_hz = strongest_resonance_band(frf)
@@ -90,7 +99,7 @@ def analyse(
     identified = time.perf_counter()
     if poles.status is PolesStatus.TOO_FEW_LINES:
         raise ValueError(f"band: {poles.message}")
-    if frf.status is not FrfStatus.OK:
+    if frf.message:
         warnings.append(f"frf: {frf.message}")
     if poles.message:
         warnings.append(f"poles: {poles.message}")

@@ -59,7 +59,15 @@ def test_json_and_figure_of_a_record(good, tmp_path):
     assert np.hypot(pole["real_rad_s"], pole["imag_rad_s"]) == pytest.approx(
         2 * np.pi * pole["f0_hz"]
     )
-    assert set(content) >= {"frf", "poles", "cost", "expected_cost", "status", "warnings", "timing_s"}
+    assert set(content) >= {
+        "frf",
+        "poles",
+        "cost",
+        "expected_cost",
+        "status",
+        "warnings",
+        "timing_s",
+    }
     frf = content["frf"]
     assert len({len(frf[key]) for key in ("frequency_hz", "real", "imag", "variance")}) == 1
     assert frf["frequency_hz"][0] == 100.0

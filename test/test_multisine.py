@@ -29,7 +29,9 @@ def test_energy_is_on_the_excited_lines_only(grid):
     )
 
 
-@pytest.mark.parametrize(("scale_by", "measure"), [("rms", np.std), ("peak", lambda x: max(abs(x)))])
+@pytest.mark.parametrize(
+    ("scale_by", "measure"), [("rms", np.std), ("peak", lambda x: max(abs(x)))]
+)
 def test_level_is_what_was_asked_for(scale_by, measure):
     excitation = design_multisine(level_v=2.5, scale_by=scale_by, seed=3)
     assert measure(excitation.period()) == pytest.approx(2.5, rel=1e-12)
@@ -54,7 +56,7 @@ def test_odd_random_grid_leaves_out_one_of_each_block():
 
 
 def test_realisations_share_lines_but_not_phases_and_seeds_repeat():
-    make = dict(grid=Grid.ODD_RANDOM, seed=11, realisations=2)
+    make = {"grid": Grid.ODD_RANDOM, "seed": 11, "realisations": 2}
     first = design_multisine(realisation=0, **make)
     second = design_multisine(realisation=1, **make)
     np.testing.assert_array_equal(first.harmonics, second.harmonics)

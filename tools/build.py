@@ -21,8 +21,8 @@ INSTALLED = ("tactile_resonance", "config", "launch")
 
 # What cmake looks for, in its order.
 _COMPILERS = {
-    "C": ("CC", ("cc", "gcc", "clang"), "gcc"),
-    "C++": ("CXX", ("c++", "g++", "clang++"), "g++"),
+    "C": ("CC", ("cc", "gcc", "clang")),
+    "C++": ("CXX", ("c++", "g++", "clang++")),
 }
 _PROBE = """
 #include <Python.h>
@@ -50,13 +50,13 @@ def check_tools() -> None:
 
 def find_compiler(language: str) -> str:
     """Path of the compiler that cmake will take."""
-    variable, names, package = _COMPILERS[language]
+    variable, names = _COMPILERS[language]
     named = os.environ.get(variable)
     for name in [shlex.split(named)[0]] if named else names:
         if path := shutil.which(name):
             return path
     looked_for = f"${variable}={named}" if named else ", ".join(names)
-    raise SetupError(f"no {language} compiler found ({looked_for}): apt install {package}")
+    raise SetupError(f"no {language} compiler found ({looked_for}): apt install g++")
 
 
 def build(anew: bool) -> None:
@@ -65,7 +65,9 @@ def build(anew: bool) -> None:
         shutil.rmtree(COLCON_BUILD, ignore_errors=True)
         shutil.rmtree(INSTALL, ignore_errors=True)
     with step("building messages and commands" + (" (about a minute)" if anew else "")):
-        colcon = ["colcon", "--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
+        # By its module: of a sourced ROS 2 there may be a colcon that is not in .venv/bin.
+        colcon = [PYTHON, "-c", "from colcon_core.command import main; raise SystemExit(main())"]
+        colcon += ["--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
         # Python files are linked, so that what is edited in the source tree is what runs.
         layout = ["--merge-install", "--symlink-install"]
         cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"]
@@ -81,7 +83,9 @@ def _environment() -> dict[str, str]:
     script = f'root={shlex.quote(str(ROOT))}; . "$root/tools/environment.sh"; exec env -0'
     text = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout
     env = dict(line.split("=", 1) for line in text.split("\0") if line)
-    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "CMAKE_GENERATOR", "DESTDIR"):
+    for name in ("MFLAGS", "MAKELEVEL", "CMAKE_GENERATOR", "DESTDIR"):
         env.pop(name, None)
-    # The user's own colcon defaults (layout, build type, arguments) are for their workspaces.
-    return env | {"COLCON_HOME": str(BUILD / "colcon")}
+    # The user's own colcon defaults (layout, build type, arguments) are for their workspaces. Jobs
+    # are given because colcon's own choice waits for other processes: it limits the load as well.
+    jobs = len(os.sched_getaffinity(0))
+    return env | {"COLCON_HOME": str(BUILD / "colcon"), "MAKEFLAGS": f"-j{jobs}"}

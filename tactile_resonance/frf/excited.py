@@ -61,7 +61,8 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
         raise ValueError(f"gap_db: {gap_db}, expected a positive step in decibels")
     periods, samples = u.shape[-2:]
     record = u.reshape(-1, periods * samples)  # (M, P N)
-    record = record - np.mean(record, axis=-1, keepdims=True)  # its leakage is not noise
+    # a large offset would cost precision where samples are float32
+    record = record - np.mean(record, axis=-1, keepdims=True)
     spectrum = fft.rfft(record, axis=-1)  # (M, P N // 2 + 1)
     power = np.mean(spectrum.real.astype(float) ** 2 + spectrum.imag.astype(float) ** 2, axis=0)
     harmonics = np.arange(1, (samples - 1) // 2 + 1)  # (H,)

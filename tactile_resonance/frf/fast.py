@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactile_resonance.frf.averaging import ratio_variance
 from tactile_resonance.frf.result import FRF, ComplexArray, FrfStatus
-from tactile_resonance.frf.spectra import PeriodicSpectra
+from tactile_resonance.frf.spectra import PeriodicSpectra, ratio_variance
 
 WEAK_INPUT_DB = 10.0
 """Input signal-to-noise ratio of a mean spectrum below which Y/U is biased [dB]."""

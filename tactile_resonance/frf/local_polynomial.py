@@ -5,19 +5,20 @@ The spectrum of P consecutive periods has P - 1 bins between harmonics. A period
 leaves them to noise and transient. Around each excited line a polynomial in the bin offset is
 fitted to the nearest of them, extrapolated to the line and subtracted, for input and output alike;
 the residuals of the fit give the 2 x 2 noise covariance. The neighbours lie alike around all lines
-but those at the ends of the spectrum, so the fit is one constant real matrix times a strided view
-of the spectrum.
+but those at the ends of the spectrum, so the fit is one constant real matrix times the bins around
+all lines.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 
 from tactile_resonance.frf.neighbours import Neighbourhood, neighbourhoods
+from tactile_resonance.frf.record_transform import PairSpectrum, PairTransform, Place
 from tactile_resonance.frf.result import ComplexArray
 from tactile_resonance.frf.spectra import IntArray, PeriodicSpectra, checked_harmonics
 
@@ -40,15 +41,11 @@ class LocalPolynomialPlan:
         signal-to-noise ratio wants 4.
     dof : int
         Degrees of freedom of the covariance, at least.
-    dtype : {float64, float32}
-        Precision of the Fourier transform. float32 halves its time on float32 records (others are
-        converted first, which costs a copy). It adds an error of about 1e-7 of the rms value over
-        all bins: spectra and FRF stay within 1e-6 of the double ones for lines less than some 20
-        dB below that rms value, and covariances within 1e-3 for noise less than 70 dB below
-        (2.5e-3 standard deviations at an input signal-to-noise ratio of 60 dB).
 
     Attributes
     ----------
+    transform : PairTransform
+        From records to the bins near harmonics.
     groups : tuple of Neighbourhood
         Lines by pattern of neighbouring bins.
     noise_dof : int
@@ -83,10 +80,11 @@ class LocalPolynomialPlan:
     periods: int
     order: int = 2
     dof: int = 6
-    dtype: npt.DTypeLike = np.float64
+    transform: PairTransform = field(init=False)
     groups: tuple[Neighbourhood, ...] = field(init=False)
     noise_dof: int = field(init=False)
     correlation_lines: int = field(init=False)
+    _places: tuple[tuple[tuple[Place, Place], ...], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         harmonics = checked_harmonics(self.harmonics, self.samples_per_period)
@@ -99,8 +97,6 @@ class LocalPolynomialPlan:
             raise ValueError(f"order: {self.order}, expected at least 0")
         if self.dof < 1:
             raise ValueError(f"dof: {self.dof}, expected at least 1")
-        if np.dtype(self.dtype) not in (np.dtype(np.float64), np.dtype(np.float32)):
-            raise ValueError(f"dtype: {self.dtype}, accepted are float64 and float32")
         groups = neighbourhoods(
             harmonics,
             self.samples_per_period,
@@ -109,8 +105,15 @@ class LocalPolynomialPlan:
             self.dof,
             scale=1 / (self.samples_per_period * self.periods),
         )
+        transform = PairTransform(
+            self.samples_per_period,
+            self.periods,
+            np.unique(np.concatenate([group.offsets for group in groups])),
+        )
+        places = tuple(transform.places(group.centre_bins, group.offsets) for group in groups)
         object.__setattr__(self, "harmonics", harmonics)
-        object.__setattr__(self, "dtype", np.dtype(self.dtype))
+        object.__setattr__(self, "transform", transform)
+        object.__setattr__(self, "_places", places)
         object.__setattr__(self, "groups", groups)
         object.__setattr__(self, "noise_dof", groups[0].projector.shape[0] - 1)
         object.__setattr__(self, "correlation_lines", _correlation_lines(harmonics, groups))
@@ -121,66 +124,76 @@ class LocalPolynomialPlan:
         Parameters
         ----------
         u, y : (..., P, N) float
-            Actuator and sensor, P consecutive periods of N samples from the first sample on.
+            Actuator and sensor, P consecutive periods of N samples from the first sample on. All is
+            computed in double precision; float32 records need no copy for that.
 
         Raises
         ------
         ValueError
             If the shapes do not fit the plan or a sample is not finite.
         """
-        # one channel after the other: a spectrum is dropped before the next needs the memory
-        projected = [self._project(self._transform(x, name)) for x, name in ((y, "y"), (u, "u"))]
-        return self._assemble(*projected)
+        return self.from_transform(self.transformed(u, y))
 
-    def from_spectra(
-        self,
-        spectrum_u: npt.NDArray[np.complexfloating],
-        spectrum_y: npt.NDArray[np.complexfloating],
-    ) -> PeriodicSpectra:
-        """Same, from ``scipy.fft.rfft`` of the whole records (not scaled).
+    def transformed(self, u: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> PairSpectrum:
+        """First half of a call: `transform` of records (..., P, N); ValueError where none fits."""
+        shape = (self.periods, self.samples_per_period)
+        for name, x in (("u", u), ("y", y)):
+            if np.shape(x)[-2:] != shape:
+                raise ValueError(
+                    f"{name}: shape {np.shape(x)}, expected (..., {shape[0]}, {shape[1]})"
+                )
+        return self.transform(np.asarray(y), np.asarray(u))
+
+    def from_transform(self, spectrum: PairSpectrum) -> PeriodicSpectra:
+        """Second half of a call: the method itself."""
+
+        def channels() -> Iterator[tuple[ComplexArray, ComplexArray]]:
+            for group, places in zip(self.groups, self._places, strict=True):
+                # the projector is real: it may as well work before the records are told apart
+                mixed = group.project(spectrum.gather(places))  # (..., 1 + dof, 2, L)
+                direct, mirrored = mixed[..., 0, :], mixed[..., 1, :]
+                np.conjugate(mirrored, out=mirrored)
+                y = direct + mirrored
+                yield y, np.subtract(direct, mirrored, out=direct)
+
+        return self._assembled(channels(), 0.5, -0.5j / spectrum.scale)
+
+    def from_bins(self, bins: Iterable[ComplexArray]) -> PeriodicSpectra:
+        """Same as a call, from the bins around the lines.
 
         Parameters
         ----------
-        spectrum_u, spectrum_y : (..., P N // 2 + 1) complex
+        bins : iterable over `groups` of (..., W, 2, L) complex
+            Output and input, not scaled, at ``group.centre_bins + group.offsets[:, None]``.
         """
-        return self._assemble(self._project(spectrum_y), self._project(spectrum_u))
 
-    def from_bins(
+        def channels() -> Iterator[tuple[ComplexArray, ComplexArray]]:
+            for group, group_bins in zip(self.groups, bins, strict=True):
+                projected = group.project(group_bins)  # (..., 1 + dof, 2, L)
+                yield projected[..., 0, :], projected[..., 1, :]
+
+        return self._assembled(channels(), 1.0, 1.0)
+
+    def _assembled(
         self,
-        bins_u: list[npt.NDArray[np.complexfloating]],
-        bins_y: list[npt.NDArray[np.complexfloating]],
+        channels: Iterable[tuple[ComplexArray, ComplexArray]],
+        unit_y: complex,
+        unit_u: complex,
     ) -> PeriodicSpectra:
-        """Same, from the bins around the lines, for those who obtain them without a whole spectrum.
-
-        Parameters
-        ----------
-        bins_u, bins_y : list over `groups` of (..., W, L) complex
-            Not scaled, at ``group.centre_bins + group.offsets[:, None]``.
-        """
-        return self._assemble(
-            *(
-                [group.project(bins) for group, bins in zip(self.groups, channel, strict=True)]
-                for channel in (bins_y, bins_u)
-            )
-        )
-
-    def _project(self, spectrum: npt.NDArray[np.complexfloating]) -> list[ComplexArray]:
-        """List over groups of (..., 1 + dof, L)."""
-        return [group.project(group.gather(spectrum)) for group in self.groups]
-
-    def _assemble(self, y: list[ComplexArray], u: list[ComplexArray]) -> PeriodicSpectra:
-        """Means and covariances from the projected bins of both channels."""
-        batch = np.broadcast_shapes(y[0].shape[:-2], u[0].shape[:-2])
-        spectra = np.empty((*batch, 2, self.harmonics.size), complex)
-        covariance = np.empty((*batch, 2, 2, self.harmonics.size), complex)
-        for group, group_y, group_u in zip(self.groups, y, u, strict=True):
-            where = _as_slice(group.lines)
-            spectra[..., 0, where] = group_y[..., 0, :]
-            spectra[..., 1, where] = group_u[..., 0, :]
-            residual_y, residual_u = group_y[..., 1:, :], group_u[..., 1:, :]
-            covariance[..., 0, 0, where] = _sum_of_squares(residual_y)
-            covariance[..., 1, 1, where] = _sum_of_squares(residual_u)
-            cross = np.sum(residual_y * residual_u.conj(), axis=-2)  # (..., L)
+        """Result from the projected bins of both channels (..., 1 + dof, L), in the units given."""
+        spectra = covariance = np.empty(0, complex)
+        for group, (y, u) in zip(self.groups, channels, strict=True):
+            if spectra.size == 0:
+                spectra = np.empty((*y.shape[:-2], 2, self.harmonics.size), complex)
+                covariance = np.empty((*y.shape[:-2], 2, 2, self.harmonics.size), complex)
+            where = group.where
+            spectra[..., 0, where] = unit_y * y[..., 0, :]
+            spectra[..., 1, where] = unit_u * u[..., 0, :]
+            y, u = y[..., 1:, :], u[..., 1:, :]  # residuals
+            covariance[..., 0, 0, where] = abs(unit_y) ** 2 * _sum_of_squares(y)
+            covariance[..., 1, 1, where] = abs(unit_u) ** 2 * _sum_of_squares(u)
+            products = np.multiply(y, np.conjugate(u, out=u), out=u)  # in place: u is done with
+            cross = unit_y * np.conj(unit_u) * products.sum(axis=-2)  # (..., L)
             covariance[..., 0, 1, where] = cross
             covariance[..., 1, 0, where] = cross.conj()
         if not np.all(np.isfinite(spectra)):
@@ -196,27 +209,12 @@ class LocalPolynomialPlan:
             method=f"fast local polynomial method, order {self.order}",
         )
 
-    def _transform(self, x: npt.NDArray[np.floating], name: str) -> ComplexArray:
-        """(..., P N // 2 + 1) spectrum of the record (..., P, N)."""
-        x = np.asarray(x)
-        shape = (self.periods, self.samples_per_period)
-        if x.shape[-2:] != shape:
-            raise ValueError(f"{name}: shape {x.shape}, expected (..., {shape[0]}, {shape[1]})")
-        record = x.reshape(*x.shape[:-2], shape[0] * shape[1])
-        return scipy.fft.rfft(record.astype(self.dtype, copy=False), axis=-1)
-
 
 def _sum_of_squares(residual: ComplexArray) -> npt.NDArray[np.floating]:
     """(..., L) sum of absolute squares of residuals (..., dof, L)."""
     parts = residual.view(residual.real.dtype)  # (..., dof, 2 L), real and imaginary alternate
-    squares = np.einsum("...ij,...ij->...j", parts, parts)  # no complex product, no square root
+    squares = np.einsum("...ij,...ij->...j", parts, parts)  # no complex product, no root
     return squares[..., 0::2] + squares[..., 1::2]
-
-
-def _as_slice(lines: IntArray) -> slice | IntArray:
-    """Contiguous indices as a slice, which writes faster."""
-    first, last = int(lines[0]), int(lines[-1])
-    return slice(first, last + 1) if last - first + 1 == lines.size else lines
 
 
 def _correlation_lines(harmonics: IntArray, groups: tuple[Neighbourhood, ...]) -> int:

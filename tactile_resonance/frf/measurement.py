@@ -6,108 +6,137 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from tactile_resonance.frf.averaging import average_periods
 from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.streaming import FrfStream
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import Contact, Origin, Record
+from tactile_resonance.record import Origin, Record
 
 
 class MeasurementFrf:
-    """Collects the records of one measurement; after each, the FRF so far.
+    """Takes in the records of one measurement; after each, the FRF so far.
 
     Parameters
     ----------
     measurement_id : int
+    band_hz : (low, high), optional
+        Only lines in this band are computed; all excited lines without.
+    order, dof : int
+        Of the local polynomial method.
     """
 
-    def __init__(self, measurement_id: int) -> None:
+    def __init__(
+        self,
+        measurement_id: int,
+        *,
+        band_hz: tuple[float, float] | None = None,
+        order: int = 2,
+        dof: int = 6,
+    ) -> None:
         self.measurement_id = measurement_id
-        self._excitations: dict[int, Excitation] = {}
-        self._periods: dict[int, list[tuple[npt.NDArray, npt.NDArray]]] = {}
-        self._records: list[Record] = []
+        self._band_hz, self._order, self._dof = band_hz, order, dof
+        self._stream: FrfStream | None = None
+        self._realisation = -1
+        self._periods: dict[int, int] = {}
+        self._frf: FRF | None = None
         self._notes: list[str] = []
+        self._first: Record | None = None
+        self._last: Record | None = None
+        self._forces_n: list[float] = []
+        self.saturated = False
 
-    def add(self, record: Record, excitation: Excitation) -> None:
-        """Take in the next record, played as `excitation`.
+    def add(self, record: Record, excitation: Excitation) -> FRF:
+        """FRF with the next record, played as `excitation`.
 
-        A gap in the block indices is noted; what follows it in that realisation is not used, because the
-        periods would no longer be consecutive.
+        A gap in the block indices is noted; what follows it in that realisation is not used, because
+        the periods would no longer be consecutive. A realisation under way counts once it has as many
+        periods as the ones before.
 
         Raises
         ------
         ValueError
-            If the record does not fit the excitation.
+            If the record does not fit the excitation, or the band holds no line of it.
         """
         n = excitation.samples_per_period
         u, y = record.actuator.volts(), record.sensor.volts()
         if u.shape != y.shape or u.size == 0 or u.size % n or record.samples_per_period != n:
             raise ValueError(
-                f"record: {u.size} and {y.size} samples, expected whole periods of {n} on both channels"
+                f"record: {u.size} and {y.size} samples, expected whole periods of {n} on both "
+                "channels"
             )
-        self._records.append(record)
-        periods = self._periods.setdefault(record.realisation, [])
-        self._excitations[record.realisation] = excitation
-        for channel, name in ((record.actuator, "actuator"), (record.sensor, "sensor")):
-            if channel.saturated:
-                self._note(f"{name} saturated")
-        if record.block_index * (u.size // n) != len(periods):
+        if self._stream is None:
+            self._stream = FrfStream(
+                excitation.harmonics,
+                n,
+                sample_rate_hz=excitation.sample_rate_hz,
+                band_hz=self._band_hz,
+                order=self._order,
+                dof=self._dof,
+                max_periods=excitation.periods,
+            )
+        self._remember(record)
+        so_far = self._periods.setdefault(record.realisation, 0)
+        if record.block_index * (u.size // n) != so_far:
             self._note(
                 f"realisation {record.realisation}: blocks lost before block {record.block_index}, "
                 "not used from there on"
             )
-            return
-        periods += zip(u.reshape(-1, n), y.reshape(-1, n))
+        else:
+            self._take(self._stream, record.realisation, u.reshape(-1, n), y.reshape(-1, n))
+        return self.frf()
 
     def frf(self) -> FRF:
-        """FRF from all realisations that have as many periods as the longest; those under way wait.
-
-        The first period of each realisation is left out as unsettled where two others remain.
-        """
-        longest = max(len(periods) for periods in self._periods.values())
-        if longest == 0:
-            empty = np.empty(0)
-            return FRF(empty, empty.astype(complex), status=FrfStatus.FAILED, message=self._message())
-        complete = [k for k, periods in self._periods.items() if len(periods) == longest]
-        u, y = (
-            np.stack([[period[i] for period in self._periods[k]] for k in complete])
-            for i in (0, 1)
-        )  # (M, P, N)
-        excitation = self._excitations[complete[0]]
-        frf = average_periods(
-            u,
-            y,
-            sample_rate_hz=excitation.sample_rate_hz,
-            harmonics=excitation.harmonics,
-            unsettled_periods=1 if longest > 2 else 0,
-        )
-        if self._notes:
-            frf = replace(
-                frf,
-                status=FrfStatus.SUSPECT,
-                message="; ".join(filter(None, [frf.message, self._message()])),
-            )
-        return frf
+        """The FRF so far; status FAILED where no period could be used."""
+        frf = self._frf
+        if frf is None:
+            frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
+        if not self._notes:
+            return frf
+        status = FrfStatus.FAILED if frf.status is FrfStatus.FAILED else FrfStatus.SUSPECT
+        message = "; ".join(filter(None, [frf.message, *self._notes]))
+        return replace(frf, status=status, message=message)
 
     def origin(self) -> Origin:
-        """Where the FRF comes from: middle of the acquisition, last pose, mean force."""
-        first, last = self._records[0], self._records[-1]
-        end_ns = last.origin.time_ns + round(last.duration_s * 1e9)
-        forces = np.array([record.origin.contact.force_n for record in self._records])
-        contact: Contact = replace(last.origin.contact, force_n=float(forces.mean()))
+        """Where the FRF comes from: middle of the acquisition, last pose, mean force.
+
+        Raises
+        ------
+        ValueError
+            Before the first record.
+        """
+        if self._first is None or self._last is None:
+            raise ValueError("records: none so far, expected at least 1")
+        last = self._last.origin
+        end_ns = last.time_ns + round(self._last.duration_s * 1e9)
         return replace(
-            last.origin, time_ns=(first.origin.time_ns + end_ns) // 2, contact=contact
+            last,
+            time_ns=(self._first.origin.time_ns + end_ns) // 2,
+            contact=replace(last.contact, force_n=float(np.mean(self._forces_n))),
         )
 
-    @property
-    def saturated(self) -> bool:
-        """A channel of any record stood at the end of its range."""
-        return any(r.actuator.saturated or r.sensor.saturated for r in self._records)
+    def _take(self, stream: FrfStream, realisation: int, u: np.ndarray, y: np.ndarray) -> None:
+        """Periods (P, N) that follow those of the same realisation without a gap."""
+        if realisation != self._realisation and stream.periods:
+            stream.next_realisation()
+        self._realisation = realisation
+        for period_u, period_y in zip(u, y, strict=True):
+            single = stream.add_period(period_u, period_y)
+            self._periods[realisation] += 1
+        if len(self._periods) == 1:
+            self._frf = single
+        elif stream.periods >= max(self._periods.values()):
+            self._frf = stream.robust().frf
+
+    def _remember(self, record: Record) -> None:
+        if self._first is None:
+            self._first = record
+        self._last = record
+        self._forces_n.append(record.origin.contact.force_n)
+        for channel, name in ((record.actuator, "actuator"), (record.sensor, "sensor")):
+            if channel.saturated:
+                self.saturated = True
+                self._note(f"{name} saturated")
 
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
-
-    def _message(self) -> str:
-        return "; ".join(self._notes)

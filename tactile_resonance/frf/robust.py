@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_resonance.frf.averaging import ratio_variance
 from tactile_resonance.frf.fast import response_status
 from tactile_resonance.frf.result import FRF, ComplexArray, FloatArray, FrfStatus
-from tactile_resonance.frf.spectra import PeriodicSpectra
+from tactile_resonance.frf.spectra import PeriodicSpectra, ratio_variance
 
 
 @dataclass(frozen=True, eq=False)

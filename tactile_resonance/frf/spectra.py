@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+import scipy.fft
 
-from tactile_resonance.frf.averaging import period_spectra
 from tactile_resonance.frf.result import ComplexArray, FloatArray
 
 IntArray = npt.NDArray[np.int64]
@@ -72,6 +72,24 @@ class PeriodicSpectra:
             spectra=self.spectra[..., where],
             covariance=None if self.covariance is None else self.covariance[..., where],
         )
+
+
+def period_spectra(
+    samples: npt.NDArray[np.floating], harmonics: npt.NDArray[np.int64]
+) -> ComplexArray:
+    """Spectrum of each period at the given harmonics.
+
+    Parameters
+    ----------
+    samples : (..., N) float
+    harmonics : (F,) int
+
+    Returns
+    -------
+    (..., F) complex
+        ``X[k] = (1/N) sum_n x[n] exp(-j 2 pi k n / N)``; single precision stays single.
+    """
+    return scipy.fft.rfft(samples, axis=-1, norm="forward")[..., harmonics]
 
 
 def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
@@ -178,3 +196,28 @@ def stacked_spectra(realisations: Sequence[PeriodicSpectra]) -> PeriodicSpectra:
         covariance=np.stack(covariances, axis=-4) if complete else None,
         noise_dof=min(each.noise_dof for each in realisations) if complete else 0,
     )
+
+
+def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
+    """Variance of Y/U, to first order in the noise.
+
+    Parameters
+    ----------
+    mean : (..., 2, F) complex
+        [Y; U].
+    covariance : (..., 2, 2, F) complex
+
+    Returns
+    -------
+    (..., F) float
+        ``|Y/U|^2 (C_YY/|Y|^2 + C_UU/|U|^2 - 2 Re(C_YU / (Y conj U)))``, written without dividing by Y
+        (Pintelon &
+        Schoukens 2012, chapter 2).
+    """
+    u = mean[..., 1, :]
+    g = mean[..., 0, :] / u
+    return (
+        covariance[..., 0, 0, :].real
+        + np.abs(g) ** 2 * covariance[..., 1, 1, :].real
+        - 2 * np.real(covariance[..., 0, 1, :] * g.conj())
+    ) / np.abs(u) ** 2

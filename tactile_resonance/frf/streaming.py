@@ -87,7 +87,7 @@ class FrfStream:
         self.max_periods = max_periods
         self._order, self._dof = order, dof
         self._plans: dict[int, LocalPolynomialPlan] = {}
-        self._record = np.empty((2, 1, samples_per_period))  # (2, room, N), rows [U; Y]
+        self._record = np.empty((2, 1, samples_per_period))  # (2, room, N), rows [Y; U]
         self._finished: list[PeriodicSpectra] = []
         self._band: BandSpectrum | None = None
         self._spectra: PeriodicSpectra | None = None
@@ -120,7 +120,7 @@ class FrfStream:
             For another number of samples, samples that are not finite (the period is then not
             taken), or more than `max_periods`.
         """
-        period = np.stack([np.asarray(u, float), np.asarray(y, float)])  # (2, N)
+        period = np.stack([np.asarray(y, float), np.asarray(u, float)])  # (2, N), rows [Y; U]
         if period.shape != (2, self.samples_per_period):
             raise ValueError(
                 f"u, y: shape {period.shape[1:]}, expected ({self.samples_per_period},)"
@@ -181,12 +181,11 @@ class FrfStream:
         else:
             self._keep(period)
         if self.periods == 1:
-            return averaged_spectra(period[0, None], period[1, None], self.harmonics)
+            return averaged_spectra(period[1, None], period[0, None], self.harmonics)
         plan = self._plan(self.periods)
         if self._band is None:
-            return plan(*self._record[:, : self.periods])
-        bins = [self._band.bins(group) for group in plan.groups]  # each (2, W, L)
-        return plan.from_bins(*([group[channel] for group in bins] for channel in (0, 1)))
+            return plan(*self._record[::-1, : self.periods])
+        return plan.from_bins(self._band.bins(group) for group in plan.groups)
 
     def _keep(self, period: npt.NDArray[np.float64]) -> None:
         """Append to the record, doubling its room where needed."""

@@ -36,6 +36,7 @@ class BenchDevice:
         node.create_subscription(msg.Record, "bench/block", self._blocks.put, RESULTS)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
+        """Wait for the bench."""
         if not self._play_client.wait_for_service(timeout_sec=ANSWER_TIMEOUT_S):
             raise DeviceError(
                 f"device: no bench answers on {self._play_client.srv_name}, start fake_hardware_node"
@@ -52,10 +53,12 @@ class BenchDevice:
         )
 
     def arm(self, excitation: Excitation) -> None:
+        """Remember what to play: the bench loads nothing beforehand."""
         self._armed = excitation
         self._next_index = 0
 
     def play(self) -> None:
+        """Ask the bench to play."""
         if self._armed is None:
             raise DeviceError("device: nothing armed to play")
         request = Play.Request(
@@ -66,6 +69,7 @@ class BenchDevice:
             raise DeviceError(f"device: the bench refuses: {answer.message}")
 
     def read_block(self, timeout_s: float) -> Block:
+        """Next block of what is armed; blocks of what was stopped before are passed over."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -76,14 +80,13 @@ class BenchDevice:
             if self._armed and message.excitation_id == self._armed.excitation_id:
                 break
         if message.block_index != self._next_index:
-            raise DeviceError(
-                f"device: block {self._next_index} lost, got {message.block_index}"
-            )
+            raise DeviceError(f"device: block {self._next_index} lost, got {message.block_index}")
         self._next_index += 1
         record = record_from_message(message)
         return Block(record.block_index, record.origin.time_ns, record.actuator, record.sensor)
 
     def stop(self) -> None:
+        """Silence the bench, where there is one."""
         self._armed = None
         if self._stop_client.service_is_ready():
             self._call(self._stop_client, Trigger.Request())

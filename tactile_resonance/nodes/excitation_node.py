@@ -127,7 +127,7 @@ class ExcitationNode(Node):
         def work() -> None:
             try:
                 outcome.append(self._measure(goal))
-            except Exception as error:  # noqa: BLE001 - whatever it is, the client must hear of it
+            except Exception as error:
                 outcome.append(error)
             guard.trigger()
 
@@ -184,7 +184,9 @@ class ExcitationNode(Node):
         if not level <= max_level:
             raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
         if goal.grid and goal.grid not in GRIDS:
-            raise ValueError(f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter")
+            raise ValueError(
+                f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter"
+            )
         seed = goal.seed or seed + self._measurements
         measurement_id = goal.measurement_id or self._new_id()
         self._measurements += 1
@@ -230,9 +232,7 @@ class ExcitationNode(Node):
         result: Measure.Result,
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
-        self._excitations.publish(
-            excitation_to_message(excitation, time.time_ns(), self._frame_id)
-        )
+        self._excitations.publish(excitation_to_message(excitation, time.time_ns(), self._frame_id))
         self._device.arm(excitation)
         try:
             self._device.play()

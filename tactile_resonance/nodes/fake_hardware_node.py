@@ -64,9 +64,7 @@ class FakeHardwareNode(Node):
         declare(self, PARAMETERS)
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
-        self._scene = read_scene(
-            read_tissues(), path if path.is_absolute() else share_path(scene)
-        )
+        self._scene = read_scene(read_tissues(), path if path.is_absolute() else share_path(scene))
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
         self._tissue: Tissue | None = None

@@ -13,11 +13,18 @@ from tactile_resonance.nodes.conversions import (
     frf_to_message,
     record_from_message,
 )
+from tactile_resonance.nodes.parameters import Parameter, declare, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
 from tactile_resonance.record import Record
 
-
 MOST_WAITING = 64
+
+PARAMETERS = (
+    Parameter("band_low_hz", 0.0, "Only lines from here are computed [Hz].", 0.0, 1e7),
+    Parameter("band_high_hz", 0.0, "To here [Hz]; 0: all excited lines.", 0.0, 1e7),
+    Parameter("transient_order", 2, "Order of the local polynomial for the transient.", 0, 10),
+    Parameter("noise_dof", 6, "Degrees of freedom of the noise variance, at least.", 1, 100),
+)
 
 
 class FrfNode(Node):
@@ -25,10 +32,11 @@ class FrfNode(Node):
 
     def __init__(self) -> None:
         super().__init__("frf_node")
+        declare(self, PARAMETERS)
         self._publisher = self.create_publisher(msg.FRF, "frf", RESULTS)
         self._excitations: dict[int, Excitation] = {}
         self._waiting: list[Record] = []
-        self._measurement = MeasurementFrf(0)
+        self._measurement: MeasurementFrf | None = None
         self.create_subscription(msg.Excitation, "excitation", self._on_excitation, EXCITATIONS)
         self.create_subscription(msg.Record, "record", self._on_record, RESULTS)
 
@@ -62,16 +70,23 @@ class FrfNode(Node):
                     f"no excitation {lost.origin.excitation_id} arrived: block {lost.block_index} not used"
                 )
             return
-        if record.origin.measurement_id != self._measurement.measurement_id:
-            self._measurement = MeasurementFrf(record.origin.measurement_id)
-        self._measurement.add(record, excitation)
+        measurement = self._measurement
+        if measurement is None or record.origin.measurement_id != measurement.measurement_id:
+            measurement = self._measurement = self._begin(record.origin.measurement_id)
+        frf = measurement.add(record, excitation)
         self._publisher.publish(
-            frf_to_message(
-                self._measurement.frf(),
-                self._measurement.origin(),
-                excitation.level_v,
-                self._measurement.saturated,
-            )
+            frf_to_message(frf, measurement.origin(), excitation.level_v, measurement.saturated)
+        )
+
+    def _begin(self, measurement_id: int) -> MeasurementFrf:
+        low_hz, high_hz, order, dof = values(
+            self, "band_low_hz", "band_high_hz", "transient_order", "noise_dof"
+        )
+        return MeasurementFrf(
+            measurement_id,
+            band_hz=(low_hz, high_hz) if high_hz > 0 else None,
+            order=order,
+            dof=dof,
         )
 
 

@@ -149,9 +149,7 @@ class ScanSession:
     def _place(self, position_m: tuple[float, float, float]) -> None:
         """Say where the tip is until the bench's truth carries that very pose."""
         now_ns = time.time_ns()
-        pose = pose_to_message(
-            Contact(position_m=position_m, frame_id="table", time_ns=now_ns)
-        )
+        pose = pose_to_message(Contact(position_m=position_m, frame_id="table", time_ns=now_ns))
 
         def there() -> bool:
             self._pose.publish(pose)

@@ -101,7 +101,7 @@ def _read_mat(path: Path) -> Mapping[str, np.ndarray]:
         raise ValueError(
             f"{path.name}: MATLAB 7.3 file, accepted are versions up to 7 (save with '-v7')"
         ) from error
-    except Exception as error:  # noqa: BLE001 - loadmat raises whatever a damaged file makes it stumble on
+    except Exception as error:
         raise ValueError(f"{path.name}: no .mat record ({_first_line(error)})") from error
     return {name: value for name, value in content.items() if not name.startswith("__")}
 
@@ -122,7 +122,7 @@ def _read_csv(path: Path) -> Mapping[str, np.ndarray]:
         raise ValueError(
             f"{path.name}: {columns.shape[1]} columns under {len(names)} names, expected as many"
         )
-    return dict(zip(names, columns.T))
+    return dict(zip(names, columns.T, strict=False))
 
 
 def _sample_rate(fields: Mapping[str, np.ndarray], path: Path) -> float:

@@ -76,9 +76,13 @@ def make_recording(
             f"{y_name}: shape {channels[1].shape}, expected that of {u_name}, {channels[0].shape}"
         )
     if segments is not None:
-        channels = [_cut(x, segments, name) for x, name in zip(channels, (u_name, y_name))]
+        channels = [
+            _cut(x, segments, name) for x, name in zip(channels, (u_name, y_name), strict=False)
+        ]
     n = _period_length(channels[0].shape, samples_per_period, periods, u_name)
-    channels = [x.reshape((1,) * (3 - x.ndim) + x.shape) for x in channels]  # (M, P, N) or (M, 1, n)
+    channels = [
+        x.reshape((1,) * (3 - x.ndim) + x.shape) for x in channels
+    ]  # (M, P, N) or (M, 1, n)
     channels = [x.reshape(x.shape[0], -1, n) for x in channels]
     if periods is not None:
         if not 1 <= periods <= channels[0].shape[1]:
@@ -86,7 +90,7 @@ def make_recording(
                 f"periods: {periods}, accepted is 1..{channels[0].shape[1]}, the periods recorded"
             )
         channels = [x[:, :periods] for x in channels]
-    for x, name in zip(channels, (u_name, y_name)):
+    for x, name in zip(channels, (u_name, y_name), strict=False):
         _check_samples(x, name)
     realisations, used = channels[0].shape[:2]
     if realisations < 2 and used < 2:

@@ -20,7 +20,9 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
     whole = axes["whole"]
     whole.plot(frf.frequency_hz, decibel(np.abs(frf.g) ** 2), ".", ms=2, label="|G|")
     if frf.variance is not None:
-        whole.plot(frf.frequency_hz, decibel(frf.variance), ".", ms=2, label="its standard deviation")
+        whole.plot(
+            frf.frequency_hz, decibel(frf.variance), ".", ms=2, label="its standard deviation"
+        )
     whole.axvspan(*poles.band_hz, color="0.9", label="band of the fit")
     whole.set(xlabel="frequency [Hz]", ylabel="[dB]")
     whole.legend(loc="best", fontsize="small")
@@ -35,7 +37,12 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
         band.plot(fine, decibel(np.abs(model) ** 2), "k-", lw=1, label="model")
         left = inside.g - poles.fit.response(inside.frequency_hz)
         band.plot(
-            inside.frequency_hz, decibel(np.abs(left) ** 2), ".", ms=3, color="C3", label="|G - model|"
+            inside.frequency_hz,
+            decibel(np.abs(left) ** 2),
+            ".",
+            ms=3,
+            color="C3",
+            label="|G - model|",
         )
         phase.plot(fine, np.degrees(np.unwrap(np.angle(model))), "k-", lw=1)
     if inside.variance is not None:
@@ -47,7 +54,7 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
     phase.set(xlabel="frequency [Hz]", ylabel="phase [degrees]")
 
     pole_axes = axes["poles"]
-    for k, (f0_hz, damping_ratio) in enumerate(zip(poles.f0_hz, poles.damping_ratio)):
+    for k, (f0_hz, damping_ratio) in enumerate(zip(poles.f0_hz, poles.damping_ratio, strict=False)):
         pole_axes.plot(f0_hz, damping_ratio, "k+", ms=10)
         for covariance, colour, name in (
             (poles.total_covariance, "C1", "95 %, total"),

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from tactile_resonance.frf.averaging import average_periods, ratio_variance
+from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
@@ -50,9 +51,7 @@ def test_exact_data_give_the_exact_pole():
     # 100 s / A has the residue 100 p / A'(p) at the pole p, with A' = 2 p + 2 damping w0
     residue = 100 * expected / (2 * expected + 2 * DAMPING * w0)
     np.testing.assert_allclose(poles.residues, [residue], rtol=1e-9)
-    np.testing.assert_allclose(
-        poles.fit.response(LINES_HZ), second_order(LINES_HZ), rtol=1e-11
-    )
+    np.testing.assert_allclose(poles.fit.response(LINES_HZ), second_order(LINES_HZ), rtol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -84,13 +83,7 @@ def test_silverbox_gives_the_reference(shared_data):
         np.stack([content[name].ravel()[end - 8192 : end] for end in ends])[:, None]
         for name in ("V1", "V2")
     )
-    frf = average_periods(
-        u,
-        y,
-        sample_rate_hz=1e7 / 2**14,
-        harmonics=np.arange(1, 2684, 2),
-        unsettled_periods=0,
-    )
+    frf = estimate_frf(u, y, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2))
     bare = identify_poles(frf, (40.0, 110.0), BARE)
     assert bare.lines == 470
     assert bare.f0_hz[0] == pytest.approx(69.536, abs=0.0006)

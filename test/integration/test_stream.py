@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
-from tactile_resonance.action import Measure
-from tactile_resonance.frf.averaging import average_periods
+from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.nodes.conversions import (
     excitation_from_message,
     frf_from_message,
@@ -37,7 +37,7 @@ class Listener:
         self.executor.add_node(self.node)
         self.heard = {"excitation": [], "record": [], "frf": [], "poles": []}
         types = (msg.Excitation, msg.Record, msg.FRF, msg.Poles)
-        for (topic, list_), kind in zip(self.heard.items(), types):
+        for (topic, list_), kind in zip(self.heard.items(), types, strict=False):
             qos = EXCITATIONS if topic == "excitation" else RESULTS
             self.node.create_subscription(kind, topic, list_.append, qos)
         return self
@@ -98,7 +98,8 @@ def test_messages_of_a_measurement(session):
         key = result.origin.measurement_id
         listener.listen(
             lambda: all(
-                any(m.final for m in listener.of(topic, key)) for topic in ("record", "frf", "poles")
+                any(m.final for m in listener.of(topic, key))
+                for topic in ("record", "frf", "poles")
             )
         )
         excitations = [excitation_from_message(m) for m in listener.of("excitation", key)]
@@ -137,10 +138,10 @@ def test_messages_of_a_measurement(session):
         for name in ("actuator", "sensor")
     )
     frf, _ = frf_from_message(last)
-    alone = average_periods(u, y, sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
+    alone = estimate_frf(u, y, sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
     np.testing.assert_allclose(frf.g, alone.g, rtol=1e-12)
     np.testing.assert_allclose(frf.variance_total, alone.variance_total, rtol=1e-9)
-    assert (frf.periods, frf.realisations) == (4, 2)
+    assert (frf.periods, frf.realisations) == (5, 2)
     assert last.level_v == pytest.approx(0.5)
 
     # and the poles are those of the tissue under the tip
@@ -172,8 +173,12 @@ def test_level_above_the_sensors_limit_is_refused(session):
 def test_a_node_that_ended_is_named(domain, tmp_path):
     with NodeProcesses(tmp_path) as nodes:
         nodes.start("fake_hardware_node", {"scene": "nowhere.yaml"})
-        deadline = time.monotonic() + 30
         with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*nowhere.yaml"):
-            while time.monotonic() < deadline:
-                nodes.check()
-                time.sleep(0.1)
+            wait_for_an_end(nodes)
+
+
+def wait_for_an_end(nodes):
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        nodes.check()
+        time.sleep(0.1)

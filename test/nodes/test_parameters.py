@@ -9,24 +9,27 @@ import yaml
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy  # noqa: E402
-from rclpy.parameter import Parameter as RosParameter  # noqa: E402
+import rclpy
+from rclpy.parameter import Parameter as RosParameter
 
-from tactile_resonance.configuration import share_path  # noqa: E402
-from tactile_resonance.nodes import (  # noqa: E402
+from tactile_resonance.configuration import share_path
+from tactile_resonance.nodes import (
     excitation_node,
     fake_hardware_node,
+    frf_node,
     poles_node,
 )
-from tactile_resonance.processes import free_domain_id  # noqa: E402
+from tactile_resonance.processes import free_domain_id
 
 NODES = {
     "excitation_node": excitation_node.ExcitationNode,
+    "frf_node": frf_node.FrfNode,
     "poles_node": poles_node.PolesNode,
     "fake_hardware_node": fake_hardware_node.FakeHardwareNode,
 }
 DECLARED = {
     "excitation_node": excitation_node.PARAMETERS,
+    "frf_node": frf_node.PARAMETERS,
     "poles_node": poles_node.PARAMETERS,
     "fake_hardware_node": fake_hardware_node.PARAMETERS,
 }

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Even and odd distortion at detection lines."""
+
+import numpy as np
+import pytest
+from scipy import io, signal
+
+from tactile_resonance.frf.distortion import nonlinear_distortion
+from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.spectra import averaged_spectra
+from tactile_resonance.multisine import Grid, harmonics_on_grid
+
+SILVERBOX_ENDS = (48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196)
+SAMPLES = 1024
+EXCITED = harmonics_on_grid(1, 201, Grid.ODD_RANDOM, seed=3)
+ALL = np.arange(1, 202)
+
+
+def records(rng, multisine, nonlinearity, noise, *, realisations=3, periods=4):
+    u = multisine(EXCITED, SAMPLES, rng, amplitude=0.15, records=(realisations, 1))
+    u = np.broadcast_to(u, (realisations, periods, SAMPLES))
+    y = nonlinearity(u)
+    return tuple(x + noise * rng.standard_normal(x.shape) for x in (u, y))
+
+
+def distortion_of(u, y):
+    return nonlinear_distortion(averaged_spectra(u, y, ALL), EXCITED, sample_rate_hz=1024.0)
+
+
+def test_equals_the_reference_implementation(shared_data):
+    with np.load(shared_data / "oracle" / "nl_odd_random_grid.npz") as data:
+        u, y = data["u"].astype(float), data["y"].astype(float)
+        result = nonlinear_distortion(
+            averaged_spectra(u, y, np.arange(1, 1201)), data["ex"], sample_rate_hz=10e3
+        )
+        even, odd = result.even, result.odd
+        for mine, theirs in (
+            (result.frequency_hz, "fE"),
+            (result.output, "YE"),
+            (np.sqrt(result.output_variance), "sYE"),
+            (result.output / result.input, "Gm"),
+            (even.frequency_hz, "fev"),
+            (even.output, "Yev"),
+            (np.sqrt(even.output_variance), "sYev"),
+            (even.frequency_hz[even.in_band], "fevin"),
+            (even.corrected[:, even.in_band], "Ycev"),
+            (odd.frequency_hz, "fod"),
+            (odd.output, "Yod"),
+            (np.sqrt(odd.output_variance), "sYod"),
+            (odd.frequency_hz[odd.in_band], "fodin"),
+            (odd.corrected[:, odd.in_band], "Ycod"),
+        ):
+            assert np.max(np.abs(mine / data[f"fast_{theirs}"] - 1)) < 1e-6, theirs
+    assert even.above_noise
+    assert odd.above_noise
+
+
+def test_silverbox_even_output_is_near_minus_48_db(shared_data):
+    data = io.loadmat(shared_data / "silverbox" / "SNLS80mV.mat")
+    u, y = (
+        np.stack([data[name][0][end - 8192 : end] for end in SILVERBOX_ENDS])[:, None, :]
+        for name in ("V1", "V2")
+    )  # (M, 1, N)
+    spectra = averaged_spectra(u, y, np.arange(1, 2684))
+    result = nonlinear_distortion(spectra, np.arange(1, 2684, 2), sample_rate_hz=1e7 / 2**14)
+    assert result.even.rms_output_level_db == pytest.approx(-48, abs=1)
+    assert result.even.above_noise is None  # single periods: the noise is not known
+    assert not np.any(result.odd.in_band)
+    assert np.isnan(result.odd.rms_level_db)
+    assert "noise level unknown" in result.summary()
+    assert "No odd detection lines" in result.summary()
+
+
+@pytest.mark.parametrize(
+    ("nonlinearity", "even", "odd"),
+    [
+        (lambda u: u, False, False),
+        (lambda u: u + 0.02 * u**2, True, False),
+        (lambda u: u + 0.02 * u**3, False, True),
+        (lambda u: u + 0.02 * u**2 + 0.02 * u**3, True, True),
+    ],
+)
+def test_parities_are_told_apart(multisine, nonlinearity, even, odd):
+    u, y = records(np.random.default_rng(1), multisine, nonlinearity, 1e-3)
+    result = distortion_of(u, y)
+    assert bool(result.even.above_noise) is even
+    assert bool(result.odd.above_noise) is odd
+    assert result.summary().count("nothing above noise") == (not even) + (not odd)
+
+
+def test_level_of_a_square_is_known(multisine):
+    """u^2 of a flat multisine: its power is predicted from the spectrum of the true square."""
+    rng = np.random.default_rng(2)
+    u, y = records(rng, multisine, lambda u: 3 * u + 0.1 * u**2, 0.0, periods=1)
+    result = distortion_of(u, y)
+    square = np.fft.rfft(0.1 * u[:, 0] ** 2)[:, result.even.harmonics] / SAMPLES
+    assert np.allclose(result.even.corrected, square, atol=1e-12, equal_nan=True)
+    inside = result.even.in_band
+    power = np.mean(np.abs(square[:, inside]) ** 2)
+    linear = 9 * (0.15 / 2) ** 2
+    assert result.even.rms_level_db == pytest.approx(10 * np.log10(power / linear), abs=1e-6)
+
+
+def test_distortion_of_the_input_is_no_distortion_of_the_system(multisine):
+    """A distorted drive through a linear system: seen at input and output, none left corrected."""
+    rng = np.random.default_rng(3)
+    drive, _ = records(rng, multisine, lambda u: u, 0.0)
+    u = drive + 0.05 * drive**2 + 0.05 * drive**3
+    b, a = [0.2], [1, -0.8]  # smooth over the spacing of the lines
+    y = np.fft.irfft(
+        np.fft.rfft(u) * signal.freqz(b, a, 2 * np.pi * np.arange(SAMPLES // 2 + 1) / SAMPLES)[1],
+        SAMPLES,
+    )
+    u, y = (x + 1e-3 * rng.standard_normal(x.shape) for x in (u, y))
+    result = distortion_of(u, y)
+    for lines in (result.even, result.odd):
+        assert lines.rms_input_level_db > -50
+        assert lines.rms_output_level_db > -50
+        # what is left comes from interpolating the response between lines
+        assert lines.rms_level_db < lines.rms_output_level_db - 20
+
+
+def test_false_alarms_are_as_rare_as_stated(multisine):
+    rng = np.random.default_rng(4)
+    alarms = 0
+    runs = 300
+    for _ in range(runs):
+        u, y = records(rng, multisine, lambda u: u, 0.01, realisations=1, periods=2)
+        result = distortion_of(u, y)
+        alarms += int(result.even.above_noise) + int(result.odd.above_noise)
+    # 1 % of 600; eight standard deviations of a Poisson number of 6
+    assert alarms < 6 + 8 * np.sqrt(6)
+
+
+def test_noise_level_is_that_of_the_mean(multisine):
+    rng = np.random.default_rng(5)
+    noise, periods = 0.01, 50
+    u, y = records(rng, multisine, lambda u: 2 * u, noise, periods=periods)
+    level = distortion_of(u, y).even.rms_noise_level_db
+    expected = noise**2 * (1 + 4) / (SAMPLES * periods) / (2 * 0.15 / 2) ** 2
+    assert level == pytest.approx(10 * np.log10(expected), abs=0.2)
+
+
+def test_local_polynomial_spectra_serve_as_well(multisine):
+    rng = np.random.default_rng(6)
+    u, y = records(rng, multisine, lambda u: u + 0.02 * u**2, 1e-3)
+    fitted = nonlinear_distortion(
+        LocalPolynomialPlan(ALL, SAMPLES, 4)(u, y), EXCITED, sample_rate_hz=1024.0
+    )
+    plain = distortion_of(u, y)
+    assert fitted.even.rms_level_db == pytest.approx(plain.even.rms_level_db, abs=0.05)
+    assert bool(fitted.even.above_noise)
+    assert not bool(fitted.odd.above_noise)
+
+
+def test_outside_the_band_nothing_is_corrected(multisine):
+    u, y = records(np.random.default_rng(7), multisine, lambda u: u + u**2, 1e-3)
+    result = nonlinear_distortion(
+        averaged_spectra(u, y, np.arange(1, 400)), EXCITED, sample_rate_hz=1024.0
+    )
+    outside = result.even.harmonics > EXCITED[-1]
+    assert np.all(np.isnan(result.even.corrected[:, outside]))
+    assert np.all(np.isfinite(result.even.output[:, outside]))
+    smoothed = result.even.smoothed_level_db(11)
+    assert np.array_equal(np.isfinite(smoothed), result.even.in_band)
+
+
+def test_refusals(multisine):
+    u, y = records(np.random.default_rng(8), multisine, lambda u: u, 0.0)
+    spectra = averaged_spectra(u, y, ALL)
+    with pytest.raises(ValueError, match="even ones are among them"):
+        nonlinear_distortion(spectra, [1, 2, 3], sample_rate_hz=1.0)
+    with pytest.raises(ValueError, match="only excited harmonics"):
+        nonlinear_distortion(spectra.at(EXCITED), EXCITED, sample_rate_hz=1.0)
+    with pytest.raises(ValueError, match=r"harmonics: \[301\] are not among"):
+        nonlinear_distortion(spectra, [1, 3, 301], sample_rate_hz=1.0)
+    with pytest.raises(ValueError, match="expected .* with realisations M"):
+        nonlinear_distortion(averaged_spectra(u[0], y[0], ALL), EXCITED, sample_rate_hz=1.0)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Acquisition faults, each injected alone into a good record, and none seen in a good one."""
+
+import numpy as np
+import pytest
+from scipy import io, signal
+
+from tactile_resonance.frf.fast import fast_frf
+from tactile_resonance.frf.fault_types import FaultKind, FaultReport
+from tactile_resonance.frf.faults import find_faults
+from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.result import FrfStatus
+
+RATE, SAMPLES, PERIODS = 2000.0, 1000, 6
+LINES = np.arange(5, 200, 2)  # 10 to 398 Hz
+
+
+@pytest.fixture
+def record(multisine):
+    rng = np.random.default_rng(1)
+    u = np.tile(multisine(LINES, SAMPLES, rng, amplitude=0.1), (PERIODS, 1))
+    y = 0.5 * np.roll(u, 3, axis=-1)
+    return u + 1e-3 * rng.standard_normal(u.shape), y + 1e-3 * rng.standard_normal(u.shape)
+
+
+def check(u, y, **settings):
+    return find_faults(u, y, sample_rate_hz=RATE, harmonics=LINES, **settings)
+
+
+def only(report, kind, channel):
+    assert report.kinds == {kind}, report.message
+    (fault,) = report.faults
+    assert fault.channel == channel
+    return fault
+
+
+def test_good_records_have_none(multisine):
+    rng = np.random.default_rng(2)
+    u = multisine(LINES, SAMPLES, rng, amplitude=0.1, records=(40, 1))
+    u = np.broadcast_to(u, (40, PERIODS, SAMPLES))
+    for noise in (1e-3, 0.1):
+        noisy = [u + noise * rng.standard_normal(u.shape) for _ in range(2)]
+        report = check(*noisy, u_range_v=(-10, 10), y_range_v=(-10, 10))
+        assert report == FaultReport()
+    assert not report.suspect
+
+
+@pytest.mark.parametrize("step", [1e-3, 1e-2, 0.1])
+def test_quantised_record_is_not_saturated(record, step):
+    assert check(*(np.round(x / step) * step for x in record)) == FaultReport()
+
+
+def test_quantised_sine_is_not_saturated():
+    t = np.arange(4000).reshape(4, 1000) / 1000
+    for amplitude in np.linspace(20, 21, 11):
+        x = np.round(amplitude * np.sin(2 * np.pi * 7 * t))
+        report = find_faults(x, x, sample_rate_hz=1000.0, harmonics=np.array([7]))
+        assert FaultKind.SATURATION not in report.kinds
+
+
+def test_saturation(record):
+    u, y = record
+    top = 0.9 * y.max()
+    fault = only(check(u, np.minimum(y, top)), FaultKind.SATURATION, "sensor")
+    assert fault.spoils
+    fault = only(check(u, y, u_range_v=(-5, u.max())), FaultKind.SATURATION, "actuator")
+    assert fault.value == 1
+
+
+def test_missing_samples(record):
+    u, y = record
+    gap = y.copy()
+    gap[2, 100:130] = np.nan
+    fault = only(check(u, gap), FaultKind.MISSING_SAMPLES, "sensor")
+    assert fault.value == 30
+    held = u.copy()
+    held[2, 100:130] = held[2, 99]
+    fault = only(check(held, y), FaultKind.MISSING_SAMPLES, "actuator")
+    assert fault.value == 31
+    assert fault.spoils
+    assert check(u, np.zeros_like(y)).kinds == {FaultKind.MISSING_SAMPLES}
+
+
+def test_lost_samples(record):
+    u, y = record
+    lost = np.append(np.delete(u.ravel(), np.arange(3300, 3307)), u.ravel()[:7])
+    fault = only(check(lost.reshape(u.shape), y), FaultKind.LOST_SAMPLES, "actuator")
+    assert fault.value == 7
+    assert fault.spoils
+
+
+def test_offset_and_drift(record):
+    u, y = record
+    fault = only(check(u, y + 1), FaultKind.OFFSET, "sensor")
+    assert not fault.spoils
+    ramp = 0.3 * np.linspace(-1, 1, y.size).reshape(y.shape)
+    report = check(u, y + ramp)
+    assert FaultKind.DRIFT in report.kinds
+    assert report.suspect
+    assert not check(u, y + ramp, transient_removed=True).suspect
+
+
+# 50 Hz is an excited line, 60 Hz lies six bins from the next
+@pytest.mark.parametrize(("mains", "near"), [(50.013, True), (60.02, False)])
+def test_hum(record, mains, near):
+    u, y = record
+    t = np.arange(y.size).reshape(y.shape) / RATE
+    fault = only(check(u, y + 0.01 * np.sin(2 * np.pi * mains * t)), FaultKind.HUM, "sensor")
+    assert f"{round(mains)} Hz" in fault.message
+    assert fault.spoils is near
+
+
+def test_hum_of_the_silverbox(shared_data):
+    """Single periods: the hum stands out of the harmonics that are not excited."""
+    data = io.loadmat(shared_data / "silverbox" / "SNLS80mV.mat")
+    end = 48946
+    u, y = (data[name][0][end - 8192 : end][None] for name in ("V1", "V2"))
+    report = find_faults(u, y, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2))
+    assert FaultKind.HUM in report.kinds
+    assert "150" in report.message
+
+
+def test_distortion_is_not_hum(shared_data):
+    with np.load(shared_data / "oracle" / "nl_odd_random_grid.npz") as data:
+        report = find_faults(data["u"], data["y"], sample_rate_hz=10e3, harmonics=data["ex"])
+    assert report == FaultReport()
+
+
+def test_first_period_not_settled(record):
+    u, _ = record
+    rng = np.random.default_rng(3)
+    b, a = [0.02], [1, -2 * 0.99 * np.cos(0.3), 0.99**2]
+    y = signal.lfilter(b, a, u.ravel()).reshape(u.shape) + 1e-3 * rng.standard_normal(u.shape)
+    fault = only(check(u, y), FaultKind.UNSETTLED, "sensor")
+    assert fault.spoils
+    assert not check(u, y, transient_removed=True).suspect
+
+
+def test_several_records_give_the_worst(record):
+    u, y = record
+    worse = y.copy()
+    worse[2, 100:130] = np.nan
+    report = check(np.stack([u, u, u]), np.stack([y, worse, y]))
+    fault = only(report, FaultKind.MISSING_SAMPLES, "sensor")
+    assert "(in 1 of 3 records)." in fault.message
+
+
+def test_status_of_the_response(record):
+    u, y = record
+    frf = fast_frf(LocalPolynomialPlan(LINES, SAMPLES, PERIODS)(u, y), sample_rate_hz=RATE)
+    assert FaultReport().marked(frf) is frf
+    worth_knowing = check(u, y + 1).marked(frf)
+    assert worth_knowing.status is FrfStatus.OK
+    assert "offset" in worth_knowing.message
+    spoilt = check(u, np.minimum(y, 0.9 * y.max())).marked(frf)
+    assert spoilt.status is FrfStatus.SUSPECT
+    assert np.array_equal(spoilt.g, frf.g)
+
+
+def test_shapes_must_fit():
+    with pytest.raises(ValueError, match=r"u, y: shapes \(2, 10\), \(3, 10\)"):
+        check(np.zeros((2, 10)), np.zeros((3, 10)))

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fast local polynomial method: reference answers, exactness, sign convention, edges, refusals."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from tactile_resonance.frf.fast import fast_frf
+from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.frf.spectra import averaged_spectra
+
+
+@pytest.fixture(scope="module")
+def oracle(shared_data):
+    with np.load(shared_data / "oracle" / "lpm_full.npz") as data:
+        return dict(data)
+
+
+@pytest.mark.parametrize(
+    ("key", "harmonics", "order", "dof", "actual_dof", "correlation"),
+    [
+        ("order2_dof6", np.arange(4, 4001), 2, 6, 7, 1),
+        ("order2_dof2", np.arange(4, 4001), 2, 2, 3, 0),
+        ("order4_dof6_h80_120", np.arange(80, 121), 4, 6, 7, 1),
+    ],
+)
+def test_equals_the_reference_implementation(
+    oracle, key, harmonics, order, dof, actual_dof, correlation
+):
+    plan = LocalPolynomialPlan(harmonics, 20000, 8, order, dof)
+    result = plan(oracle["u"].reshape(8, 20000), oracle["y"].reshape(8, 20000))
+    assert np.max(np.abs(result.spectra / oracle[f"Z_{key}"] - 1)) < 1e-9
+    assert np.max(np.abs(result.covariance / oracle[f"CZ_{key}"] - 1)) < 1e-7
+    assert (result.noise_dof, result.correlation_lines) == (actual_dof, correlation)
+
+
+def test_single_precision_records_give_what_their_double_copies_give(oracle):
+    u, y = oracle["u"].reshape(8, 20000), oracle["y"].reshape(8, 20000)
+    assert u.dtype == y.dtype == np.float32
+    plan = LocalPolynomialPlan(oracle["harm"], 20000, 8)
+    single, double = plan(u, y), plan(u.astype(float), y.astype(float))
+    assert np.array_equal(single.spectra, double.spectra)
+    assert np.array_equal(single.covariance, double.covariance)
+
+
+@pytest.mark.parametrize("periods", [2, 3, 5, 8])
+@pytest.mark.parametrize("samples", [400, 401])
+@pytest.mark.parametrize("order", [0, 2, 3])
+def test_polynomial_transient_is_removed_exactly(periods, samples, order):
+    """A spectrum that is a polynomial in the bin number leaves no trace, up to the edges."""
+    rng = np.random.default_rng(periods)
+    plan = LocalPolynomialPlan(np.arange(1, (samples - 1) // 2 + 1), samples, periods, order, 4)
+    bins = np.arange(periods * samples // 2 + 1)
+    coefficients = rng.standard_normal((2, order + 1)) + 1j * rng.standard_normal((2, order + 1))
+    transient = np.polynomial.polynomial.polyval(bins / bins[-1], coefficients.T)  # (2, K)
+    lines = rng.standard_normal((2, plan.harmonics.size)) + 1j
+    spectrum = transient.copy()
+    spectrum[:, plan.harmonics * periods] += lines
+    result = plan.from_bins(
+        spectrum[:, group.centre_bins + group.offsets[:, None]].swapaxes(0, 1).copy()
+        for group in plan.groups
+    )
+    assert np.allclose(
+        result.spectra * samples * periods, lines, atol=1e-8 * np.abs(transient).max()
+    )
+    assert np.max(np.abs(result.covariance)) < 1e-16 * np.abs(transient).max() ** 2
+
+
+def test_what_stands_at_other_harmonics_does_not_matter(multisine):
+    rng = np.random.default_rng(1)
+    odd = np.arange(1, 200, 2)
+    u = np.tile(multisine(odd, 1000, rng), (3, 1)) + 0.01 * rng.standard_normal((3, 1000))
+    even = np.tile(multisine(np.arange(2, 200, 2), 1000, rng), (3, 1))
+    plan = LocalPolynomialPlan(odd, 1000, 3)
+    quiet, distorted = plan(u, u), plan(u + even, u + even)
+    assert np.allclose(quiet.spectra, distorted.spectra, rtol=0, atol=1e-12)
+    assert np.allclose(quiet.covariance, distorted.covariance, rtol=1e-9, atol=0)
+
+
+def test_lines_do_not_depend_on_which_others_are_wanted():
+    rng = np.random.default_rng(2)
+    u, y = rng.standard_normal((2, 4, 3, 500))  # (M, P, N) each
+    full = LocalPolynomialPlan(np.arange(1, 250), 500, 3)(u, y)
+    some = np.array([1, 2, 7, 50, 51, 60, 249])
+    part = LocalPolynomialPlan(some, 500, 3)(u, y)
+    assert part.spectra.shape == (4, 2, 7)
+    assert part.covariance.shape == (4, 2, 2, 7)
+    assert np.allclose(part.spectra, full.spectra[..., some - 1], rtol=1e-12, atol=0)
+    assert np.allclose(part.covariance, full.covariance[..., some - 1], rtol=1e-10, atol=0)
+    one = LocalPolynomialPlan(some, 500, 3)(u[2], y[2])
+    assert np.allclose(one.covariance, part.covariance[2], rtol=1e-10, atol=0)
+
+
+def test_covariance_is_hermitian_and_positive():
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal((2, 2, 300))
+    c = LocalPolynomialPlan(np.arange(1, 150), 300, 2)(u, y).covariance
+    assert np.array_equal(c[0, 1], c[1, 0].conj())
+    assert np.all(np.linalg.eigvalsh(np.moveaxis(c, -1, 0)) > 0)
+
+
+def _pure_delay(f, rate):
+    return np.exp(-2j * np.pi * f * 3.7 / rate)
+
+
+def _rc_low_pass(f, rate):
+    return 1 / (1 + 1j * f / (0.05 * rate))
+
+
+@pytest.mark.parametrize("system", [_pure_delay, _rc_low_pass])
+@pytest.mark.parametrize("method", ["fast", "averaged"])
+def test_response_is_not_conjugated(multisine, system, method):
+    """exp(+j omega t): a delay and a low-pass have negative phase."""
+    rng = np.random.default_rng(4)
+    samples, rate = 1000, 5000.0
+    lines = np.arange(1, 60)
+    u = multisine(lines, samples, rng)
+    f_all = np.fft.rfftfreq(samples, 1 / rate)
+    y = np.fft.irfft(np.fft.rfft(u) * system(f_all, rate), samples)
+    u, y = np.tile(u, (3, 1)), np.tile(y, (3, 1))
+    spectra = (
+        LocalPolynomialPlan(lines, samples, 3)(u, y)
+        if method == "fast"
+        else averaged_spectra(u, y, lines)
+    )
+    frf = fast_frf(spectra, sample_rate_hz=rate)
+    assert np.allclose(frf.frequency_hz, lines * 5.0)
+    assert np.allclose(frf.g, system(frf.frequency_hz, rate), atol=1e-12)
+    assert np.all(np.angle(frf.g[:20]) < 0)
+
+
+def test_a_cosine_of_peak_a_gives_half_a():
+    t = np.arange(400) / 100
+    u = 0.6 * np.cos(2 * np.pi * 7 * t + 0.4).reshape(4, 100)
+    y = 3 * np.cos(2 * np.pi * 7 * t - 0.2).reshape(4, 100)
+    spectra = LocalPolynomialPlan(np.array([7]), 100, 4)(u, y).spectra[:, 0]
+    assert np.allclose(spectra, [1.5 * np.exp(-0.2j), 0.3 * np.exp(0.4j)], atol=1e-12)
+
+
+def test_transient_of_a_resonance_from_rest(multisine):
+    """Without noise the error falls with the order, far below that of averaging all periods."""
+    rng = np.random.default_rng(5)
+    samples, periods = 2000, 4
+    lines = np.arange(2, 300)
+    b, a = [0.1, 0.05], [1, -2 * 0.995 * np.cos(0.3), 0.995**2]
+    u = np.tile(multisine(lines, samples, rng), periods)
+    y = signal.lfilter(b, a, u)
+    u, y = u.reshape(periods, samples), y.reshape(periods, samples)
+    truth = signal.freqz(b, a, 2 * np.pi * lines / samples)[1]
+
+    def error(spectra):
+        g = fast_frf(spectra, sample_rate_hz=1.0).g
+        return np.sqrt(np.mean(np.abs(g / truth - 1) ** 2))
+
+    plain = error(averaged_spectra(u, y, lines))
+    order = {r: error(LocalPolynomialPlan(lines, samples, periods, r, 2)(u, y)) for r in (0, 2, 4)}
+    assert plain > 30 * order[2]
+    assert order[0] > 3 * order[2] > 9 * order[4]
+
+
+def test_weak_input_is_suspect():
+    rng = np.random.default_rng(6)
+    u, y = rng.standard_normal((2, 4, 200))
+    frf = fast_frf(LocalPolynomialPlan(np.arange(3, 40), 200, 4)(u, y), sample_rate_hz=200.0)
+    assert frf.status is FrfStatus.SUSPECT
+    assert "10 dB above its noise" in frf.message
+
+
+def test_a_single_period_has_no_covariance(multisine):
+    u = multisine([3, 5], 100, np.random.default_rng(7))[None]
+    frf = fast_frf(averaged_spectra(u, 2 * u, [3, 5]), sample_rate_hz=100.0)
+    assert frf.status is FrfStatus.NO_COVARIANCE
+    assert frf.variance is None
+    assert frf.spectra_covariance is None
+    assert np.allclose(frf.g, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"periods": 1}, "periods: 1, expected at least 2"),
+        ({"order": -1}, "order: -1"),
+        ({"dof": 0}, "dof: 0"),
+        ({"dof": 90}, "dof: 2, 90 need 94 bins between harmonics, .* has 50; lower either"),
+        ({"harmonics": np.array([0, 1])}, r"harmonics: 0\.\.1, .* within 1\.\.24"),
+        ({"harmonics": np.array([3, 25])}, r"harmonics: 3\.\.25, .* within 1\.\.24"),
+        ({"harmonics": np.array([3, 3])}, "harmonics: .* ascending"),
+        ({"harmonics": np.array([1.5])}, "harmonics: float64 of shape"),
+        ({"harmonics": np.array([], int)}, "harmonics: .* F >= 1"),
+    ],
+)
+def test_impossible_plans_are_refused(change, message):
+    good = {"harmonics": np.array([3, 4]), "samples_per_period": 50, "periods": 3, "dof": 2}
+    LocalPolynomialPlan(**good)
+    with pytest.raises(ValueError, match=message):
+        LocalPolynomialPlan(**{**good, **change})
+
+
+def test_bad_records_are_named():
+    plan = LocalPolynomialPlan(np.array([3, 4]), 50, 3, dof=2)
+    good = np.zeros((3, 50))
+    with pytest.raises(ValueError, match=r"y: shape \(2, 50\), expected \(\.\.\., 3, 50\)"):
+        plan(good, np.zeros((2, 50)))
+    gap = good.copy()
+    gap[1, 7] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        plan(gap, good)

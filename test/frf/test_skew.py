@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Delay between channels: measured, corrected, suspected."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from tactile_resonance.frf.fast import fast_frf
+from tactile_resonance.frf.fault_types import FaultKind
+from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.skew import correct_skew, skew_from_loopback, suspected_skew
+from tactile_resonance.frf.spectra import averaged_spectra
+
+SAMPLES, RATE = 1000, 10e3
+LINES = np.arange(3, 400)
+F_HZ = np.arange(SAMPLES // 2 + 1) * RATE / SAMPLES
+
+
+def loopback(rng, multisine, delay_s, gain=1.0, response=1.0, noise=0.01, periods=3):
+    u = multisine(LINES, SAMPLES, rng, amplitude=0.1)
+    y = np.fft.irfft(
+        np.fft.rfft(u) * gain * response * np.exp(-2j * np.pi * F_HZ * delay_s), SAMPLES
+    )
+    return tuple(
+        np.tile(x, (periods, 1)) + noise * rng.standard_normal((periods, SAMPLES)) for x in (u, y)
+    )
+
+
+@pytest.mark.parametrize("gain", [0.7, -2.0])
+def test_delay_is_unbiased_and_its_deviation_true(multisine, gain):
+    rng = np.random.default_rng(1)
+    true = 37e-6
+    errors = []
+    for _ in range(200):
+        skew = skew_from_loopback(
+            *loopback(rng, multisine, true, gain), sample_rate_hz=RATE, harmonics=LINES
+        )
+        errors.append((skew.delay_s - true) / skew.delay_std_s)
+    # 200 runs: the mean within 4 / sqrt(200), the deviation within 4 / sqrt(400) of 1
+    assert abs(np.mean(errors)) < 0.28
+    assert np.std(errors) == pytest.approx(1, abs=0.2)
+    assert skew.gain == pytest.approx(gain, rel=0.01)
+
+
+@pytest.mark.parametrize("delay_s", [-2.3e-3, -1e-6, 0.0, 4.5e-3])
+def test_delays_of_many_samples_need_no_unwrapping(multisine, delay_s):
+    rng = np.random.default_rng(2)
+    skew = skew_from_loopback(
+        *loopback(rng, multisine, delay_s), sample_rate_hz=RATE, harmonics=LINES
+    )
+    assert skew.delay_s == pytest.approx(delay_s, abs=6 * skew.delay_std_s)
+
+
+def test_correction_restores_the_response(multisine):
+    delay, response = 37e-6, 1 / (1 + 1j * F_HZ / 800)
+    records = [loopback(np.random.default_rng(4), multisine, d, 1, response) for d in (0, delay)]
+    plan = LocalPolynomialPlan(LINES, SAMPLES, 3)
+    true, skewed = (fast_frf(plan(u, y), sample_rate_hz=RATE) for u, y in records)
+    corrected = correct_skew(skewed, delay)
+    scatter = np.sqrt(true.variance_noise)
+    assert np.max(np.abs(skewed.g - true.g) / scatter) > 5
+    assert np.max(np.abs(corrected.g - true.g) / scatter) < 5
+    assert np.allclose(corrected.spectra[0] / corrected.spectra[1], corrected.g, rtol=1e-12, atol=0)
+    c, c_skewed = corrected.spectra_covariance, skewed.spectra_covariance
+    assert np.array_equal(c[0, 0], c_skewed[0, 0])
+    assert np.allclose(c[0, 1], c[1, 0].conj(), rtol=1e-12)
+    assert np.allclose(np.abs(c[0, 1]), np.abs(c_skewed[0, 1]), rtol=1e-12)
+    # the variance of the response follows from either
+    g = corrected.g
+    variance = (c[0, 0] + np.abs(g) ** 2 * c[1, 1] - 2 * np.real(c[0, 1] * g.conj())).real / np.abs(
+        corrected.spectra[1]
+    ) ** 2
+    assert np.allclose(variance, corrected.variance_noise, rtol=1e-9)
+
+
+def test_skew_is_suspected_where_a_flat_response_has_straight_phase(multisine):
+    rng = np.random.default_rng(5)
+    # feed-through with a mode low in the band, as of a bimorph
+    mode = 1 + 0.2 / (1 - (F_HZ / 300) ** 2 + 0.04j * F_HZ / 300)
+    frf = {
+        delay: fast_frf(
+            averaged_spectra(*loopback(rng, multisine, delay, 1, mode), LINES),
+            sample_rate_hz=RATE,
+        )
+        for delay in (0.0, 20e-6)
+    }
+    assert suspected_skew(frf[0.0]) is None
+    fault = suspected_skew(frf[20e-6])
+    assert fault.kind is FaultKind.CHANNEL_SKEW
+    assert not fault.spoils
+    assert fault.value == pytest.approx(20e-6, rel=0.1)
+    assert "loop-back" in fault.message
+
+
+def test_refusals(multisine):
+    rng = np.random.default_rng(6)
+    u, y = loopback(rng, multisine, 0.0)
+    with pytest.raises(ValueError, match="harmonics: 2 lines, expected at least 3"):
+        skew_from_loopback(u, y, sample_rate_hz=RATE, harmonics=[3, 4])
+    resonance = signal.lfilter([1], [1, -1.8, 0.95], y, axis=-1)
+    with pytest.raises(ValueError, match="expected a loop-back"):
+        skew_from_loopback(u, resonance, sample_rate_hz=RATE, harmonics=LINES)
+    frf = fast_frf(averaged_spectra(u, y, LINES), sample_rate_hz=RATE)
+    with pytest.raises(ValueError, match="delay_s: nan"):
+        correct_skew(frf, float("nan"))
