@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.distortion import Distortion
+from tactile_resonance.frf.estimate import estimate_distortion, estimate_frf
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
@@ -32,6 +33,8 @@ class Analysis:
     frf : FRF
         At all excited lines.
     poles : Poles
+    distortion : Distortion or None
+        Where it was asked for.
     warnings : tuple of str
         What a reader should know before relying on the figures.
     timing_s : dict
@@ -40,6 +43,7 @@ class Analysis:
 
     frf: FRF
     poles: Poles
+    distortion: Distortion | None
     warnings: tuple[str, ...]
     timing_s: dict[str, float]
 
@@ -50,6 +54,7 @@ def analyse(
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
     frf_method: str = "local polynomial",
+    with_distortion: bool = False,
 ) -> Analysis:
     """FRF at all excited lines, poles in a band.
 
@@ -61,6 +66,8 @@ def analyse(
     structure : ModelStructure, optional
     frf_method : str
         See `frf.estimate.estimate_frf`.
+    with_distortion : bool
+        Estimate even and odd distortion too; needs an odd or odd random grid.
 
     Raises
     ------
@@ -97,15 +104,25 @@ def analyse(
         )
     poles = identify_poles(frf, band_hz, structure)
     identified = time.perf_counter()
+    distortion = None
+    if with_distortion:
+        distortion = estimate_distortion(
+            recording.u,
+            recording.y,
+            sample_rate_hz=recording.sample_rate_hz,
+            harmonics=harmonics,
+            method=frf_method,
+        )
     if poles.status is PolesStatus.TOO_FEW_LINES:
         raise ValueError(f"band: {poles.message}")
-    if frf.message:
+    if frf.message and frf.message not in poles.message:
         warnings.append(f"frf: {frf.message}")
     if poles.message:
         warnings.append(f"poles: {poles.message}")
     return Analysis(
         frf,
         poles,
+        distortion,
         tuple(warnings),
         {
             "excited_lines": found - start,
@@ -146,11 +163,31 @@ def analysis_as_json(analysis: Analysis) -> str:
         "expected_cost": _number(poles.expected_cost),
         "condition_number": _number(poles.condition_number),
         "variance_model": poles.variance_model,
+        "distortion": _distortion(analysis.distortion),
         "status": poles.status.value,
         "warnings": list(analysis.warnings),
         "timing_s": analysis.timing_s,
     }
     return json.dumps(content, indent=1, allow_nan=False)
+
+
+def _distortion(distortion: Distortion | None) -> dict | None:
+    """Levels against the linear output around, of all realisations together; null where unknown."""
+    if distortion is None:
+        return None
+    return {
+        name: {
+            "frequency_hz": lines.frequency_hz.tolist(),
+            "level_db": [_number(level) for level in lines.level_db],
+            "rms_level_db": _number(float(lines.rms_level_db)),
+            "rms_output_level_db": _number(float(lines.rms_output_level_db)),
+            "rms_input_level_db": _number(float(lines.rms_input_level_db)),
+            "rms_noise_level_db": None
+            if lines.rms_noise_level_db is None
+            else _number(float(lines.rms_noise_level_db)),
+        }
+        for name, lines in (("even", distortion.even), ("odd", distortion.odd))
+    }
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from tactile_resonance.commands import analyze, demo
+from tactile_resonance.commands import analyze, benchmark, demo, figures  # noqa: E402
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze):
+    for command in (demo, analyze, figures, benchmark):
         command.add_parser(commands)
     parsed = parser.parse_args(arguments)
     try:

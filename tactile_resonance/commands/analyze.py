@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.analysis import Analysis, analyse, analysis_as_json, write_whole
+from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
@@ -53,6 +54,17 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         type=int,
         help="default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model",
     )
+    parser.add_argument(
+        "--frf",
+        choices=METHODS,
+        default=METHODS[0],
+        help=f"how transients are dealt with (default: {METHODS[0]})",
+    )
+    parser.add_argument(
+        "--distortion",
+        action="store_true",
+        help="even and odd distortion at the lines left out; --plot then draws FILE_distortion too",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
     parser.set_defaults(run=run)
@@ -93,7 +105,13 @@ def run(options: argparse.Namespace) -> int:
                 f"band: {low_hz:g} {high_hz:g}, expected 0 <= LO < HI <= {nyquist_hz:g} Hz"
             )
         band_hz = (low_hz, high_hz)
-    analysis = analyse(recording, band_hz=band_hz, structure=structure)
+    analysis = analyse(
+        recording,
+        band_hz=band_hz,
+        structure=structure,
+        frf_method=options.frf,
+        with_distortion=options.distortion,
+    )
     print(as_text(analysis))
     if options.json:
         write_whole(options.json, analysis_as_json(analysis).encode())
@@ -103,6 +121,11 @@ def run(options: argparse.Namespace) -> int:
         from tactile_resonance.report.drawing import save_figure
 
         save_figure(draw_analysis(analysis, options.record.name), options.plot)
+        if analysis.distortion is not None:
+            from tactile_resonance.report.distortion_figure import draw_distortion
+
+            figure = draw_distortion({options.record.name: analysis.distortion}, "Distortion")
+            save_figure(figure, options.plot.with_stem(f"{options.plot.stem}_distortion"))
     return 0
 
 
@@ -128,6 +151,8 @@ def as_text(analysis: Analysis) -> str:
             f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, pole {pole.real:.3f} "
             f"+- j{pole.imag:.3f} rad/s"
         )
+    if analysis.distortion is not None:
+        lines.append(f"distortion: {analysis.distortion.summary()}")
     if poles.status is not PolesStatus.OK:
         lines.append(f"status: {poles.status.value}")
     lines += [f"note: {warning}" for warning in analysis.warnings]

@@ -10,8 +10,13 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tactile_resonance.processes import NodeProcesses, free_domain_id
+
+if TYPE_CHECKING:
+    from tactile_resonance.identification.result import Poles
+    from tactile_resonance.simulation.scene import PhantomScene
 
 NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
 START_TIMEOUT_S = 30.0
@@ -90,7 +95,7 @@ def _check(options: argparse.Namespace) -> None:
             raise ValueError(f"{name}: {value}, expected at least {least}")
 
 
-def _places(scene, most: int | None) -> list[tuple[str, int, tuple[float, float, float]]]:
+def _places(scene: PhantomScene, most: int | None) -> list[tuple[str, int, tuple[float, float, float]]]:
     """(phantom, index in it, position) of every point to measure."""
     counts: dict[str, int] = {}
     places = []
@@ -150,7 +155,7 @@ def _measure(nodes: NodeProcesses, places: list, options: argparse.Namespace) ->
     return points
 
 
-def _nearest(truth, poles) -> tuple[float, float]:
+def _nearest(truth: Poles, poles: Poles) -> tuple[float, float]:
     """True mode inside the band of the fit."""
     low_hz, high_hz = poles.band_hz
     inside = (truth.f0_hz >= low_hz) & (truth.f0_hz <= high_hz)

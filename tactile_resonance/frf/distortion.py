@@ -172,8 +172,13 @@ def _interpolate(x: IntArray, values: npt.NDArray, at: IntArray) -> npt.NDArray:
 def _sentence(name: str, lines: DetectionLines) -> str:
     if not np.any(lines.in_band):
         return f"No {name} detection lines in the excited band."
-    level = float(np.max(lines.rms_level_db))
-    text = f"{name.capitalize()} distortion {level:.1f} dB against the linear output (rms)"
+    raw, level = (
+        float(np.max(x)) for x in (lines.rms_output_level_db, lines.rms_level_db)
+    )
+    text = (
+        f"{name.capitalize()} lines: output {raw:.1f} dB against the linear output (rms), "
+        f"{level:.1f} dB corrected for the input's own distortion"
+    )
     noise = lines.rms_noise_level_db
     if noise is None:
         return text + "; noise level unknown (single periods)."

@@ -82,7 +82,7 @@ class FaultReport:
         status = frf.status
         if self.suspect and status is not FrfStatus.FAILED:
             status = FrfStatus.SUSPECT
-        message = " ".join(filter(None, [frf.message, self.message]))
+        message = "; ".join(filter(None, [frf.message, self.message]))
         return replace(frf, status=status, message=message)
 
 

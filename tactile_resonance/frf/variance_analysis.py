@@ -71,6 +71,16 @@ class VarianceSource:
             return float("nan")
         return float(decibel(np.mean(self.variance / self.mean_power)))
 
+    @property
+    def rms_level_db(self) -> float:
+        """Mean variance over lines against mean ``|mean G|^2`` [dB]; NaN where unknown.
+
+        Unlike `mean_level_db` it is not ruled by the lines where G is small.
+        """
+        if self.variance is None:
+            return float("nan")
+        return float(decibel(np.mean(self.variance) / np.mean(self.mean_power)))
+
 
 @dataclass(frozen=True, eq=False)
 class VarianceAnalysis:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +44,7 @@ def draw_ellipse(
     centre: npt.ArrayLike,
     covariance: npt.NDArray[np.float64],
     probability: float = 0.95,
-    **style,
+    **style: Any,
 ) -> None:
     """Ellipse that holds the truth with the given probability if errors are Gaussian.
 

@@ -98,3 +98,14 @@ def test_refusals():
         analyse_variance(g, np.arange(4.0), axes=["a", "b"])
     with pytest.raises(ValueError, match="name: 'c', accepted are a, b"):
         analyse_variance(np.ones((2, 3, 4)), np.arange(4.0), axes=["a", "b"]).source("c")
+
+
+def test_rms_level_weighs_lines_by_their_response():
+    """A line where G vanishes does not rule the level: mean variance over mean power."""
+    rng = np.random.default_rng(5)
+    scatter = rng.standard_normal((40, 2)) + 1j * rng.standard_normal((40, 2))
+    g = np.array([1.0, 1e-6]) + 0.01 / np.sqrt(2) * scatter
+    source = analyse_variance(g, [1.0, 2.0], axes=("period",)).sources[0]
+    # relative std of a variance of 39 complex degrees of freedom: 0.16, two lines
+    assert source.rms_level_db == pytest.approx(10 * np.log10(1e-4 / 0.5), abs=2)
+    assert source.mean_level_db > 0

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance benchmark`: run time against error, as tables and figures."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+NAMES = ("frf",)
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "benchmark",
+        help="run time against error",
+        description="Measure run time as a ratio to something known, and error against truth. Needs the "
+        "source tree (tools/run.sh).",
+    )
+    parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("docs/benchmarks"),
+        metavar="DIR",
+        help="where table and figure go (default: docs/benchmarks)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run one or all; each prints its table and writes table and figure."""
+    if find_spec("benchmarks") is None:
+        raise ValueError("benchmark: no benchmarks found, run it from the source tree: tools/run.sh")
+    options.output.mkdir(parents=True, exist_ok=True)
+    for name in NAMES if options.name is None else (options.name,):
+        print(import_module(f"benchmarks.{name}").run(options.output, options.quick))
+    return 0

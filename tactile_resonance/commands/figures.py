@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance figures`: the paper's experiments on the simulated bench."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+NAMES = ("distortion", "variance")
+BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "figures",
+        help="distortion and variance figures from the simulated bench",
+        description="Draw distortion over drive level (figures 5 and 6 of arXiv 1805.00682) and variance by "
+        "source (figure 9) from the simulated bench. Nothing here is a measurement.",
+    )
+    parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
+    parser.add_argument(
+        "--output", type=Path, default=Path("docs/figures"), metavar="DIR", help="default: docs/figures"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Simulate, analyse, draw."""
+    options.output.mkdir(parents=True, exist_ok=True)
+    draw = {"distortion": _distortion, "variance": _variance}
+    for name in NAMES if options.name is None else (options.name,):
+        draw[name](options.output)
+    return 0
+
+
+def _progress(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _distortion(output: Path) -> None:
+    from tactile_resonance.frf.estimate import estimate_distortion
+    from tactile_resonance.report.distortion_figure import draw_distortion, draw_distortion_levels
+    from tactile_resonance.report.drawing import SIMULATED, save_figure
+    from tactile_resonance.simulation.experiments import records_at_levels
+
+    cases = {
+        level_v: estimate_distortion(u, y, sample_rate_hz=rate_hz, harmonics=harmonics)
+        for level_v, (u, y, harmonics, rate_hz) in records_at_levels(
+            (1.0, 2.0, 3.0, 4.0), progress=_progress
+        ).items()
+    }
+    for level_v, distortion in cases.items():
+        print(f"{level_v:g} V rms: {distortion.summary()}")
+    tissue = f"gelatine 10 %, {SIMULATED}"
+    figure = draw_distortion(
+        {f"{level_v:g} V rms": distortion for level_v, distortion in cases.items()},
+        f"Output and its nonlinear distortion ({tissue})",
+    )
+    save_figure(figure, output / "distortion.png")
+    figure = draw_distortion_levels(cases, f"Distortion over drive level ({tissue})")
+    save_figure(figure, output / "distortion_levels.png")
+    print(f"figures in {output}: distortion.png, distortion_levels.png")
+
+
+def _variance(output: Path) -> None:
+    from tactile_resonance.frf.spectra import period_spectra
+    from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
+    from tactile_resonance.report.drawing import SIMULATED, save_figure
+    from tactile_resonance.report.variance_figure import draw_variance
+    from tactile_resonance.simulation.experiments import repeated_records
+
+    u, y, harmonics, rate_hz = repeated_records(progress=_progress)
+    g = period_spectra(y, harmonics) / period_spectra(u, harmonics)
+    frequency_hz = harmonics * rate_hz / u.shape[-1]
+    inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
+    whole = analyse_variance(g, frequency_hz, axes=PAPER_AXES)
+    band = analyse_variance(g[..., inside], frequency_hz[inside], axes=PAPER_AXES)
+    for source in reversed(band.sources):
+        print(
+            f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {BAND_HZ[0]:g}-"
+            f"{BAND_HZ[1]:g} Hz, {source.dof} degrees of freedom"
+        )
+    title = f"Variance of the FRF by source (gelatine 12 %, {SIMULATED})"
+    save_figure(draw_variance(whole, band, BAND_HZ, title), output / "variance.png")
+    print(f"figure in {output}: variance.png")
