@@ -13,7 +13,7 @@ from collections.abc import Sequence
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from tactile_resonance.commands import analyze, benchmark, demo, figures  # noqa: E402
+from tactile_resonance.commands import analyze, benchmark, demo, figures
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -93,7 +93,7 @@ class Excitation:
     @property
     def frequency_hz(self) -> FloatArray:
         """(F,) excited lines [Hz]."""
-        return self.harmonics * (self.sample_rate_hz / self.samples_per_period)
+        return np.asarray(self.harmonics * (self.sample_rate_hz / self.samples_per_period), float)
 
     @property
     def level_v(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -50,9 +51,9 @@ class Channel:
 
     def volts(self) -> npt.NDArray[np.floating]:
         """(n,) samples [V]; floating samples come back as they are, without a copy."""
-        if not self.is_counts:
-            return self.samples
-        return self.samples * self.scale_v + self.offset_v
+        if self.is_counts:
+            return self.samples * self.scale_v + self.offset_v
+        return cast("npt.NDArray[np.floating]", self.samples)
 
 
 @dataclass(frozen=True)

@@ -105,8 +105,8 @@ def _places(scene: PhantomScene, most: int | None) -> list[tuple[str, int, tuple
         index = counts.get(name, 0)
         counts[name] = index + 1
         if most is None or index < most:
-            position = (*point, 0.0)[:3]
-            places.append((name, index, position))
+            x_m, y_m, z_m = (*point, 0.0)[:3]
+            places.append((name, index, (x_m, y_m, z_m)))
     return places
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,8 +40,9 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
         lines = [getattr(cases[level], name) for level in levels]
         axes.plot(levels, [float(np.max(x.rms_level_db)) for x in lines], marker, label=name)
     noise = [cases[level].odd.rms_noise_level_db for level in levels]
-    if all(x is not None for x in noise):
-        axes.plot(levels, [float(np.max(x)) for x in noise], "k.--", label="noise at odd lines")
+    known = [float(np.max(x)) for x in noise if x is not None]
+    if len(known) == len(levels):
+        axes.plot(levels, known, "k.--", label="noise at odd lines")
     axes.set(
         xlabel="drive level [V rms]",
         ylabel="against the linear output in the band [dB]",
@@ -53,7 +55,7 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
 
 def _draw_case(axes: Axes, distortion: Distortion) -> None:
     power = np.mean(np.abs(distortion.output) ** 2, axis=-2)
-    style = {"marker": ".", "ms": 1.5, "ls": "none"}
+    style: dict[str, Any] = {"marker": ".", "ms": 1.5, "ls": "none"}
     axes.semilogx(distortion.frequency_hz, decibel(power), color="k", label="linear output", **style)
     for name, colour in (("odd", "C3"), ("even", "C0")):
         lines = getattr(distortion, name)
