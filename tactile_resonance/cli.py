@@ -7,6 +7,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 # One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they give.
 # Before numpy is imported, which reads it once.
@@ -16,9 +17,17 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from tactile_resonance.commands import analyze, benchmark, demo, figures
 
 
+class OneLineParser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as all other errors are said."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2."""
+        self.exit(2, f"tactile_resonance: {message} (see {self.prog} --help)\n")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )

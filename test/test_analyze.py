@@ -119,6 +119,15 @@ def test_bad_input_gives_one_line_and_no_file(case, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_unknown_options_are_told_in_one_line(capsys):
+    for arguments in (["analyze"], ["analyze", "a.npz", "--band", "1"], ["analyse"], []):
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(arguments)
+        printed = capsys.readouterr().err
+        assert printed.count("\n") == 1
+        assert printed.startswith("tactile_resonance: ")
+
+
 def test_silverbox_as_the_issue_of_a_user(shared_data, tmp_path):
     """Reference: f0 69.536 +- 0.012 Hz, damping ratio 0.04877 +- 0.00016."""
     ends = [48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196]

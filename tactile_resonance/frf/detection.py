@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, stats
+from scipy import ndimage, special
 
 from tactile_resonance.frf.result import ComplexArray, FloatArray
 from tactile_resonance.frf.spectra import IntArray
@@ -129,7 +129,7 @@ class DetectionLines:
         estimate_dof = realisations * self.noise_dof
         squares = np.sum(noise**2, axis=-1) * estimate_dof / (estimate_dof + 1)
         dof = 2 * realisations * total**2 / squares
-        quantile = stats.f.isf(FALSE_ALARM, dof, dof * self.noise_dof)
+        quantile = special.fdtri(dof, dof * self.noise_dof, 1 - FALSE_ALARM)
         return np.asarray(self.power[..., inside].sum(axis=-1) > quantile * total)
 
     def smoothed_level_db(self, lines: int = 21) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, ndimage, stats
+from scipy import fft, ndimage, special
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -131,7 +131,9 @@ def _noise_threshold_between(
     local = ndimage.uniform_filter1d(mean, width, mode="nearest", origin=0)[1:]
     bins = width * (periods - 1)
     # the ratio of two exponential means is F distributed
-    quantile = stats.f.isf(_FALSE_ALARM / harmonics.size, 2 * records, 2 * bins * records)
+    quantile = special.fdtri(
+        2 * records, 2 * bins * records, 1 - _FALSE_ALARM / harmonics.size
+    )
     return np.asarray(quantile * local)
 
 
@@ -140,6 +142,6 @@ def _noise_threshold_single_period(line_power: FloatArray, records: int) -> floa
     # the lower quartile over all lines is the median of the weaker half; were half of the lines
     # excited, it is still a level that noise reaches
     noise = np.quantile(line_power, 0.25)
-    low = stats.gamma.ppf(0.25, records) / records
-    high = stats.gamma.isf(_FALSE_ALARM / line_power.size, records) / records
+    low = special.gammaincinv(records, 0.25) / records
+    high = special.gammainccinv(records, _FALSE_ALARM / line_power.size) / records
     return float(noise * high / low)

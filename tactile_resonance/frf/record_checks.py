@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy import stats
+from scipy import special
 
 from tactile_resonance.frf.fault_types import Fault, FaultKind
 from tactile_resonance.frf.spectra import period_spectra
@@ -119,7 +119,7 @@ def hum(x: Samples, channel: str, sample_rate_hz: float, harmonics: Lines) -> li
                 continue
             floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
             # the floor of a few bins is itself uncertain
-            limit = stats.f.isf(_FALSE_ALARM / peak.size, 2, 2 * around.size)
+            limit = special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size)
             if power[peak].max() > 2 * limit * floor:
                 near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
                 lines.append((k * mains, float(power[peak].sum()), near))
@@ -170,7 +170,7 @@ def unsettled(x: Samples, channel: str, harmonics: Lines, *, spoils: bool) -> li
     noise = np.sum(np.abs(spectra[1:] - mean) ** 2) / (periods - 2)
     difference = np.sum(np.abs(spectra[0] - mean) ** 2) / (1 + 1 / (periods - 1))
     dof = 2 * len(harmonics)
-    limit = stats.f.isf(_FALSE_ALARM, dof, dof * (periods - 2))
+    limit = special.fdtri(dof, dof * (periods - 2), 1 - _FALSE_ALARM)
     rounding = np.finfo(x.dtype).eps ** 2 * np.sum(np.abs(mean) ** 2)
     # twice the limit: noise of few lines may dominate and vary
     if difference <= 2 * limit * (noise + rounding):

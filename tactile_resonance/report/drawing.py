@@ -12,7 +12,6 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy import stats
 
 from tactile_resonance.analysis import write_whole
 
@@ -53,7 +52,7 @@ def draw_ellipse(
     centre : (2,) float
     covariance : (2, 2) float
     """
-    radius = np.sqrt(stats.chi2.ppf(probability, 2))
+    radius = np.sqrt(-2 * np.log1p(-probability))  # chi-square with two degrees of freedom
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.stack([np.cos(angle), np.sin(angle)])  # (2, 100)
