@@ -19,9 +19,12 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.identification.joint import identify_poles_from_records
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
+
+POLES_METHODS = ("auto", "joint", "frf")
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ def analyse(
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
     frf_method: str = "local polynomial",
+    poles_method: str = "auto",
     with_distortion: bool = False,
 ) -> Analysis:
     """FRF at all excited lines, poles in a band.
@@ -66,14 +70,21 @@ def analyse(
     structure : ModelStructure, optional
     frf_method : str
         See `frf.estimate.estimate_frf`.
+    poles_method : {"auto", "joint", "frf"}
+        Poles from all bins of the band together with the transient (`identification.joint`; one
+        realisation), or from the FRF. ``auto`` takes the first where there is one realisation.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.
 
     Raises
     ------
     ValueError
-        If the band holds too few lines for the model.
+        If the band holds too few lines for the model, or the method does not fit the record.
     """
+    if poles_method not in POLES_METHODS:
+        raise ValueError(
+            f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}"
+        )
     structure = structure or ModelStructure()
     warnings = []
     start = time.perf_counter()
@@ -102,7 +113,9 @@ def analyse(
         warnings.append(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
-    poles = identify_poles(frf, band_hz, structure)
+    if poles_method == "auto":
+        poles_method = "joint" if recording.u.shape[0] == 1 else "frf"
+    poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:
@@ -129,6 +142,30 @@ def analyse(
             "frf": estimated - found,
             "poles": identified - estimated,
         },
+    )
+
+
+def _poles(
+    recording: Recording,
+    harmonics: npt.NDArray[np.int64],
+    frf: FRF,
+    method: str,
+    band_hz: tuple[float, float],
+    structure: ModelStructure,
+) -> Poles:
+    if method == "frf":
+        return identify_poles(frf, band_hz, structure)
+    if recording.u.shape[0] > 1:
+        raise ValueError(
+            f"method: joint takes one realisation, the record has {recording.u.shape[0]}; use frf"
+        )
+    return identify_poles_from_records(
+        recording.u[0],
+        recording.y[0],
+        sample_rate_hz=recording.sample_rate_hz,
+        harmonics=harmonics,
+        band_hz=band_hz,
+        structure=structure,
     )
 
 
@@ -162,6 +199,7 @@ def analysis_as_json(analysis: Analysis) -> str:
         "cost": _number(poles.cost),
         "expected_cost": _number(poles.expected_cost),
         "condition_number": _number(poles.condition_number),
+        "method": poles.method,
         "variance_model": poles.variance_model,
         "distortion": _distortion(analysis.distortion),
         "status": poles.status.value,

@@ -92,7 +92,7 @@ BAD = {
     "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y: 12000 samples are NaN or infinite"),
     "constant": (damaged(u=np.ones(6 * N)), (), r"u: constant (1 V)"),
     "one period": (damaged(samples_per_period=6 * N), (), "periods: 1 period of 1 realisation"),
-    "narrow band": (damaged(), ("--band", 249, 251), "band: 1 lines in 249-251 Hz"),
+    "narrow band": (damaged(), ("--band", 249, 251), "holds 1 excited lines"),
     "band reversed": (damaged(), ("--band", 300, 200), "band: 300 200"),
     "no rate": (damaged(sample_rate_hz=None), (), "sample_rate_hz: missing"),
     "zero rate": (damaged(sample_rate_hz=0.0), (), "sample_rate_hz: 0"),
@@ -141,3 +141,32 @@ def test_silverbox_as_the_issue_of_a_user(shared_data, tmp_path):
     pole = json.loads((tmp_path / "out.json").read_text())["poles"][0]
     assert abs(pole["f0_hz"] - 69.536) < 3 * 0.012
     assert abs(pole["damping_ratio"] - 0.04877) < 3 * 0.00016
+
+
+@pytest.mark.parametrize("options", [(), ("--method", "frf"), ("--frf", "average", "--method", "frf")])
+@pytest.mark.parametrize("domain", ["s", "z"])
+def test_every_method_agrees_with_the_truth(options, domain, tmp_path, capsys):
+    """A record from rest: the transient is in it."""
+    content = record(periods=8, noise=2e-3, seed=4)
+    w0 = 2 * np.pi * F0_HZ
+    pole = w0 * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2))
+    time_s = np.arange(8 * N) / RATE_HZ
+    content["y"] = content["y"] + 0.3 * np.real(np.exp(pole * time_s + 0.7j))
+    np.savez(tmp_path / "a.npz", **content)
+    out = tmp_path / "out.json"
+    arguments = ["analyze", str(tmp_path / "a.npz"), "--band", "200", "300", "--domain", domain]
+    assert cli.main([*arguments, *options, "--json", str(out)]) == 0
+    found = json.loads(out.read_text())["poles"][0]
+    std = np.sqrt(np.diag(found["covariance"]))
+    assert abs(found["f0_hz"] - F0_HZ) < 4 * std[0]
+    assert abs(found["damping_ratio"] - DAMPING) < 4 * std[1]
+    assert std[0] < 0.05
+
+
+def test_joint_method_takes_one_realisation(tmp_path, capsys):
+    content = record(periods=8)
+    for name in "uy":
+        content[name] = content[name].reshape(2, 4, N)
+    np.savez(tmp_path / "a.npz", **content)
+    assert cli.main(["analyze", str(tmp_path / "a.npz"), "--method", "joint"]) == 1
+    assert "joint takes one realisation, the record has 2" in capsys.readouterr().err

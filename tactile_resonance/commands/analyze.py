@@ -4,11 +4,18 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.analysis import Analysis, analyse, analysis_as_json, write_whole
+from tactile_resonance.analysis import (
+    POLES_METHODS,
+    Analysis,
+    analyse,
+    analysis_as_json,
+    write_whole,
+)
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
@@ -55,6 +62,19 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model",
     )
     parser.add_argument(
+        "--domain",
+        choices=("s", "z"),
+        default="s",
+        help="of the model; z for an input held between samples (default: s)",
+    )
+    parser.add_argument(
+        "--method",
+        choices=POLES_METHODS,
+        default="auto",
+        help="poles from all bins together with the transient (joint, one realisation) or from the "
+        "FRF (default: joint where there is one realisation)",
+    )
+    parser.add_argument(
         "--frf",
         choices=METHODS,
         default=METHODS[0],
@@ -95,7 +115,9 @@ def run(options: argparse.Namespace) -> int:
     )
     structure = ModelStructure.with_residual(options.order)
     if options.numerator_order is not None:
-        structure = ModelStructure(options.order, options.numerator_order)
+        structure = replace(structure, numerator_order=options.numerator_order)
+    if options.domain == "z":
+        structure = replace(structure, domain="z", sample_rate_hz=recording.sample_rate_hz)
     band_hz = None
     if options.band is not None:
         low_hz, high_hz = options.band
@@ -110,6 +132,7 @@ def run(options: argparse.Namespace) -> int:
         band_hz=band_hz,
         structure=structure,
         frf_method=options.frf,
+        poles_method=options.method,
         with_distortion=options.distortion,
     )
     print(as_text(analysis))

@@ -7,7 +7,8 @@ import numpy as np
 
 from tactile_resonance.frf.result import FRF
 
-# Half width of the band in units of the resonance's own half width: wide enough to see the mode die out.
+# Half width of the band in units of the resonance's own half width: wide enough to see the mode die
+# out.
 HALF_WIDTHS = 10.0
 FEWEST_LINES_EACH_SIDE = 20
 
@@ -26,13 +27,15 @@ def strongest_resonance_band(frf: FRF) -> tuple[float, float]:
 
     Notes
     -----
-    Kennedy & Pancu (J. Aeronaut. Sci. 14 (1947) 603-625): near a resonance G runs through a circle, and
-    ``|dG/df|``, proportional to ``1 / ((f - f0)^2 + (damping f0)^2)``, is largest at the resonance
-    whatever the other modes add. It is averaged over five lines against noise.
+    Kennedy & Pancu (J. Aeronaut. Sci. 14 (1947) 603-625): near a resonance G runs through a circle,
+    and ``|dG/df|``, proportional to ``1 / ((f - f0)^2 + (damping f0)^2)``, is largest at the
+    resonance whatever the other modes add. It is averaged over five lines against noise.
     """
     f = frf.frequency_hz
     if f.size < 10:
-        raise ValueError(f"band: {f.size} excited lines, at least 10 are needed to find a resonance")
+        raise ValueError(
+            f"band: {f.size} excited lines, at least 10 are needed to find a resonance"
+        )
     speed = np.abs(np.diff(frf.g) / np.diff(f))
     speed = np.convolve(speed, np.ones(5) / 5, mode="same")
     speed[:2] = speed[-2:] = 0.0  # fewer than five lines were averaged there

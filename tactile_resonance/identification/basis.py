@@ -33,54 +33,103 @@ class PolynomialBasis:
     hessenberg: FloatArray
 
     @classmethod
-    def on_lines(cls, x: ComplexArray, degree: int) -> PolynomialBasis:
-        """Basis up to `degree`, orthonormal on the points `x` (F,): mean of ``|p_k|^2`` is 1."""
+    def on_lines(
+        cls, x: ComplexArray, degree: int, weight: FloatArray | None = None
+    ) -> PolynomialBasis:
+        """Basis up to `degree` on the points `x` (F,).
+
+        Orthonormal in the mean of ``weight |p_k|^2``, with weights (F,) of mean 1 (all 1 when
+        absent). A degree that the points cannot tell from lower ones has values of no meaning but
+        finite ones.
+        """
+        w = np.ones(x.size) if weight is None else weight
         values = np.zeros((x.size, degree + 1), complex)
         hessenberg = np.zeros((degree + 1, degree))
         values[:, 0] = 1.0
         for k in range(degree):
             new = x * values[:, k]
             for _ in range(2):  # twice is enough: the second pass removes what rounding left
-                projection = np.real(values[:, : k + 1].conj().T @ new) / x.size
+                projection = np.real(values[:, : k + 1].conj().T @ (w * new)) / x.size
                 new = new - values[:, : k + 1] @ projection
                 hessenberg[: k + 1, k] += projection
-            hessenberg[k + 1, k] = np.sqrt(np.mean(np.abs(new) ** 2))
+            norm = np.sqrt(np.mean(w * np.abs(new) ** 2))
+            hessenberg[k + 1, k] = norm if norm > 0 else 1.0
             values[:, k + 1] = new / hessenberg[k + 1, k]
         return cls(values, hessenberg)
+
+    @property
+    def degree(self) -> int:
+        """Of the last polynomial."""
+        return self.hessenberg.shape[1]
 
     def at(self, x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Values and derivatives at other points.
 
         Parameters
         ----------
-        x : (n_x,) complex
+        x : (...,) complex
 
         Returns
         -------
-        values, derivatives : (n_x, n + 1) complex
+        values, derivatives : (..., n + 1) complex
         """
-        degree = self.hessenberg.shape[1]
-        values = np.zeros((x.size, degree + 1), complex)
+        shape = np.shape(x)
+        values = np.zeros((*shape, self.degree + 1), complex)
         slopes = np.zeros_like(values)
-        values[:, 0] = 1.0
-        for k in range(degree):
+        values[..., 0] = 1.0
+        for k in range(self.degree):
             column = self.hessenberg[: k + 1, k]
             scale = self.hessenberg[k + 1, k]
-            values[:, k + 1] = (x * values[:, k] - values[:, : k + 1] @ column) / scale
-            slopes[:, k + 1] = (
-                values[:, k] + x * slopes[:, k] - slopes[:, : k + 1] @ column
+            values[..., k + 1] = (x * values[..., k] - values[..., : k + 1] @ column) / scale
+            slopes[..., k + 1] = (
+                values[..., k] + x * slopes[..., k] - slopes[..., : k + 1] @ column
             ) / scale
         return values, slopes
+
+    def second_derivative(self, x: ComplexArray) -> ComplexArray:
+        """(..., n + 1) second derivatives at points x (...)."""
+        _, slopes = self.at(x)
+        bends = np.zeros_like(slopes)
+        for k in range(self.degree):
+            column = self.hessenberg[: k + 1, k]
+            bends[..., k + 1] = (
+                2 * slopes[..., k] + x * bends[..., k] - bends[..., : k + 1] @ column
+            ) / self.hessenberg[k + 1, k]
+        return bends
 
     def roots(self, coefficients: FloatArray) -> ComplexArray:
         """Roots of ``sum_k coefficients[k] p_k``, by the eigenvalues of its comrade matrix.
 
         Parameters
         ----------
-        coefficients : (m + 1,) float
+        coefficients : (..., m + 1) float
             With m from 1 to the basis' degree, and a last coefficient other than zero.
+
+        Returns
+        -------
+        (..., m) complex
+            NaN where a coefficient is not finite.
         """
-        m = coefficients.size - 1
-        comrade = self.hessenberg[:m, :m].copy()
-        comrade[:, -1] -= self.hessenberg[m, m - 1] * coefficients[:m] / coefficients[m]
-        return np.linalg.eigvals(comrade)
+        m = coefficients.shape[-1] - 1
+        last = self.hessenberg[m, m - 1] * coefficients[..., :m] / coefficients[..., m:]
+        h = self.hessenberg[:m, :m]
+        if m == 1:
+            return (h[0, 0] - last).astype(complex)
+        if m == 2:  # closed form: an eigenvalue solver costs more than the fit
+            first, second = h[0, 0] * np.ones_like(last[..., 0]), h[1, 1] - last[..., 1]
+            half = (first + second) / 2
+            under = ((first - second) / 2) ** 2 + (h[0, 1] - last[..., 0]) * h[1, 0]
+            root = np.sqrt(under.astype(complex))
+            # the root of larger modulus first, the other from the product: no cancellation
+            large = half + np.where(half < 0, -1.0, 1.0) * root
+            product = first * second - (h[0, 1] - last[..., 0]) * h[1, 0]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                other = np.where(under < 0, np.conj(large), product / large)
+            return np.stack([large, np.where(large == 0, 0, other)], axis=-1)
+        comrade = np.broadcast_to(h, (*last.shape[:-1], m, m)).copy()
+        comrade[..., :, -1] -= last
+        finite = np.isfinite(last).all(axis=-1)
+        comrade[~finite] = 0.0
+        roots = np.linalg.eigvals(comrade).astype(complex)
+        roots[~finite] = np.nan
+        return roots

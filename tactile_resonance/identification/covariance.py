@@ -1,76 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance of the parameters, and of the poles that follow from them."""
+"""Covariance of the coefficients, and of the poles, zeros and residues that follow from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+import numpy.typing as npt
 
-from tactile_resonance.identification.rational_fit import RationalFit
+from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.result import (
     ComplexArray,
     FloatArray,
+    natural_frequency_and_damping,
     natural_frequency_and_damping_jacobian,
 )
 
+# A mode this fraction of the band outside of it is still one that the lines show.
+BAND_MARGIN = 0.1
 
-@dataclass(frozen=True)
-class ParameterCovariance:
-    """Covariance of [denominator, numerator] for unit-variance weighted residuals.
 
-    Attributes
+def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse of normal matrices, and the condition number of the Jacobian they came from.
+
+    Parameters
     ----------
-    inverse : (n, n) float
-        ``(J^T J)^-1`` for the column-scaled Jacobian.
-    scaled_jacobian : (2 F, n) float
-    column : (n,) float
-        Norms the columns were divided by.
-    condition_number : float
-        Of the scaled Jacobian.
+    normal : (batch, n, n) float
+
+    Returns
+    -------
+    inverse : (batch, n, n) float
+        NaN where the matrix is singular or not finite.
+    condition_number : (batch,) float
+        Root of the Frobenius condition number with unit diagonal: the true one within a factor n.
     """
-
-    inverse: FloatArray
-    scaled_jacobian: FloatArray
-    column: FloatArray
-    condition_number: float
-
-    @classmethod
-    def of(cls, fit: RationalFit) -> ParameterCovariance:
-        """Through the singular values: J^T J would square the condition number."""
-        column = np.linalg.norm(fit.jacobian, axis=0)
-        column[column == 0] = 1.0
-        scaled = fit.jacobian / column
-        _, singular, vh = np.linalg.svd(scaled, full_matrices=False)
-        condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            half = vh.T / singular
-        return cls(half @ half.T, scaled, column, condition)
-
-    def from_weights(self) -> FloatArray:
-        """(n, n) covariance where the variance of each line is the one it was weighted with.
-
-        The two real components of a circular complex error have half its variance each.
-        """
-        return 0.5 * self.inverse / np.outer(self.column, self.column)
-
-    def from_variance(self, ratio: FloatArray) -> FloatArray:
-        """(n, n) covariance where the variance is `ratio` (F,) times the one weighted with."""
-        weighted = self.scaled_jacobian * np.concatenate([ratio, ratio])[:, None]
-        inner = self.scaled_jacobian.T @ weighted
-        return 0.5 * self.inverse @ inner @ self.inverse / np.outer(self.column, self.column)
+    n = normal.shape[-1]
+    diagonal = np.einsum("...ii->...i", normal)
+    bad = ~np.isfinite(normal).all(axis=(-2, -1)) | ~(diagonal > 0).all(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(diagonal)
+        scaled = normal * scale[..., :, None] * scale[..., None, :]
+    scaled[bad] = np.eye(n)
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        singular = np.linalg.matrix_rank(scaled, hermitian=True) < n
+        scaled[singular] = np.eye(n)
+        inverse = np.linalg.inv(scaled)
+        bad |= singular
+    # rounding can leave a negative variance where the matrix is singular to working precision
+    bad |= ~(np.einsum("...ii->...i", inverse) > 0).all(axis=-1)
+    condition = np.sqrt(
+        np.linalg.norm(scaled, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
+    )
+    with np.errstate(invalid="ignore"):
+        inverse *= scale[..., :, None] * scale[..., None, :]
+    inverse[bad] = np.nan
+    return inverse, np.where(bad, np.inf, condition)
 
 
-def pole_covariance(
-    fit: RationalFit, poles_rad_s: ComplexArray, parameters: FloatArray
-) -> FloatArray:
-    """(n_poles, 2, 2) covariance of (Re, Im) of simple poles, to first order."""
-    sensitivity = fit.pole_sensitivity(poles_rad_s)  # (n_poles, n)
-    stacked = np.stack([sensitivity.real, sensitivity.imag], axis=1)  # (n_poles, 2, n)
-    return stacked @ parameters @ np.swapaxes(stacked, -1, -2)
+def modes_in_band(
+    poles_rad_s: ComplexArray, band_hz: tuple[float, float], places: int | None = None
+) -> ComplexArray:
+    """Of each complex pair near the band the pole above the real axis, by natural frequency.
+
+    Parameters
+    ----------
+    poles_rad_s : (..., n) complex
+    band_hz : (low, high)
+    places : int, optional
+        ``n // 2`` when absent.
+
+    Returns
+    -------
+    (..., places) complex
+        NaN from the last mode on.
+    """
+    places = poles_rad_s.shape[-1] // 2 if places is None else places
+    margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
+    f0_hz = np.abs(poles_rad_s) / (2 * np.pi)
+    inside = (
+        (poles_rad_s.imag > 0) & (f0_hz >= band_hz[0] - margin) & (f0_hz <= band_hz[1] + margin)
+    )
+    if poles_rad_s.shape[-1] == 2 and places == 1:
+        first = inside[..., :1]
+        taken = np.where(first, poles_rad_s[..., :1], poles_rad_s[..., 1:])
+        return np.where(first | inside[..., 1:], taken, np.nan)
+    order = np.argsort(np.where(inside, f0_hz, np.inf), axis=-1)[..., :places]
+    taken = np.take_along_axis(np.where(inside, poles_rad_s, np.nan), order, axis=-1)
+    return taken
+
+
+def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:
+    """(..., k, 2, 2) covariance of (Re, Im) of k quantities from that of the coefficients.
+
+    Parameters
+    ----------
+    sensitivity : (..., k, p) complex
+    parameters : (..., n, n) float
+        Of which the first p belong to the sensitivity.
+    """
+    p = sensitivity.shape[-1]
+    stacked = np.stack([sensitivity.real, sensitivity.imag], axis=-2)  # (..., k, 2, p)
+    return stacked @ parameters[..., None, :p, :p] @ np.swapaxes(stacked, -1, -2)
 
 
 def f0_damping_covariance(poles_rad_s: ComplexArray, covariance: FloatArray) -> FloatArray:
-    """(n_poles, 2, 2) covariance of (f0_hz, damping_ratio) from that of (Re, Im)."""
+    """(..., 2, 2) covariance of (f0_hz, damping_ratio) from that of (Re, Im) of poles (...)."""
     jacobian = natural_frequency_and_damping_jacobian(poles_rad_s)
     return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
+
+
+def pole_quantities(
+    model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
+) -> dict[str, npt.NDArray]:
+    """Poles in the band and what follows from them, by the names that `PolesBatch` gives them.
+
+    Parameters
+    ----------
+    model : RationalModel
+        Leading axes (...).
+    band_hz : (low, high)
+    parameters : (..., n, n) float
+        Covariance of the free coefficients, those of the denominator first.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        poles = modes_in_band(model.poles_rad_s(), band_hz)
+        f0_hz, damping_ratio = natural_frequency_and_damping(poles)
+        residues, sensitivity = model.residues_and_sensitivity(poles)
+        covariance = real_covariance(sensitivity, parameters)
+        return {
+            "poles_rad_s": poles,
+            "f0_hz": f0_hz,
+            "damping_ratio": damping_ratio,
+            "residues": residues,
+            "pole_covariance": covariance,
+            "covariance": f0_damping_covariance(poles, covariance),
+        }

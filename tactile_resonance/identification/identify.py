@@ -1,35 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an FRF with covariance to poles with covariance."""
+"""From an FRF, or spectra, with covariance to poles with covariance."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.covariance import (
-    ParameterCovariance,
-    f0_damping_covariance,
-    pole_covariance,
+from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.covariance import modes_in_band
+from tactile_resonance.identification.judgement import (
+    MODEL_ERROR_PROBABILITY,
+    Evidence,
+    assemble,
+    difference_of_halves,
+    single,
 )
-from tactile_resonance.identification.noise_level import VarianceModel, model_variance
-from tactile_resonance.identification.rational_fit import RationalFit, fit_rational
+from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.identification.noise_level import KINDS, VarianceModel, model_variance
 from tactile_resonance.identification.result import (
     ComplexArray,
     FloatArray,
     Poles,
-    PolesStatus,
-    natural_frequency_and_damping,
+    PolesBatch,
 )
 from tactile_resonance.identification.structure import ModelStructure
-
-# A cost that noise alone exceeds once in a thousand fits counts as model error.
-MODEL_ERROR_PROBABILITY = 1e-3
-# Beyond this the parameters have no figure left in double precision.
-LARGEST_CONDITION_NUMBER = 1e12
-# A mode this fraction of the band outside of it is still one that the lines show.
-BAND_MARGIN = 0.1
 
 
 def identify_poles(
@@ -53,158 +50,261 @@ def identify_poles(
 
     Notes
     -----
-    Lines are weighted with the largest variance known (total, else noise), pooled over the band where a
-    test allows it. Where both are known, ``covariance`` propagates the noise through these weights and
-    ``total_covariance`` the total; where only realisations are at hand, noise cannot be told from
-    distortion and both fields hold both. Where the cost exceeds what the variance explains,
-    ``total_covariance`` is enlarged by the ratio of the cost to its expectation.
+    Lines are weighted with the largest variance known (total, else noise), pooled over the band
+    where a test allows it. Where both are known, ``covariance`` propagates the noise through these
+    weights and ``total_covariance`` the total; where only realisations are at hand, noise cannot be
+    told from distortion and both fields hold both. Where the cost exceeds what the variance
+    explains, ``total_covariance`` holds the model error too; see `judgement.model_error_factor`.
+    """
+    if frf.g.ndim != 1:
+        raise ValueError(f"frf.g: shape {frf.g.shape}, expected (F,); identify_batch takes batches")
+    batch = identify_batch(frf, band_hz, structure)
+    notes = []
+    left_out = frf.band(*batch.band_hz).g.size - int(batch.lines)
+    if left_out:
+        notes.append(f"{left_out} lines without a finite response left out")
+    if frf.status is not FrfStatus.OK or frf.variance_noise is None:
+        notes.append(frf.message)
+    return single(batch, notes=notes)
+
+
+def identify_batch(
+    frf: FRF, band_hz: tuple[float, float] | None = None, structure: ModelStructure | None = None
+) -> PolesBatch:
+    """As `identify_poles` for FRFs of many points on the same lines.
+
+    Parameters
+    ----------
+    frf : FRF
+        With (..., F) arrays.
+
+    Returns
+    -------
+    PolesBatch
+        With the leading axes of `frf`.
     """
     structure = structure or ModelStructure()
-    if band_hz is None:
-        band_hz = (float(frf.frequency_hz[0]), float(frf.frequency_hz[-1]))
+    band_hz = _band(frf.frequency_hz, band_hz)
     selected = frf.band(*band_hz)
-    variance = selected.variance
-    usable = np.isfinite(selected.g)
+    g = selected.g.reshape(-1, selected.frequency_hz.size)
+    variance = _flat(selected.variance, g.shape)
+    noise = _flat(selected.variance_noise, g.shape)
+    usable = np.isfinite(g)
     if variance is not None:
         usable &= np.isfinite(variance)
-    lines = int(usable.sum())
-    nothing = Poles(
-        structure=structure, band_hz=band_hz, lines=lines, method="weighted least squares"
-    )
-    if lines < structure.fewest_lines:
-        return replace(
-            nothing,
-            status=PolesStatus.TOO_FEW_LINES,
-            message=f"{lines} lines in {band_hz[0]:g}-{band_hz[1]:g} Hz, "
-            f"{structure.parameters} parameters need at least {structure.fewest_lines}",
-        )
-    g = selected.g[usable]
-    model = None
-    if variance is not None and selected.dof > 0 and np.all(variance[usable] > 0):
-        model = model_variance(variance[usable], selected.dof)
-        std = np.sqrt(model.variance)
+    known: VarianceModel | None = None
+    if variance is not None and selected.dof > 0 and bool(np.all((variance > 0) | ~usable)):
+        known = model_variance(np.where(usable, variance, np.nan), selected.dof)
+        weights = known.variance
     else:
-        std = np.full(lines, np.sqrt(np.mean(np.abs(g) ** 2)))  # alike for all lines
-    fit = fit_rational(selected.frequency_hz[usable], g, std, structure)
-    parameters = ParameterCovariance.of(fit)
-    poles = modes_in_band(fit.poles_rad_s(), band_hz)
-    f0_hz, damping_ratio = natural_frequency_and_damping(poles)
-    noise_ratio = None
-    if model is not None and selected.variance_noise is not None:
-        noise_ratio = selected.variance_noise[usable] / model.variance
-    result = replace(
-        nothing,
-        poles_rad_s=poles,
-        f0_hz=f0_hz,
-        damping_ratio=damping_ratio,
-        residues=fit.residues(poles),
-        cost=fit.cost if model else float("nan"),
-        expected_cost=model.expected_cost(lines, structure.parameters) if model else float("nan"),
-        condition_number=parameters.condition_number,
-        variance_model=model.kind if model else "unknown",
-        fit=fit,
+        count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)
+        power = np.sum(np.abs(np.where(usable, g, 0)) ** 2, axis=-1, keepdims=True) / count
+        power = np.where(power > 0, power, 1.0)
+        weights = np.where(usable, power, np.inf)
+    if not usable.all():
+        g = np.where(usable, g, 0.0)
+    total_known = selected.variance_total is not None
+    return _identify(
+        selected.frequency_hz,
+        BinData(g, None, weights),
+        known,
+        usable,
+        structure,
+        band_hz,
+        shape=frf.g.shape[:-1],
+        method="weighted least squares",
+        noise=noise if known is not None and total_known else None,
+        total_known=total_known,
     )
-    result = _judge(result, fit, model)
-    result = _with_covariances(
-        result, fit, parameters, model, noise_ratio, selected.variance_total is not None
+
+
+def identify_spectra(
+    frequency_hz: FloatArray,
+    spectra: ComplexArray,
+    covariance: ComplexArray,
+    dof: int,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+    *,
+    pooled: bool = True,
+) -> PolesBatch:
+    """Poles from input and output spectra with their noise covariance: errors in variables.
+
+    Parameters
+    ----------
+    frequency_hz : (F,) float
+    spectra : (..., 2, F) complex
+        Mean spectra, row order [Y; U].
+    covariance : (..., 2, 2, F) complex
+        Noise covariance of these means.
+    dof : int
+        Complex degrees of freedom of the covariance; 0 where it is exact.
+    band_hz, structure
+        As for `identify_poles`.
+    pooled : bool
+        Average the covariance over the band where a test finds both variances flat.
+
+    Returns
+    -------
+    PolesBatch
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    section 12.3: sample maximum likelihood.
+    """
+    structure = structure or ModelStructure()
+    if spectra.shape[-2] != 2 or covariance.shape[-3:-1] != (2, 2):
+        raise ValueError(
+            f"spectra, covariance: shapes {spectra.shape}, {covariance.shape}, "
+            "expected (..., 2, F) and (..., 2, 2, F)"
+        )
+    band_hz = _band(frequency_hz, band_hz)
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    lines = int(inside.sum())
+    shape = spectra.shape[:-2]
+    z = spectra[..., inside].reshape(-1, 2, lines)
+    c = np.broadcast_to(covariance, (*shape, 2, 2, covariance.shape[-1]))
+    c = c[..., inside].reshape(-1, 2, 2, lines)
+    usable = np.isfinite(z).all(axis=-2) & np.isfinite(c).all(axis=(-3, -2))
+    usable &= c[:, 0, 0].real > 0
+    z = np.where(usable[:, None], z, 0.0)
+    c_yy = np.where(usable, c[:, 0, 0].real, np.inf)
+    c_uu = np.where(usable, c[:, 1, 1].real, 0.0)
+    c_yu = np.where(usable, c[:, 0, 1], 0.0)
+    known = _pooled_kind(c_yy, c_uu, usable, dof, pooled)
+    flat = known.kind == 0
+    if flat.any():
+        count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)
+        choose = flat[:, None] & usable
+        finite = np.where(usable, c_yy, 0.0)
+        c_yy = np.where(choose, finite.sum(axis=-1, keepdims=True) / count, c_yy)
+        c_uu = np.where(choose, c_uu.sum(axis=-1, keepdims=True) / count, c_uu)
+        c_yu = np.where(choose, c_yu.sum(axis=-1, keepdims=True) / count, c_yu)
+    return _identify(
+        frequency_hz[inside],
+        BinData(z[:, 0], z[:, 1], c_yy, c_uu, c_yu),
+        known,
+        usable,
+        structure,
+        band_hz,
+        shape=shape,
+        method="sample maximum likelihood, errors in variables",
     )
-    notes = [result.message]
-    if lines < usable.size:
-        notes.append(f"{usable.size - lines} lines without a finite response left out")
-    if frf.status is not FrfStatus.OK or selected.variance_noise is None:
-        notes.append(frf.message)
-    return replace(result, message="; ".join(filter(None, notes)))
 
 
-def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> ComplexArray:
-    """Of each complex pair near the band the pole above the real axis, by natural frequency."""
-    margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
-    f0_hz, _ = natural_frequency_and_damping(poles_rad_s)
-    inside = (
-        (poles_rad_s.imag > 0) & (f0_hz >= band_hz[0] - margin) & (f0_hz <= band_hz[1] + margin)
-    )
-    return poles_rad_s[inside][np.argsort(f0_hz[inside])]
+def _pooled_kind(
+    c_yy: FloatArray, c_uu: FloatArray, usable: npt.NDArray[np.bool_], dof: int, pooled: bool
+) -> VarianceModel:
+    """Flat where both variances pass the test (exact ones count as many periods), else per line."""
+    lines = usable.sum(axis=-1)
+    exact = dof <= 0
+    kind = np.full(c_yy.shape[0], 2)
+    if pooled and not exact:
+        for variance in (c_yy, c_uu):
+            if np.any(variance[usable] > 0):
+                kind = np.minimum(kind, 2 - 2 * (model_variance(variance, dof).kind == 0))
+                kind = np.where(model_variance(variance, dof).kind == 0, kind, 3)
+        kind = np.where(kind == 0, 0, 2)
+    return VarianceModel(c_yy, lines, 10**6 if exact else dof, kind)
 
 
-def _judge(result: Poles, fit: RationalFit, model: VarianceModel | None) -> Poles:
-    """Status and its sentence: the first that applies, the gravest first."""
-    low_hz, high_hz = result.band_hz
-    checks = [
-        (
-            not fit.converged,
-            PolesStatus.NOT_CONVERGED,
-            f"no minimum found in {fit.iterations} iterations",
-        ),
-        (
-            not result.condition_number < LARGEST_CONDITION_NUMBER,
-            PolesStatus.ILL_CONDITIONED,
-            f"condition number {result.condition_number:.2g}: the lines do not determine the model",
-        ),
-        (
-            result.poles_rad_s.size == 0,
-            PolesStatus.NO_RESONANCE,
-            f"no complex pole pair in {low_hz:g}-{high_hz:g} Hz",
-        ),
-        (
-            bool(np.any(result.poles_rad_s.real >= 0)),
-            PolesStatus.UNSTABLE_POLE,
-            "a pole in the right half plane: the sensor is passive, so the model is wrong",
-        ),
-        (
-            model is None,
-            PolesStatus.NO_COVARIANCE,
-            "the variance of the response is unknown: lines weighted alike",
-        ),
-        (
-            model is not None
-            and result.cost
-            > model.cost_quantile(
-                result.lines, result.structure.parameters, 1 - MODEL_ERROR_PROBABILITY
-            ),
-            PolesStatus.MODEL_ERROR,
-            f"cost {result.cost:.4g} where the variance explains {result.expected_cost:.4g}: the model "
-            "leaves something out, rely on the total covariance",
-        ),
-    ]
-    for applies, status, message in checks:
-        if applies:
-            return replace(result, status=status, message=message)
-    return replace(result, status=PolesStatus.OK)
-
-
-def _with_covariances(
-    result: Poles,
-    fit: RationalFit,
-    parameters: ParameterCovariance,
-    model: VarianceModel | None,
-    noise_ratio: FloatArray | None,
-    total_known: bool,
-) -> Poles:
-    """Fill in the covariances that can be told; see the notes of `identify_poles`."""
-    if result.poles_rad_s.size == 0 or result.status in (
-        PolesStatus.NOT_CONVERGED,
-        PolesStatus.ILL_CONDITIONED,
-    ):
-        return result
-    if model is None:
+def _identify(
+    frequency_hz: FloatArray,
+    data: BinData,
+    known: VarianceModel | None,
+    usable: npt.NDArray[np.bool_],
+    structure: ModelStructure,
+    band_hz: tuple[float, float],
+    *,
+    shape: tuple[int, ...],
+    method: str,
+    noise: FloatArray | None = None,
+    total_known: bool = False,
+) -> PolesBatch:
+    lines = usable.sum(axis=-1)
+    batch = lines.size
+    parameters = structure.parameters
+    enough = lines >= structure.fewest_lines
+    places = max(frequency_hz.size, structure.order + 1, structure.numerator_order + 1)
+    if frequency_hz.size < structure.fewest_lines:
+        # bases need points: any will do, nothing is fitted
+        frequency_hz = np.linspace(band_hz[0], max(band_hz[1], band_hz[0] + 1.0), places)
+        return assemble(
+            Evidence.empty(LinesPlan.on_lines(frequency_hz, structure), lines),
+            structure,
+            band_hz,
+            shape,
+            method,
+        )
+    plan = LinesPlan.on_lines(frequency_hz, structure)
+    fit = plan.fit(data)
+    free = np.maximum(lines - parameters / 2, 0.5)
+    nan = np.full(batch, np.nan)
+    if known is None:
         # the residuals are all there is: they hold noise, distortion and model error together
-        free = result.lines - result.structure.parameters / 2
-        scaled = parameters.from_weights() * (fit.cost / free)
-        total = pole_covariance(fit, result.poles_rad_s, scaled)
-        return replace(result, total_covariance=f0_damping_covariance(result.poles_rad_s, total))
-    correction = model.information_correction
-    weighted = pole_covariance(fit, result.poles_rad_s, parameters.from_weights()) * correction
-    noise = weighted
-    if total_known and noise_ratio is not None:
-        noise = pole_covariance(fit, result.poles_rad_s, parameters.from_variance(noise_ratio))
-    total = weighted if total_known else None
-    if result.status is PolesStatus.MODEL_ERROR:
-        total = weighted * (result.cost / result.expected_cost)
-    return replace(
-        result,
-        pole_covariance=noise,
-        covariance=f0_damping_covariance(result.poles_rad_s, noise),
-        total_covariance=None
-        if total is None
-        else f0_damping_covariance(result.poles_rad_s, total),
-    )
+        scale = fit.cost / free
+        nothing = np.full_like(fit.covariance, np.nan)
+        evidence = Evidence(
+            fit, lines, enough, nan, nan, np.zeros(batch, bool), nothing,
+            fit.covariance * scale[:, None, None], np.full(batch, "unknown"), False,
+        )  # fmt: skip
+        return assemble(evidence, structure, band_hz, shape, method)
+    weighted = fit.covariance * known.information_correction[:, None, None]
+    covariance = weighted
+    if noise is not None:
+        covariance = _propagated(plan, fit, data, noise)
+    expected = known.expected_cost(parameters)
+    with np.errstate(invalid="ignore"):
+        suspect = fit.cost > known.cost_quantile(parameters, 1 - MODEL_ERROR_PROBABILITY)
+    total = weighted if total_known else np.full_like(weighted, np.nan)
+    evidence = Evidence(
+        fit, lines, enough, fit.cost, expected, suspect, covariance, total,
+        np.array(KINDS)[known.kind], True,
+    )  # fmt: skip
+    if suspect.any():
+        evidence = evidence.with_model_error(weighted)
+    result = assemble(evidence, structure, band_hz, shape, method)
+    if suspect.any():
+        halves = _difference_of_halves(plan, data, usable, np.flatnonzero(suspect), band_hz)
+        total = result.total_covariance.reshape((batch, *halves.shape[1:]))
+        total[suspect] += halves
+    return result
+
+
+def _difference_of_halves(
+    plan: LinesPlan,
+    data: BinData,
+    usable: npt.NDArray[np.bool_],
+    rows: npt.NDArray[np.int64],
+    band_hz: tuple[float, float],
+) -> FloatArray:
+    """(rows, places, 2, 2) as `judgement.difference_of_halves`."""
+    poles = []
+    part = data.rows(rows)
+    for parity in (0, 1):
+        left_out = np.arange(usable.shape[1]) % 2 == parity
+        half = replace(part, variance_y=np.where(left_out, np.inf, part.variance_y))
+        poles.append(modes_in_band(plan.fit(half).model.poles_rad_s(), band_hz))
+    return difference_of_halves(*poles)
+
+
+def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
+    """Covariance (batch, n, n) from a variance (batch, F) other than the one weighted with."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        finite = np.isfinite(data.variance_y)
+        changed = BinData(data.y, None, np.where(finite, data.variance_y**2 / noise, np.inf))
+    inner = plan.weighted_normal(changed, plan.theta(fit.model))
+    n = inner.shape[-1]
+    inverse = 2 * fit.covariance[:, :n, :n]
+    return 0.5 * inverse @ inner @ inverse
+
+
+def _band(frequency_hz: FloatArray, band_hz: tuple[float, float] | None) -> tuple[float, float]:
+    if band_hz is None:
+        return float(frequency_hz[0]), float(frequency_hz[-1])
+    return float(band_hz[0]), float(band_hz[1])
+
+
+def _flat(array: FloatArray | None, shape: tuple[int, ...]) -> FloatArray | None:
+    return None if array is None else array.reshape(shape)

@@ -12,63 +12,92 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 FloatArray = npt.NDArray[np.float64]
 
-# Bartlett's test rejects a flat variance wrongly in one of a thousand bands.
-FALSE_ALARM = 1e-3
+# Bartlett's test rejects a flat variance wrongly in one of ten thousand bands.
+FALSE_ALARM = 1e-4
+KINDS = ("flat", "sloped", "per line")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VarianceModel:
-    """Variance to weight with.
+    """Variance to weight with, for a batch of points.
 
     Attributes
     ----------
-    variance : (F,) float
+    variance : (batch, F) float
+        Infinite on lines that are left out.
+    lines : (batch,) int
+        Lines that are not.
     dof : int
         Complex degrees of freedom of the variance of each line.
-    pooled_dof : int
-        Of the whole curve; equals `dof` for ``per line``.
-    kind : {"flat", "sloped", "per line"}
+    kind : (batch,) int
+        Index into `KINDS`.
     """
 
     variance: FloatArray
+    lines: npt.NDArray[np.int64]
     dof: int
-    pooled_dof: int
-    kind: str
+    kind: npt.NDArray[np.int64]
 
     @property
-    def information_correction(self) -> float:
-        """Factor by which the plain covariance ``(2 Re J^H J / s^2)^-1`` is too small.
+    def pooled_dof(self) -> FloatArray:
+        """(batch,) of the whole curve; equals `dof` for ``per line``."""
+        return np.where(self.kind == 2, 1, self.lines) * float(self.dof)
 
-        With weights 1/s^2 of nu complex degrees of freedom each, ``E[1/s^2] = nu/(nu-1)/sigma^2``
-        and ``E[1/s^4] = nu^2/((nu-1)(nu-2))/sigma^4``; the plain covariance becomes (nu-1)/nu of
-        the bound and the estimate's own (nu-1)/(nu-2), together nu/(nu-2). NaN for nu <= 2, where
-        the weights have no second moment. 1 where the variance is pooled.
+    @property
+    def information_correction(self) -> FloatArray:
+        """(batch,) factor by which the plain covariance ``(2 Re J^H J / s^2)^-1`` is too small.
+
+        With weights 1/s^2 of nu complex degrees of freedom each, ``E[1/s^2] = nu / (nu - 1) /
+        sigma^2`` and ``E[1/s^4] = nu^2 / ((nu - 1)(nu - 2)) / sigma^4``; the plain covariance
+        becomes (nu - 1)/nu of the bound and the estimate's own (nu - 1)/(nu - 2), together nu / (nu
+        - 2). NaN for nu <= 2, where the weights have no second moment. 1 where the variance is
+        pooled.
         """
-        if self.kind != "per line":
-            return 1.0
-        return self.dof / (self.dof - 2) if self.dof > 2 else float("nan")
+        per_line = self.dof / (self.dof - 2) if self.dof > 2 else np.nan
+        return np.where(self.kind == 2, per_line, 1.0)
 
-    def expected_cost(self, lines: int, parameters: int) -> float:
-        """Expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none.
-
-        ``|e|^2 / s^2`` is F-distributed with 2 and 2 nu degrees of freedom.
-        """
+    def expected_cost(self, parameters: int) -> FloatArray:
+        """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
         nu = self.pooled_dof
-        return (lines - parameters / 2) * nu / (nu - 1) if nu > 1 else float("nan")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(nu > 1, (self.lines - parameters / 2) * nu / (nu - 1), np.nan)
 
-    def cost_quantile(self, lines: int, parameters: int, probability: float) -> float:
-        """Quantile of the cost with noise alone; NaN where its distribution is too wide to tell."""
-        free = lines - parameters / 2
-        if self.kind != "per line":
-            return free * float(stats.f.ppf(probability, 2 * free, 2 * self.pooled_dof))
-        if self.dof <= 2:
-            return float("nan")
-        one = stats.f(2, 2 * self.dof)
-        return free * one.mean() + np.sqrt(free) * one.std() * float(stats.norm.ppf(probability))
+    def cost_quantile(self, parameters: int, probability: float) -> FloatArray:
+        """(batch,) quantile of the cost with noise alone; NaN where it is too wide to tell.
+
+        Wilson and Hilferty's cube root makes the F-distribution normal to better than 1 % here.
+        """
+        free = np.maximum(self.lines - parameters / 2, 0.5)
+        per_line = np.nan
+        if self.dof > 2:
+            # moments of F(2, 2 nu)
+            nu = self.dof
+            mean = nu / (nu - 1)
+            std = mean * np.sqrt(nu / (nu - 2))
+            per_line = free * mean + np.sqrt(free) * std * special.ndtri(probability)
+        pooled = free * f_quantile(probability, 2 * free, 2 * self.pooled_dof)
+        return np.where(self.kind == 2, per_line, pooled)
+
+
+def f_quantile(probability: float, dof_1: FloatArray, dof_2: FloatArray) -> FloatArray:
+    """Quantile of the F-distribution by Wilson and Hilferty's cube roots: arrays at no cost.
+
+    Paulson, *An approximate normalization of the analysis of variance distribution*, Ann. Math.
+    Stat. 13 (1942) 233-235. Within 1 % for degrees of freedom above 10. Infinite where the
+    approximation ends.
+    """
+    normal = float(special.ndtri(probability))
+    a, b = 2 / (9 * np.asarray(dof_1)), 2 / (9 * np.asarray(dof_2))
+    bottom = (1 - b) ** 2 - normal**2 * b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = (1 - a) * (1 - b) + normal * np.sqrt(
+            np.maximum((1 - a) ** 2 * b + (1 - b) ** 2 * a - normal**2 * a * b, 0)
+        )
+        return np.where(bottom > 0, (root / bottom) ** 3, np.inf)
 
 
 def model_variance(variance: FloatArray, dof: int) -> VarianceModel:
@@ -76,54 +105,72 @@ def model_variance(variance: FloatArray, dof: int) -> VarianceModel:
 
     Parameters
     ----------
-    variance : (F,) float
-        Sample variance per line, positive.
+    variance : (batch, F) float
+        Sample variance per line; lines where it is not positive and finite are left out.
     dof : int
         Complex degrees of freedom of each.
-
-    Returns
-    -------
-    VarianceModel
 
     References
     ----------
     Bartlett, *Properties of sufficiency and statistical tests*, Proc. R. Soc. A 160 (1937) 268-282.
     """
-    lines = variance.size
-    flat = np.full(lines, variance.mean())
-    if _bartlett(variance, flat, dof, 1) > FALSE_ALARM:
-        return VarianceModel(flat, dof, lines * dof, "flat")
-    sloped = _log_linear(variance)
-    if _bartlett(variance, sloped, dof, 2) > FALSE_ALARM:
-        return VarianceModel(sloped, dof, lines * dof, "sloped")
-    return VarianceModel(variance, dof, dof, "per line")
+    usable = (variance > 0) & np.isfinite(variance)
+    lines = usable.sum(axis=-1)
+    count = np.maximum(lines, 1)
+    whole = bool(usable.all())
+    known = variance if whole else np.where(usable, variance, 0.0)
+    mean = known.sum(axis=-1, keepdims=True) / count[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log = np.log(variance if whole else np.where(usable, variance, 1.0))
+        log_mean = log.sum(axis=-1) / count
+        model = np.broadcast_to(mean, variance.shape)
+        kind = np.zeros(variance.shape[0], np.int64)
+        unequal = np.log(mean[:, 0]) - log_mean > _bartlett_limit(lines, dof, 1)
+    if unequal.any():
+        model = model.copy()
+        rest = np.flatnonzero(unequal)
+        curve = _log_linear(known[rest], usable[rest])
+        ratio = np.where(usable[rest], known[rest] / curve, 1.0)
+        with np.errstate(divide="ignore"):
+            spread = (
+                np.log((ratio * usable[rest]).sum(axis=-1) / count[rest])
+                - np.sum(np.log(ratio), axis=-1) / count[rest]
+            )
+        each = spread > _bartlett_limit(lines[rest], dof, 2)
+        model[rest] = np.where(each[:, None], variance[rest], curve)
+        kind[rest] = np.where(each, 2, 1)
+    if not whole:
+        model = np.where(usable, model, np.inf)
+    return VarianceModel(model, lines, dof, kind)
 
 
-def _bartlett(variance: FloatArray, model: FloatArray, dof: int, parameters: int) -> float:
-    """Probability of a spread of ``variance / model`` at least this large if the model holds."""
-    lines = variance.size
-    if lines <= parameters:
-        return 1.0
-    ratio = variance / model
+def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> FloatArray:
+    """Largest ``log mean - mean log`` of variance ratios that passes the test."""
     real_dof = 2 * dof
-    statistic = real_dof * lines * (np.log(ratio.mean()) - np.mean(np.log(ratio)))
-    correction = 1 + (lines + 1) / (3 * lines * real_dof)
-    return float(stats.chi2.sf(statistic / correction, lines - parameters))
+    count = np.maximum(lines, parameters + 1).astype(float)
+    correction = 1 + (count + 1) / (3 * count * real_dof)
+    quantile = special.chdtri(count - parameters, FALSE_ALARM)
+    return quantile * correction / (real_dof * count)
 
 
-def _log_linear(variance: FloatArray) -> FloatArray:
-    """Maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
+def _log_linear(variance: FloatArray, usable: npt.NDArray[np.bool_]) -> FloatArray:
+    """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
 
-    By Fisher scoring.
+    By Fisher scoring, over the usable lines.
     """
-    x = np.linspace(-1, 1, variance.size)
+    x = np.linspace(-1, 1, variance.shape[-1])
     design = np.column_stack([np.ones_like(x), x])  # (F, 2)
-    coefficients = np.array([np.log(variance.mean()), 0.0])
+    count = np.maximum(usable.sum(axis=-1), 1)
+    coefficients = np.stack(
+        [np.log(variance.sum(axis=-1) / count), np.zeros(variance.shape[0])], axis=-1
+    )
+    information = np.einsum("bf,fi,fj->bij", usable.astype(float), design, design)
     for _ in range(50):
-        ratio = variance * np.exp(-design @ coefficients)
-        step = np.linalg.solve(design.T @ design, design.T @ (ratio - 1))
-        # limited: the score is far from linear where the ratio is large
+        ratio = variance * np.exp(-coefficients @ design.T)
+        score = np.where(usable, ratio - 1, 0.0) @ design
+        step = np.linalg.solve(information, score[..., None])[..., 0]
+        # some decades at most: the score is far from linear where the ratio is large
         coefficients = coefficients + np.clip(step, -2.0, 2.0)
         if np.max(np.abs(step)) < 1e-10:
             break
-    return np.exp(design @ coefficients)
+    return np.exp(coefficients @ design.T)

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.identification.rational_fit import RationalFit
+from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,6 +51,12 @@ class Poles:
         From noise, distortion and model error, where they can be told.
     pole_covariance : (n, 2, 2) float or None
         Of (Re, Im) of each pole [rad^2/s^2], from noise.
+    residue_covariance : (n, 2, 2) float or None
+        Of (Re, Im) of each residue [rad^2/s^2], from noise.
+    zeros_rad_s : (k,) complex
+        All zeros of the model [rad/s]; those far outside the band mean nothing.
+    zero_covariance : (k, 2, 2) float or None
+        Of (Re, Im) of each zero, from noise.
     structure : ModelStructure
     band_hz : (float, float)
     lines : int
@@ -58,11 +64,15 @@ class Poles:
     cost, expected_cost : float
         Weighted squared residuals, and their expectation if there were nothing but noise; NaN where
         the variance is unknown.
+    whiteness : float
+        Correlation of the residuals of neighbouring lines times the root of their number: beyond
+        +-3 noise alone is improbable. NaN where it was not computed.
     condition_number : float
-        Of the column-scaled Jacobian; NaN where there is none.
+        Of the column-scaled Jacobian, to within a factor of the number of parameters; NaN where
+        there is none.
     variance_model : str
         What was assumed of the variance over the lines: flat, sloped, or per line.
-    fit : RationalFit or None
+    fit : RationalModel or None
         The model itself; ``fit.response(frequency_hz)`` is its frequency response.
     method : str
     status : PolesStatus
@@ -77,30 +87,120 @@ class Poles:
     covariance: FloatArray | None = None
     total_covariance: FloatArray | None = None
     pole_covariance: FloatArray | None = None
+    residue_covariance: FloatArray | None = None
+    zeros_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
+    zero_covariance: FloatArray | None = None
     structure: ModelStructure = field(default_factory=ModelStructure)
     band_hz: tuple[float, float] = (float("nan"), float("nan"))
     lines: int = 0
     cost: float = float("nan")
     expected_cost: float = float("nan")
+    whiteness: float = float("nan")
     condition_number: float = float("nan")
     variance_model: str = ""
-    fit: RationalFit | None = None
+    fit: RationalModel | None = None
     method: str = ""
     status: PolesStatus = PolesStatus.FAILED
     message: str = ""
 
 
+STATUSES = tuple(PolesStatus)
+STATUS_CODE = {status: code for code, status in enumerate(STATUSES)}
+
+
+@dataclass(frozen=True, eq=False)
+class PolesBatch:
+    """Poles of many points, as arrays with the points' axes (...) leading.
+
+    Every point has ``structure.order // 2`` places for modes inside the band, by natural frequency;
+    places without a mode hold NaN. NaN in a covariance means that it could not be estimated.
+
+    Attributes
+    ----------
+    poles_rad_s, residues : (..., n) complex
+    f0_hz, damping_ratio : (..., n) float
+    covariance, total_covariance, pole_covariance : (..., n, 2, 2) float
+        As in `Poles`; the total one is NaN where nothing but noise is known.
+    coefficient_covariance : (..., p, p) float
+        Of the free coefficients of ``fit``: denominator, numerator, transient (from noise).
+    cost, expected_cost, condition_number : (...) float
+    residual : (..., F) complex
+        Weighted residuals on the (excited) lines; 0 on those left out.
+    lines : (...) int
+    status_code : (...) uint8
+        Index into `STATUSES`.
+    noise_variance : (..., 2) float
+        Estimated variance of a bin of Y and of U [V^2]; NaN where the data brought their own.
+    fit : RationalModel
+        Its coefficients have the same leading axes.
+    structure : ModelStructure
+    band_hz : (float, float)
+    variance_model : (...) str array
+    method : str
+    """
+
+    poles_rad_s: ComplexArray
+    f0_hz: FloatArray
+    damping_ratio: FloatArray
+    residues: ComplexArray
+    covariance: FloatArray
+    total_covariance: FloatArray
+    pole_covariance: FloatArray
+    coefficient_covariance: FloatArray
+    cost: FloatArray
+    expected_cost: FloatArray
+    condition_number: FloatArray
+    residual: ComplexArray
+    lines: npt.NDArray[np.int64]
+    status_code: npt.NDArray[np.uint8]
+    noise_variance: FloatArray
+    fit: RationalModel
+    structure: ModelStructure
+    band_hz: tuple[float, float]
+    variance_model: npt.NDArray[np.str_]
+    method: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the batch."""
+        return self.cost.shape
+
+    @property
+    def whiteness(self) -> FloatArray:
+        """(...) correlation of neighbouring residuals over its standard deviation if white.
+
+        NaN where there are no two of them.
+        """
+        first, second = self.residual[..., :-1], self.residual[..., 1:]
+        pairs = np.sum((first != 0) & (second != 0), axis=-1)
+        used = np.maximum(np.sum(self.residual != 0, axis=-1), 1)
+        power = np.sum(np.abs(self.residual) ** 2, axis=-1) / used
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sum(np.real(first * second.conj()), axis=-1) / (power * np.sqrt(pairs / 2))
+
+    def has_status(self, status: PolesStatus) -> npt.NDArray[np.bool_]:
+        """(...) which points have a status."""
+        return self.status_code == STATUS_CODE[status]
+
+    def status(self, index: tuple[int, ...] | int = ()) -> PolesStatus:
+        """Status of one point."""
+        return STATUSES[int(self.status_code[index])]
+
+
 def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """f0 [Hz] and damping ratio of poles [rad/s], elementwise."""
     magnitude = np.abs(pole)
-    return magnitude / (2 * np.pi), -pole.real / magnitude
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return magnitude / (2 * np.pi), -pole.real / magnitude
 
 
 def natural_frequency_and_damping_jacobian(pole: ComplexArray) -> FloatArray:
     """(..., 2, 2) derivative of (f0_hz, damping_ratio) by (Re, Im) of the pole [rad/s]."""
     re, im, mag = pole.real, pole.imag, np.abs(pole)
-    rows = [
-        [re / (2 * np.pi * mag), im / (2 * np.pi * mag)],
-        [-(im**2) / mag**3, re * im / mag**3],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    out = np.empty((*np.shape(pole), 2, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out[..., 0, 0] = re / (2 * np.pi * mag)
+        out[..., 0, 1] = im / (2 * np.pi * mag)
+        out[..., 1, 0] = -(im**2) / mag**3
+        out[..., 1, 1] = re * im / mag**3
+    return out

@@ -10,31 +10,48 @@ DEFAULT_RESIDUAL_TERMS = 6
 
 @dataclass(frozen=True)
 class ModelStructure:
-    """Orders of ``G(s) = B(s) / A(s)`` with real coefficients.
+    """Orders of ``G = B / A`` with real coefficients, in s or in z.
 
-    A numerator of order ``order + r - 1`` is the same as ``order / 2`` modes and a residual polynomial
-    ``c_0 + c_1 s + ... + c_{r-1} s^{r-1}`` for the modes outside the band (partial fractions).
+    A numerator of order ``order + r - 1`` is the same as ``order / 2`` modes and a residual
+    polynomial ``c_0 + c_1 s + ... + c_{r-1} s^{r-1}`` for the modes outside the band (partial
+    fractions).
 
     Attributes
     ----------
     order : int
         Of the denominator: two poles a mode.
     numerator_order : int
+    domain : {"s", "z"}
+        Laplace variable for band-limited signals, z for a zero-order hold between samples.
+    sample_rate_hz : float or None
+        Needed in the z-domain.
+    delay : bool
+        Estimate a pure delay [s] beside the rational function.
 
     Notes
     -----
-    A bare second-order model (numerator order 2) over 200-300 Hz is biased by several standard deviations
-    by the sensor's other modes; six residual terms (the default) bring the bias below half of one.
+    A bare second-order model (numerator order 2) over 200-300 Hz is biased by several standard
+    deviations by the sensor's other modes; six residual terms (the default) bring the bias below
+    half of one.
     """
 
     order: int = 2
     numerator_order: int = 2 + DEFAULT_RESIDUAL_TERMS - 1
+    domain: str = "s"
+    sample_rate_hz: float | None = None
+    delay: bool = False
 
     def __post_init__(self) -> None:
         if self.order < 1:
             raise ValueError(f"order: {self.order}, expected at least 1")
         if self.numerator_order < 0:
             raise ValueError(f"numerator_order: {self.numerator_order}, expected at least 0")
+        if self.domain not in ("s", "z"):
+            raise ValueError(f"domain: {self.domain!r}, accepted are 's' and 'z'")
+        if self.domain == "z" and not (self.sample_rate_hz and self.sample_rate_hz > 0):
+            raise ValueError(
+                f"sample_rate_hz: {self.sample_rate_hz}, the z-domain needs a rate above 0"
+            )
 
     @classmethod
     def with_residual(
@@ -46,7 +63,7 @@ class ModelStructure:
     @property
     def parameters(self) -> int:
         """Number of free real parameters."""
-        return self.order + self.numerator_order + 1
+        return self.order + self.numerator_order + 1 + int(self.delay)
 
     @property
     def fewest_lines(self) -> int:

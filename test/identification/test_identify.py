@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-import scipy.io
 
-from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_poles
@@ -73,26 +71,6 @@ def test_stated_covariance_is_that_of_the_estimates(pooled, dof, kind):
     # std of chi-square(2) is 2; heavier tails with weights of few degrees of freedom: five of its std
     assert abs(np.mean(squared) - 2) < 5 * 2 / np.sqrt(runs) + (0.0 if pooled else 0.1)
     assert np.mean(costs) == pytest.approx(np.mean(expected), rel=0.02)
-
-
-def test_silverbox_gives_the_reference(shared_data):
-    """Reference: f0 69.536 +- 0.012 Hz, damping 0.04877 +- 0.00016, cost 525 over 470 lines."""
-    content = scipy.io.loadmat(shared_data / "silverbox" / "SNLS80mV.mat")
-    ends = [48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196]
-    u, y = (
-        np.stack([content[name].ravel()[end - 8192 : end] for end in ends])[:, None]
-        for name in ("V1", "V2")
-    )
-    frf = estimate_frf(u, y, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2))
-    bare = identify_poles(frf, (40.0, 110.0), BARE)
-    assert bare.lines == 470
-    assert bare.f0_hz[0] == pytest.approx(69.536, abs=0.0006)
-    assert bare.damping_ratio[0] == pytest.approx(0.04877, abs=0.000006)
-    assert bare.cost == pytest.approx(525, abs=1)
-    assert bare.expected_cost == pytest.approx(526, abs=1)
-    default = identify_poles(frf, (40.0, 110.0))
-    assert abs(default.f0_hz[0] - 69.536) < 3 * 0.012
-    assert abs(default.damping_ratio[0] - 0.04877) < 3 * 0.00016
 
 
 def test_model_error_is_seen_and_enlarges_the_total_covariance():

@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles: run time against error, and the Monte Carlo grid against the Cramer-Rao bound.
+
+``run(output, quick)`` writes ``poles.md`` and ``poles.png`` into `output` and returns the text.
+Everything is simulated on the plant of `poles_plant.py`; times are those of one thread of the
+machine it runs on, to be read as ratios to the Fourier transform of the same record.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+from scipy import stats
+
+from benchmarks.poles_bias import tissue_bias
+from benchmarks.poles_peers import PEERS, Case
+from benchmarks.poles_plant import (
+    BAND_HZ,
+    HARMONICS,
+    SAMPLE_RATE_HZ,
+    SAMPLES_PER_PERIOD,
+    Plant,
+    judge,
+)
+from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ratio_variance
+from tactile_resonance.identification.identify import (
+    identify_batch,
+    identify_poles,
+    identify_spectra,
+)
+from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.result import PolesBatch
+from tactile_resonance.identification.structure import ModelStructure
+
+BARE = ModelStructure(2, 2)
+DAMPING = (0.005, 0.01, 0.02, 0.05, 0.1)
+SNR_DB = (10.0, 20.0, 40.0, 60.0, 80.0)
+PERIODS = (1, 2, 8)
+CHUNK = 1000
+# Outside the band the local polynomial method needs neighbours.
+MARGIN_HZ = 30.0
+
+
+def run(output: Path, quick: bool) -> str:
+    """Write the figure and the table.
+
+    Parameters
+    ----------
+    output : Path
+        Folder, made if need be.
+    quick : bool
+        A thinned Monte Carlo: 500 runs a cell instead of 20 000.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    runs = 500 if quick else 20000
+    methods = compare_methods(quick)
+    cells = [
+        measure_cell(Plant(zeta, snr, periods), runs)
+        for periods in PERIODS
+        for zeta in DAMPING
+        for snr in SNR_DB
+    ]
+    parts = [_heading(quick), _method_table(methods), _bias_table(), _grid_table(cells, runs)]
+    text = "\n".join(line for part in parts for line in part) + "\n"
+    (output / "poles.md").write_text(text, encoding="utf-8")
+    _figure(methods, output / "poles.png")
+    return text
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """Time per point [s] and root mean square error over the bound's standard deviation."""
+
+    name: str
+    time_s: float
+    error: npt.NDArray[np.float64]
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A cell of the Monte Carlo grid: MSE over bound, coverage, failures; NaN where no ELiS is."""
+
+    plant: Plant
+    ratio: npt.NDArray[np.float64]
+    coverage: float
+    failed: int
+    elis_ratio: npt.NDArray[np.float64]
+    elis_coverage: float
+    bound: npt.NDArray[np.float64]
+    settled_bound: npt.NDArray[np.float64]
+
+
+def joint_plan(plant: Plant, structure: ModelStructure = BARE) -> JointPlan:
+    """Joint estimator for a plant."""
+    variance_y, variance_u = plant.noise
+    return JointPlan(
+        SAMPLE_RATE_HZ,
+        SAMPLES_PER_PERIOD,
+        plant.periods,
+        HARMONICS,
+        BAND_HZ,
+        structure,
+        input_noise_ratio=variance_u / variance_y if plant.periods == 1 else None,
+    )
+
+
+def local_polynomial_spectra(
+    plant: Plant,
+    u: npt.NDArray,
+    y: npt.NDArray,
+    bins: npt.NDArray,
+    band_hz: tuple[float, float] = BAND_HZ,
+) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray, int]:
+    """Lines [Hz], transient-free spectra (runs, 2, F), their covariance, degrees of freedom."""
+    line_hz = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD
+    harmonics = np.arange(round(band_hz[0] / line_hz), round(band_hz[1] / line_hz) + 1)
+    plan = LocalPolynomialPlan(harmonics, SAMPLES_PER_PERIOD, plant.periods)
+    samples = SAMPLES_PER_PERIOD * plant.periods
+    pair = np.stack([y, u], axis=1) * samples  # (runs, 2, K); the plan divides again
+    groups = []
+    for group in plan.groups:
+        where = group.centre_bins + group.offsets[:, None] - bins[0]  # (W, L)
+        groups.append(np.ascontiguousarray(np.moveaxis(pair[:, :, where], 1, 2)))
+    result = plan.from_bins(groups)
+    return harmonics * line_hz, result.spectra, result.covariance, result.noise_dof
+
+
+def measure_cell(plant: Plant, runs: int) -> Cell:
+    """Monte Carlo of one cell, seeded by the cell."""
+    seed = [int(1e4 * plant.damping_ratio), int(plant.snr_db), plant.periods]
+    rng = np.random.default_rng(seed)
+    wide = plant.bins(BAND_HZ[0] - MARGIN_HZ, BAND_HZ[1] + MARGIN_HZ)
+    inside = np.isin(wide, plant.bins())
+    plan = joint_plan(plant)
+    collected: dict[str, list] = {"joint": [], "elis": []}
+    for _ in range(-(-runs // CHUNK)):
+        u, y = plant.noisy(rng, min(runs, CHUNK), wide)
+        collected["joint"].append(_errors(plan.from_bins(u[:, inside], y[:, inside]), plant))
+        if plant.periods > 1:
+            spectra = local_polynomial_spectra(plant, u, y, wide)
+            collected["elis"].append(
+                _errors(identify_spectra(*spectra, structure=BARE, pooled=False), plant)
+            )
+    bound = plant.bound()
+    ratio, coverage, failed = _judged(collected["joint"], bound)
+    elis_ratio, elis_coverage = np.full(2, np.nan), float("nan")
+    if collected["elis"]:
+        elis_ratio, elis_coverage, _ = _judged(collected["elis"], bound)
+    return Cell(
+        plant, ratio, coverage, failed, elis_ratio, elis_coverage, bound, plant.bound(False)
+    )
+
+
+def _errors(result: PolesBatch, plant: Plant) -> tuple[npt.NDArray, npt.NDArray]:
+    truth = np.array([250.0, plant.damping_ratio])
+    estimate = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
+    return estimate - truth, result.covariance[:, 0]
+
+
+def _judged(parts: list, bound: npt.NDArray) -> tuple[npt.NDArray, float, int]:
+    errors, covariance = (np.concatenate(p) for p in zip(*parts, strict=False))
+    good = np.isfinite(errors).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+    ratio, coverage = judge(errors[good], covariance[good], bound)
+    return ratio, coverage, int(np.sum(~good))
+
+
+def compare_methods(quick: bool) -> list[Method]:
+    """Time per point against error on one cell: damping 2 %, 40 dB, 8 periods."""
+    plant = Plant(0.02, 40.0, 8)
+    runs = 200 if quick else 2000
+    wide = plant.bins(10.0, 1030.0)
+    inside = np.isin(wide, plant.bins())
+    rng = np.random.default_rng(7)
+    u, y = plant.noisy(rng, runs, wide)
+    joint_u, joint_y = np.ascontiguousarray(u[:, inside]), np.ascontiguousarray(y[:, inside])
+    frequency_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
+    frf = FRF(
+        frequency_hz,
+        spectra[:, 0] / spectra[:, 1],
+        variance_noise=ratio_variance(spectra, covariance),
+        noise_dof=dof,
+    )
+    bound = np.sqrt(np.diag(plant.bound()))
+    methods = [
+        Method("Fourier transform of the record, 2 channels", _transform_time(), np.full(2, np.nan))
+    ]
+
+    def add(name: str, time_s: float, estimates: npt.NDArray, note: str = "") -> None:
+        error = np.sqrt(np.nanmean((estimates - [250.0, 0.02]) ** 2, axis=0)) / bound
+        methods.append(Method(name, time_s, error, note))
+
+    few_frfs = [_row(frf, k) for k in range(50)]
+    for structure, model in ((BARE, "2nd order"), (ModelStructure(), "mode + 6 residual terms")):
+        plan = joint_plan(plant, structure)
+        result, seconds = _timed(lambda p=plan: p.from_bins(joint_u, joint_y))
+        estimates = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
+        add(f"joint, {model}, batched", seconds / runs, estimates)
+        _, seconds = _timed(lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)])
+        add(f"joint, {model}, single", seconds / 50, estimates)
+        batch = _repeated(frf, max(1, 5000 // runs))
+        result, seconds = _timed(lambda b=batch, s=structure: identify_batch(b, structure=s))
+        size = batch.g.shape[0]
+        estimates = np.stack([result.f0_hz[:runs, 0], result.damping_ratio[:runs, 0]], -1)
+        add(f"FRF, {model}, batched", seconds / size, estimates)
+        _, seconds = _timed(lambda s=structure: [identify_poles(f, structure=s) for f in few_frfs])
+        add(f"FRF, {model}, single", seconds / 50, estimates)
+    few = 40 if quick else 200
+    wide_hz, wide_spectra, _, _ = local_polynomial_spectra(
+        plant, u[:few], y[:few], wide, (20.0, 1000.0)
+    )
+    joint = (plant.bins(), joint_u, joint_y)
+    wide_frf = (wide_hz, wide_spectra[:, 0] / wide_spectra[:, 1])
+    for name, peer in PEERS:
+        case = Case(plant, frequency_hz, frf.g, frf.variance_noise, joint, *wide_frf)
+        try:
+            function = peer(case)
+        except ImportError as error:
+            methods.append(Method(name, np.nan, np.full(2, np.nan), f"not measured: {error}"))
+            continue
+        start = time.process_time()
+        estimates = np.array([function(k) for k in range(few)])
+        failed = int(np.sum(~np.isfinite(estimates).all(axis=-1)))
+        seconds = (time.process_time() - start) / few
+        add(name, seconds, estimates, f"{failed} of {few} without a pole" if failed else "")
+    return methods
+
+
+def _repeated(frf: FRF, times: int) -> FRF:
+    return dataclasses.replace(
+        frf, g=np.tile(frf.g, (times, 1)), variance_noise=np.tile(frf.variance_noise, (times, 1))
+    )
+
+
+def _row(frf: FRF, k: int) -> FRF:
+    return dataclasses.replace(frf, g=frf.g[k], variance_noise=frf.variance_noise[k])
+
+
+def _timed(call: Callable) -> tuple[PolesBatch, float]:
+    """Result, and the least processor time of three calls after a first one."""
+    result = call()
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return result, min(times)
+
+
+def _transform_time() -> float:
+    record = np.random.default_rng(0).standard_normal((2, 8 * SAMPLES_PER_PERIOD))
+    return _timed(lambda: [scipy.fft.rfft(record, axis=-1) for _ in range(10)])[1] / 10
+
+
+def _heading(quick: bool) -> list[str]:
+    thinned = " Thinned: not the full number of runs." if quick else ""
+    return [
+        "# Poles: run time against error",
+        "",
+        "Simulated: one mode at 250 Hz on a feed-through, random-phase multisine 10 Hz - 10 kHz "
+        "from rest, white noise, input noise 20 dB lower. Band 200-300 Hz. Errors are root mean "
+        "squares over the standard deviation of the Cramer-Rao bound with unknown initial state "
+        "and noise level." + thinned,
+        "",
+    ]
+
+
+def _method_table(methods: list[Method]) -> list[str]:
+    transform = methods[0].time_s
+    rows = [
+        "## Damping 2 %, 40 dB, 8 periods",
+        "",
+        "| Method | time per point | over the Fourier transform | points per second | error f0 "
+        "| error damping | |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for m in methods:
+        if not np.isfinite(m.time_s):
+            rows.append(f"| {m.name} | | | | | | {m.note} |")
+            continue
+        errors = ["" if np.isnan(e) else f"{e:.2f}" for e in m.error]
+        rows.append(
+            f"| {m.name} | {1e6 * m.time_s:.3g} us | {m.time_s / transform:.3g} "
+            f"| {1 / m.time_s:.3g} | {errors[0]} | {errors[1]} | {m.note} |"
+        )
+    return [*rows, ""]
+
+
+def _bias_table() -> list[str]:
+    rows = [
+        "## Bias by modes outside the band",
+        "",
+        "Noise-free records of the simulated bimorph on the tissues of the library, 8 periods from "
+        "rest at 1 V rms: error over the standard deviation that the simulated bench's noise gives "
+        "(f0, damping). The 2nd-order model is the bare one; residual terms stand for the modes "
+        "near 100 and 704 Hz.",
+        "",
+        "| tissue | 2nd order | mode + 4 residual terms | mode + 6 | mode + 8 |",
+        "|---|---|---|---|---|",
+    ]
+    structures = [BARE, *(ModelStructure.with_residual(2, terms) for terms in (4, 6, 8))]
+    for name, biases in tissue_bias(structures).items():
+        cells = " | ".join(f"{b[0]:+.2f}, {b[1]:+.2f}" for b in biases)
+        rows.append(f"| {name} | {cells} |")
+    return [*rows, ""]
+
+
+def _grid_table(cells: list[Cell], runs: int) -> list[str]:
+    low, high = (stats.chi2.ppf(p, runs) / runs for p in (0.0005, 0.9995))
+    mean = np.mean([c.ratio for c in cells])
+    rows = [
+        f"## Monte Carlo, {runs} runs a cell, second-order model",
+        "",
+        "Mean square error over the bound (f0, damping) and coverage of the 95 % ellipse. Joint: "
+        "all bins, transient estimated. ELiS: local polynomial method, sample maximum likelihood "
+        "line by line, covariance corrected for the sample variances; a transient that decays "
+        "within few bins is beyond its polynomial. The 99.9 % interval of a ratio of 1 is "
+        f"{low:.3f} to {high:.3f}. Settled: the bound without transient over that with it "
+        "(standard deviation of f0). "
+        f"Mean of the joint ratios: {mean:.3f}; worst {max(np.max(c.ratio) for c in cells):.3f}; "
+        f"coverage {min(c.coverage for c in cells):.4f} to {max(c.coverage for c in cells):.4f}; "
+        f"failed fits: {sum(c.failed for c in cells)}.",
+        "",
+        "| periods | damping | SNR | std f0 [Hz] | settled | joint MSE | coverage | failed "
+        "| ELiS MSE | coverage |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for c in cells:
+        std = np.sqrt(c.bound[0, 0])
+        elis = "" if np.isnan(c.elis_coverage) else "{:.2f}, {:.2f}".format(*c.elis_ratio)
+        covered = "" if np.isnan(c.elis_coverage) else f"{c.elis_coverage:.3f}"
+        rows.append(
+            f"| {c.plant.periods} | {100 * c.plant.damping_ratio:g} % | {c.plant.snr_db:g} dB "
+            f"| {std:.2e} | {np.sqrt(c.settled_bound[0, 0]) / std:.2f} "
+            f"| {c.ratio[0]:.3f}, {c.ratio[1]:.3f} | {c.coverage:.4f} "
+            f"| {c.failed} | {elis} | {covered} |"
+        )
+    return rows
+
+
+def _figure(methods: list[Method], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    shown = [m for m in methods if np.isfinite(m.time_s) and np.isfinite(m.error).all()]
+    figure, axes = plt.subplots(figsize=(9, 5.5), layout="constrained")
+    for m in shown:
+        ours = m.name.startswith(("joint", "FRF"))
+        axes.plot(1e6 * m.time_s, np.max(m.error), "o" if ours else "s", label=m.name)
+    axes.axhline(1, color="black", linewidth=0.8)
+    axes.axvline(1e6 * methods[0].time_s, color="grey", linestyle="--", linewidth=0.8)
+    axes.text(
+        1e6 * methods[0].time_s, axes.get_ylim()[1], " Fourier transform", va="top", fontsize=8
+    )
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="time per point [us]",
+        ylabel="larger RMS error of f0 and damping / Cramer-Rao bound",
+        title="Simulated: damping 2 %, 40 dB, 8 periods",
+    )
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The noise that the bins between harmonics of a periodic excitation show, on both channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.noise_level import FALSE_ALARM, KINDS, model_variance
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+# Bins whose powers are averaged before their variances are compared with each other.
+BINS_PER_BAND = 8
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseBands:
+    """Pieces of the band within which the variance counts as constant.
+
+    Attributes
+    ----------
+    of_others, of_excited : (K_o,), (K_e,) int
+        Which piece a bin belongs to.
+    starts : (pieces,) int
+        First of the other bins in each piece.
+    counts : (pieces,) int
+    """
+
+    of_others: IntArray
+    of_excited: IntArray
+    starts: IntArray
+    counts: IntArray
+
+    @classmethod
+    def of(cls, bins: IntArray, excited: npt.NDArray[np.bool_]) -> NoiseBands:
+        """Pieces of `BINS_PER_BAND` other bins each, the last one longer."""
+        others = int(np.sum(~excited))
+        pieces = max(1, others // BINS_PER_BAND)
+        starts = np.arange(pieces) * BINS_PER_BAND
+        of_others = np.minimum(np.arange(others) // BINS_PER_BAND, pieces - 1)
+        place = np.searchsorted(bins[~excited], bins[excited])
+        of_excited = np.minimum(place // BINS_PER_BAND, pieces - 1)
+        counts = np.diff(np.append(starts, others))
+        return cls(of_others, of_excited, starts, counts)
+
+
+@dataclass(frozen=True, eq=False)
+class JointNoise:
+    """Noise of a batch of records.
+
+    Attributes
+    ----------
+    variance_y, variance_u : (batch, 1) or (batch, pieces) float
+        Of the noise on a bin of Y, and of that on U which is not real excitation.
+    variance_rest : same shape
+        Of what remains on bins between harmonics.
+    covariance_yu : (batch, 1) complex or None
+        None where no point shows any.
+    through_input : (batch, K_o) complex or None
+        What the disturbances seen on U explain of Y between harmonics; None where nothing.
+    mean_variances : (batch, 2) float
+    kind : (batch,) str
+        flat, sloped or per line.
+    """
+
+    variance_y: FloatArray
+    variance_u: FloatArray
+    variance_rest: FloatArray
+    covariance_yu: ComplexArray | None
+    through_input: ComplexArray | None
+    mean_variances: FloatArray
+    kind: npt.NDArray[np.str_]
+
+    @staticmethod
+    def on(pieces: IntArray, variance: FloatArray) -> FloatArray:
+        """(batch, 1) or (batch, K) variance of bins from that of their pieces."""
+        return variance if variance.shape[1] == 1 else np.ascontiguousarray(variance[:, pieces])
+
+
+def noise_between_harmonics(
+    error: ComplexArray, u: ComplexArray, g: ComplexArray, bands: NoiseBands, terms: int
+) -> JointNoise:
+    """Variances of both channels, and what they have in common.
+
+    Parameters
+    ----------
+    error, u : (batch, K_o) complex
+        Y without its transient, and U, between harmonics of the excitation.
+    g : (batch, K_o) complex
+        Response there, from a first fit.
+    bands : NoiseBands
+    terms : int
+        Real coefficients that the transient has taken from `error`.
+
+    Notes
+    -----
+    Noise of the two voltmeters is independent. Where U and Y are correlated beyond chance the
+    disturbance either went through the system (noise of the generator: then it is a known input, no
+    measurement noise) or into both channels alike; taken is what explains more of Y.
+    """
+    size = error.shape[1]
+    dof = max(size - terms / 2, 1.0)
+    through = covariance = None
+    power_u = _mean_power(u)
+    cross = np.mean(error * u.conj(), axis=-1, keepdims=True)  # (batch, 1)
+    tiny = np.finfo(float).tiny
+    squared = np.abs(cross) ** 2 / np.maximum(_mean_power(error) * power_u, tiny)
+    # a squared correlation of n complex samples exceeds x by chance with (1 - x)^(n - 1)
+    correlated = squared > 1 - FALSE_ALARM ** (1 / max(size - 1, 1))
+    by_g = g * u
+    explained_g = _mean_power(error) - _mean_power(error - by_g)
+    generator = correlated & (explained_g > 0)
+    common = correlated & ~generator
+    if common.any():
+        gain = cross / np.maximum(power_u, tiny)
+        alike = _mean_power(error) - _mean_power(error - gain * u)
+        generator &= explained_g >= 0.9 * alike
+        common = correlated & ~generator
+        covariance = np.where(common, cross, 0.0)
+        through = np.where(common, gain * u, 0.0)
+    if generator.any():
+        through = np.where(generator, by_g, 0.0 if through is None else through)
+    rest = error if through is None else error - through
+    total_power, kind_y = _pieces(error, bands, size / dof)
+    rest_power, kind_rest = (
+        (total_power, kind_y) if through is None else _pieces(rest, bands, size / dof)
+    )
+    input_power, kind_u = _pieces(u, bands, 1.0)
+    kind = np.maximum(kind_rest, np.where(generator[:, 0], 0, kind_u))
+    measured = np.where(generator, rest_power, np.where(common, total_power, rest_power))
+    variance_u = np.where(generator, 0.0, input_power)
+    return JointNoise(
+        np.where(measured > tiny, measured, 1.0),  # no noise at all: any weights do
+        variance_u,
+        np.where(rest_power > tiny, rest_power, 1.0),
+        covariance,
+        through,
+        np.concatenate([_mean_power(rest) * (size / dof), variance_u.mean(-1, keepdims=True)], -1),
+        np.array(KINDS)[kind],
+    )
+
+
+def _pieces(values: ComplexArray, bands: NoiseBands, factor: float) -> tuple[FloatArray, IntArray]:
+    """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
+
+    Flat unless a test says otherwise.
+    """
+    mean = _mean_power(values) * factor
+    if bands.starts.size < 4:
+        return mean, np.zeros(values.shape[0], np.int64)
+    power = values.real**2 + values.imag**2
+    sample = np.add.reduceat(power, bands.starts, axis=-1) / bands.counts
+    model = model_variance(sample * factor, BINS_PER_BAND)
+    if not model.kind.any():
+        return mean, model.kind
+    return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
+
+
+def _mean_power(values: ComplexArray) -> FloatArray:
+    """(batch, 1)."""
+    parts = np.ascontiguousarray(values).view(float)
+    return np.einsum("bk,bk->b", parts, parts)[:, None] / values.shape[-1]

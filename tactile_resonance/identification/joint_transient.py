@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numerator of the transient in the DFT of a whole record."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.basis import PolynomialBasis
+from tactile_resonance.identification.structure import ModelStructure
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+
+def default_transient_terms(structure: ModelStructure) -> int:
+    """Length of the transient's numerator that suits a structure.
+
+    A transient of the model's own poles alone has `order` terms; every residual term beyond the
+    constant stands for modes outside the band, whose transients are as smooth as their responses.
+    """
+    return structure.order + max(0, min(structure.numerator_order - structure.order, 4))
+
+
+def transient_basis(
+    frequency_hz: FloatArray,
+    terms: int,
+    sample_rate_hz: float,
+    band_hz: tuple[float, float],
+    structure: ModelStructure,
+) -> ComplexArray:
+    """(K, terms) basis of the transient's numerator.
+
+    Samples of ``exp(p t)`` have the spectrum ``T / (1 - exp((p - s) T))``, aliases of ``1 / (s -
+    p)`` included: for n poles a polynomial of order n - 1 in 1/z over ``A(z)``, and ``A(s) / A(z)``
+    hardly depends on the poles. It is taken at +-j times the band's centre.
+    """
+    interval_s = 1 / sample_rate_hz
+    s = 2j * np.pi * frequency_hz
+    basis = PolynomialBasis.on_lines(np.exp(-s * interval_s), terms - 1).values
+    if structure.domain == "z":
+        return basis * np.exp(s * interval_s * structure.order)[:, None]
+    centre = 2j * np.pi * np.mean(band_hz)
+    factor = np.ones(s.shape, complex)
+    for pole in (centre, -centre):
+        step = (s - pole) * interval_s
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = -step / np.expm1(-step)
+        factor *= np.where(np.abs(step) < 1e-12, 1.0, ratio)
+    return basis * factor[:, None]
