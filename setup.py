@@ -38,6 +38,8 @@ setup(
     data_files=shared("config"),
     python_requires=">=3.10,<3.14",
     install_requires=["numpy>=1.24,<3", "scipy>=1.10,<2", "matplotlib>=3.6,<4", "PyYAML>=6,<7", "tqdm>=4.60,<5"],
+    # what drives hardware is installed by those who have it
+    extras_require={"nidaqmx": ["nidaqmx>=1.0,<2"]},
     entry_points={
         "console_scripts": [
             f"{NAME} = {NAME}.cli:main",
