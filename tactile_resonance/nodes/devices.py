@@ -16,6 +16,7 @@ from tactile_resonance.drivers.nidaq_config import read_nidaq_config
 from tactile_resonance.drivers.replay import ReplayDevice
 from tactile_resonance.nodes.bench_device import BenchDevice
 from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.recording.store import RecordStore
 
 PARAMETERS = (
     Parameter(
@@ -44,7 +45,8 @@ PARAMETERS = (
         "record_folder",
         "",
         "Folder that receives every excitation and record before it is published; empty: "
-        "tactile_resonance/records/DATE-TIME in $ROS_HOME (~/.ros where that is not set), UTC.",
+        "tactile_resonance/records/DATE-TIME in $ROS_HOME (~/.ros where that is not set), UTC; for "
+        "a replay, which is on disk already, none.",
         read_only=True,
     ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
@@ -76,22 +78,31 @@ def make_device(node: Node) -> AcquisitionDevice:
     raise ValueError(f"device: {device!r}, accepted are bench, replay, nidaqmx")
 
 
-def make_record_folder(parameter: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """The folder that a node's records go to, made where it is the default.
+def open_store(
+    folder: str, device: str, environment: Mapping[str, str] = os.environ
+) -> RecordStore | None:
+    """The store of a node's records.
 
     Parameters
     ----------
-    parameter : str
-        ``record_folder``; empty for the default, a folder that no other node uses.
+    folder, device : str
+        The parameters ``record_folder`` and ``device``.
     environment : mapping
+
+    Returns
+    -------
+    RecordStore or None
+        In a folder that no other node uses where none is named; None for a replay that names none.
 
     Raises
     ------
     OSError
-        If it cannot be made.
+        If the folder cannot be made.
     """
-    if parameter:
-        return Path(parameter).expanduser().absolute()
+    if folder:
+        return RecordStore(Path(folder).expanduser().absolute())
+    if device == "replay":
+        return None
     home = environment.get("ROS_HOME")
     parent = (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "records"
     parent.mkdir(parents=True, exist_ok=True)
@@ -99,10 +110,10 @@ def make_record_folder(parameter: str, environment: Mapping[str, str] = os.envir
     number = 1
     while True:
         # several nodes may start in the same second
-        folder = parent / (stamp if number == 1 else f"{stamp}-{number}")
+        path = parent / (stamp if number == 1 else f"{stamp}-{number}")
         try:
-            folder.mkdir()
+            path.mkdir()
         except FileExistsError:
             number += 1
         else:
-            return folder
+            return RecordStore(path)

@@ -59,6 +59,7 @@ class ExcitationNode(Node):
         self._records = self.create_publisher(msg.Record, "record", RESULTS)
         self._device = devices.make_device(self)
         self._store: RecordStore | None = None
+        self._has_store = False
         self._pose = PoseStamped()
         self._force_n = float("nan")
         self._busy = threading.Lock()
@@ -129,7 +130,8 @@ class ExcitationNode(Node):
             info = self._device.configure(excitations[0].sample_rate_hz)
             excitation_design.check_output(excitations, info)
             store = self._open_store()
-            store.begin(excitations)
+            if store is not None:
+                store.begin(excitations)
         except (ValueError, OSError, DeviceError) as error:
             self._busy.release()
             result.outcome = Measure.Result.REFUSED
@@ -167,12 +169,13 @@ class ExcitationNode(Node):
             for excitation in planned
         ]
 
-    def _open_store(self) -> RecordStore:
+    def _open_store(self) -> RecordStore | None:
         """The store of this run; its folder is made when the first measurement needs it."""
-        if self._store is None:
-            (folder,) = values(self, "record_folder")
-            self._store = RecordStore(devices.make_record_folder(folder))
-            self.get_logger().info(f"records go to {self._store.folder}")
+        if not self._has_store:
+            self._store = devices.open_store(*values(self, "record_folder", "device"))
+            self._has_store = True
+            where = self._store.folder if self._store else "no file: the replay is on disk already"
+            self.get_logger().info(f"records go to {where}")
         return self._store
 
     def _new_id(self) -> int:
@@ -185,12 +188,13 @@ class ExcitationNode(Node):
         goal: ServerGoalHandle,
         excitation: Excitation,
         info: DeviceInfo,
-        store: RecordStore,
+        store: RecordStore | None,
         result: Measure.Result,
         planned: int,
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
-        store.add_excitation(excitation)
+        if store is not None:
+            store.add_excitation(excitation)
         self._excitations.publish(excitation_to_message(excitation, time.time_ns(), self._frame_id))
         try:
             self._device.arm(excitation)
@@ -198,7 +202,8 @@ class ExcitationNode(Node):
             for _ in range(excitation.periods):
                 block = self._device.read_block(timeout_s)
                 record = self._record(block, excitation, info)
-                store.add_record(record)
+                if store is not None:
+                    store.add_record(record)
                 self._records.publish(record_to_message(record))
                 result.blocks += 1
                 goal.publish_feedback(
