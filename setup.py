@@ -48,6 +48,8 @@ setup(
         "PyYAML>=6,<7",
         "tqdm>=4.60,<5",
     ],
+    # what drives hardware is installed by those who have it
+    extras_require={"nidaqmx": ["nidaqmx>=1.0,<2"]},
     entry_points={
         "console_scripts": [
             f"{NAME} = {NAME}.cli:main",

@@ -65,14 +65,17 @@ def run(options: argparse.Namespace) -> int:
         f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}"
     )
     start = time.monotonic()
-    bench = {
-        "scene": str(scene_path),
-        "speed": 1.0 if options.real_time else 0.0,
-        "seed": options.seed,
+    parameters = {
+        "excitation_node": {"record_folder": (output / "records").resolve()},
+        "fake_hardware_node": {
+            "scene": str(scene_path),
+            "speed": 1.0 if options.real_time else 0.0,
+            "seed": options.seed,
+        },
     }
     with NodeProcesses(output / "log") as nodes:
         for node in NODES:
-            nodes.start(node, bench if node == "fake_hardware_node" else None)
+            nodes.start(node, parameters.get(node))
         try:
             points = _measure(nodes, places, options)
         except RuntimeError as error:

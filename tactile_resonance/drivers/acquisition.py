@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -33,6 +34,8 @@ class DeviceInfo:
         Of the sensor channel behind the actuator channel; NaN where unknown.
     anti_alias_filter : str
         For people; empty where unknown.
+    frame_id : str
+        Sensor tip frame, where a replay knows it; empty: that of whoever owns the device.
     """
 
     name: str
@@ -43,6 +46,7 @@ class DeviceInfo:
     latency_s: float = float("nan")
     channel_delay_s: float = float("nan")
     anti_alias_filter: str = ""
+    frame_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class Block:
         First sample (UNIX time) [ns].
     actuator, sensor : Channel
     contact : Contact or None
-        Where a replay knows it; None where the block was taken just now.
+        That of a recording; None where the block was taken just now.
     """
 
     index: int
@@ -70,9 +74,19 @@ class Block:
 class AcquisitionDevice(Protocol):
     """One output and two inputs on one clock.
 
-    Calls come in the order configure, then for each excitation arm, play, read_block (once a period), and
-    stop at any time. All raise `DeviceError`.
+    Calls come in the order plan, configure, then for each excitation arm, play, read_block (once a
+    period) and stop, for every measurement anew; stop may come at any time, and close, from any
+    thread, is the last. All raise `DeviceError`.
     """
+
+    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
+        """What the device will really play when asked for this measurement.
+
+        Most return what was asked. A replay returns what was recorded; it takes the next
+        measurement, or the one named by a measurement id other than 0. Ids that are 0 in the answer
+        are for the caller to give.
+        """
+        ...
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Set the sample clock; say what the device is."""
@@ -92,4 +106,8 @@ class AcquisitionDevice(Protocol):
 
     def stop(self) -> None:
         """Output to zero, inputs off; harmless when nothing plays."""
+        ...
+
+    def close(self) -> None:
+        """Stop and let the hardware go; whatever is called afterwards plays nothing."""
         ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections.abc import Sequence
 
 from rclpy.client import Client
 from rclpy.node import Node
@@ -34,6 +35,10 @@ class BenchDevice:
         self._armed: Excitation | None = None
         self._next_index = 0
         node.create_subscription(msg.Record, "bench/block", self._blocks.put, RESULTS)
+
+    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
+        """The bench plays what is asked."""
+        return list(excitations)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Wait for the bench."""
@@ -90,6 +95,9 @@ class BenchDevice:
         self._armed = None
         if self._stop_client.service_is_ready():
             self._call(self._stop_client, Trigger.Request())
+
+    def close(self) -> None:
+        """Nothing: services need an executor that spins, and a simulation may play to its end."""
 
     def _call(self, client: Client, request: object):
         """Call a service from a worker thread while the executor's thread spins."""

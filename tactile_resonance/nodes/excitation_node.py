@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionServer, CancelResponse
@@ -14,9 +15,9 @@ from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
-from tactile_resonance.multisine import Excitation, Grid, design_multisine
-from tactile_resonance.nodes.bench_device import BenchDevice
+from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.nodes import devices, excitation_design
 from tactile_resonance.nodes.conversions import (
     contact_from_message,
     excitation_to_message,
@@ -25,43 +26,11 @@ from tactile_resonance.nodes.conversions import (
 from tactile_resonance.nodes.parameters import Parameter, declare, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM, run_node
 from tactile_resonance.record import Contact, Origin, Record
-
-GRIDS = {
-    Measure.Goal.GRID_FULL: Grid.FULL,
-    Measure.Goal.GRID_ODD: Grid.ODD,
-    Measure.Goal.GRID_ODD_RANDOM: Grid.ODD_RANDOM,
-}
+from tactile_resonance.recording.store import RecordStore
 
 PARAMETERS = (
-    Parameter("sample_rate_hz", 50e3, "Sample rate of both channels [Hz].", 1.0, 1e7),
-    Parameter("samples_per_period", 20000, "Samples of one period.", 4, 10**8),
-    Parameter("f_min_hz", 10.0, "Lowest excited line [Hz].", 1e-3, 1e7),
-    Parameter("f_max_hz", 10e3, "Highest excited line [Hz].", 1e-3, 1e7),
-    Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
-    Parameter(
-        "max_level_v",
-        4.0,
-        "The sensor's limit: a level above is refused [V rms].",
-        1e-6,
-        1e3,
-        read_only=True,
-    ),
-    Parameter(
-        "grid",
-        "full",
-        "Which harmonics are excited.",
-        choices=tuple(grid.value for grid in GRIDS.values()),
-    ),
-    Parameter("periods", 8, "Periods of each realisation.", 1, 10**6),
-    Parameter("realisations", 1, "Realisations of the phases in each measurement.", 1, 10**6),
-    Parameter(
-        "seed",
-        1,
-        "Seed of the phases of the first measurement; each further one takes the next.",
-        1,
-        2**62,
-    ),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
+    *excitation_design.PARAMETERS,
+    *devices.PARAMETERS,
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
 
@@ -77,8 +46,9 @@ class Cancelled(Exception):
 class ExcitationNode(Node):
     """Action `measure`; publishes `excitation` (latched) and `record`.
 
-    Records carry the tip pose and the force heard last on `tcp_pose` and `wrench`. The device is read in a
-    thread of its own, so that its blocking calls never hold up the executor.
+    Every record is on disk before it is published. Records carry the tip pose and the force heard
+    last on `tcp_pose` and `wrench`, where the device is no replay. The device is read in a thread
+    of its own, so that its blocking calls never hold up the executor.
     """
 
     def __init__(self) -> None:
@@ -87,7 +57,9 @@ class ExcitationNode(Node):
         (self._frame_id,) = values(self, "frame_id")
         self._excitations = self.create_publisher(msg.Excitation, "excitation", EXCITATIONS)
         self._records = self.create_publisher(msg.Record, "record", RESULTS)
-        self._device: AcquisitionDevice = BenchDevice(self, self._frame_id)
+        self._device = devices.make_device(self)
+        self._store: RecordStore | None = None
+        self._has_store = False
         self._pose = PoseStamped()
         self._force_n = float("nan")
         self._busy = threading.Lock()
@@ -103,6 +75,11 @@ class ExcitationNode(Node):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT_S,
         )
+
+    def destroy_node(self) -> None:
+        """Silence the output first."""
+        self._device.close()
+        super().destroy_node()
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._pose = message
@@ -148,103 +125,89 @@ class ExcitationNode(Node):
             result.message = "a measurement is running, cancel it or wait for its result"
             return result
         try:
-            excitations = self._design(goal.request)
+            excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
             info = self._device.configure(excitations[0].sample_rate_hz)
-            self._check_output(excitations, info)
-        except (ValueError, DeviceError) as error:
+            excitation_design.check_output(excitations, info)
+            store = self._open_store()
+            if store is not None:
+                store.begin(excitations)
+        except (ValueError, OSError, DeviceError) as error:
             self._busy.release()
             result.outcome = Measure.Result.REFUSED
-            result.message = str(error)
-            self.get_logger().error(f"refused: {error}")
+            result.message = _reason(error)
+            self.get_logger().error(f"refused: {result.message}")
             return result
+        planned = sum(excitation.periods for excitation in excitations)
         try:
             for excitation in excitations:
-                self._play(goal, excitation, info, result)
+                self._play(goal, excitation, info, store, result, planned)
             result.outcome = Measure.Result.DONE
         except Cancelled:
             result.outcome = Measure.Result.CANCELLED
             result.message = f"cancelled after {result.blocks} blocks"
-        except DeviceError as error:
+        except (OSError, DeviceError) as error:
             result.outcome = Measure.Result.FAILED
-            result.message = str(error)
-            self.get_logger().error(f"failed: {error}")
+            result.message = _reason(error)
+            self.get_logger().error(f"failed: {result.message}")
         finally:
             self._busy.release()
         return result
 
-    def _design(self, goal: Measure.Goal) -> list[Excitation]:
-        """All realisations of a goal; zero in the goal means the node's parameter."""
-        rate, samples, low, high, level, max_level, grid, periods, realisations, seed = values(
-            self,
-            *("sample_rate_hz", "samples_per_period", "f_min_hz", "f_max_hz", "level_v"),
-            *("max_level_v", "grid", "periods", "realisations", "seed"),
-        )
-        level = goal.level_v or level
-        if not level <= max_level:
-            raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
-        if goal.grid and goal.grid not in GRIDS:
-            raise ValueError(
-                f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter"
-            )
-        seed = goal.seed or seed + self._measurements
-        measurement_id = goal.measurement_id or self._new_id()
+    def _plan(self, goal: Measure.Goal) -> list[Excitation]:
+        """What the device will play, with ids where neither goal nor device gives any."""
+        asked = excitation_design.design(self, goal, self._measurements)
         self._measurements += 1
-        realisations = goal.realisations or realisations
+        planned = self._device.plan(asked)
+        measurement_id = planned[0].measurement_id or self._new_id()
         return [
-            design_multisine(
-                sample_rate_hz=rate,
-                samples_per_period=samples,
-                band_hz=(goal.f_min_hz or low, goal.f_max_hz or high),
-                level_v=level,
-                grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
-                seed=seed,
-                realisation=realisation,
-                realisations=realisations,
-                periods=goal.periods or periods,
+            replace(
+                excitation,
                 measurement_id=measurement_id,
-                excitation_id=self._new_id(),
-                label=goal.label,
+                excitation_id=excitation.excitation_id or self._new_id(),
             )
-            for realisation in range(realisations)
+            for excitation in planned
         ]
+
+    def _open_store(self) -> RecordStore | None:
+        """The store of this run; its folder is made when the first measurement needs it."""
+        if not self._has_store:
+            self._store = devices.open_store(*values(self, "record_folder", "device"))
+            self._has_store = True
+            where = self._store.folder if self._store else "no file: the replay is on disk already"
+            self.get_logger().info(f"records go to {where}")
+        return self._store
 
     def _new_id(self) -> int:
         """Microseconds of the clock, so that ids of a restarted node do not repeat."""
         self._last_id = max(self._last_id + 1, time.time_ns() // 1000)
         return self._last_id
 
-    @staticmethod
-    def _check_output(excitations: list[Excitation], info: DeviceInfo) -> None:
-        for excitation in excitations:
-            peak_v = excitation.level_v * excitation.crest_factor()
-            if peak_v > info.output_peak_v:
-                raise ValueError(
-                    f"level_v: peak {peak_v:.3g} V, {info.name} puts out at most "
-                    f"{info.output_peak_v:.3g} V"
-                )
-
     def _play(
         self,
         goal: ServerGoalHandle,
         excitation: Excitation,
         info: DeviceInfo,
+        store: RecordStore | None,
         result: Measure.Result,
+        planned: int,
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
+        if store is not None:
+            store.add_excitation(excitation)
         self._excitations.publish(excitation_to_message(excitation, time.time_ns(), self._frame_id))
-        self._device.arm(excitation)
         try:
+            self._device.arm(excitation)
             self._device.play()
             for _ in range(excitation.periods):
                 block = self._device.read_block(timeout_s)
-                self._records.publish(record_to_message(self._record(block, excitation, info)))
+                record = self._record(block, excitation, info)
+                if store is not None:
+                    store.add_record(record)
+                self._records.publish(record_to_message(record))
                 result.blocks += 1
                 goal.publish_feedback(
-                    Measure.Feedback(
-                        blocks=result.blocks,
-                        blocks_planned=excitation.periods * excitation.realisations,
-                    )
+                    Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
                 )
                 if goal.is_cancel_requested:
                     raise Cancelled
@@ -270,7 +233,7 @@ class ExcitationNode(Node):
                 excitation_id=excitation.excitation_id,
                 time_ns=block.time_ns,
                 final=last_period and last_realisation,
-                frame_id=self._frame_id,
+                frame_id=info.frame_id or self._frame_id,
                 label=excitation.label,
                 simulated=info.simulated,
                 contact=block.contact or self._contact(),
@@ -279,6 +242,11 @@ class ExcitationNode(Node):
 
     def _contact(self) -> Contact:
         return contact_from_message(self._pose, self._force_n, float("nan"))
+
+
+def _reason(error: Exception) -> str:
+    # devices raise DeviceError: what the operating system refused has to do with the records
+    return f"record_folder: {error}" if isinstance(error, OSError) else str(error)
 
 
 def main() -> None:

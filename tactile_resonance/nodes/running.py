@@ -11,6 +11,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from tactile_resonance.drivers.acquisition import DeviceError
+
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
 RESULTS = QoSProfile(
     depth=256, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
@@ -46,6 +48,6 @@ def run_node(make: Callable[[], Node]) -> None:
                 node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, DeviceError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -21,12 +21,15 @@ class Recording:
     sample_rate_hz : float
     excited_harmonics : (F,) int or None
         Multiples of ``sample_rate_hz / N``; None where the record does not say.
+    notes : tuple of str
+        What a reader should know: what was left out of the record, and why.
     """
 
     u: npt.NDArray[np.floating]
     y: npt.NDArray[np.floating]
     sample_rate_hz: float
     excited_harmonics: npt.NDArray[np.int64] | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def resolution_hz(self) -> float:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance.recording.store import read_store
+
 COMMAND = [sys.executable, "-m", "tactile_resonance.cli", "demo"]
 
 
@@ -52,6 +54,11 @@ def test_four_concentrations_are_told_apart(domain, tmp_path):
         # each concentration above the one before by far more than the uncertainty
         means = values.reshape(4, 2).mean(axis=1)
         assert np.all(np.diff(means) > 20 * stds.max())
+    content = read_store(tmp_path / "run" / "records")
+    assert content.problems == ()
+    points = content.measurements[-8:]  # after those that warmed up
+    assert [len(point.records) for point in points] == [8] * 8
+    assert all(point.gaps == () and point.records[-1].origin.final for point in points)
     assert (tmp_path / "run" / "phantoms.png").stat().st_size > 50_000
     for percent in (10, 12, 14, 16):
         assert f"gelatine {percent} %" in answer.stdout

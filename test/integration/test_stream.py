@@ -77,8 +77,12 @@ def session(tmp_path_factory):
     ):
         patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        parameters = {
+            "fake_hardware_node": {"speed": 0.0},
+            "excitation_node": {"record_folder": tmp_path_factory.mktemp("records")},
+        }
         for node in NODES:
-            nodes.start(node, {"speed": 0.0} if node == "fake_hardware_node" else None)
+            nodes.start(node, parameters.get(node))
         with ScanSession(nodes.check) as session:
             session.wait_for_nodes(30.0)
             session.warm_up(GEL_10)

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""NI hardware through nidaqmx: one output and two inputs on one sample clock.
+
+Written after the interface of nidaqmx-python 1.x and tested against a stand-in of it. It has not
+been run on hardware: go through docs/first_connection.md before a sensor is connected.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.nidaq_calls import attempt, load, translated
+from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
+from tactile_resonance.drivers.nidaq_scale import CountScale
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Channel
+
+_RATE_TOLERANCE = 1e-9
+
+
+class NiDaqDevice:
+    """Keeps `AcquisitionDevice`.
+
+    The inputs make the sample clock; the output runs on it and starts with the inputs' start
+    trigger, one period repeated from the buffer. Every period is read whole and in order: a reader
+    that is late by more than the buffer, or an output that ran dry, ends in `DeviceError`. Whatever
+    ends a measurement, the output is then set to 0 V.
+
+    Parameters
+    ----------
+    config : NiDaqConfig
+
+    Raises
+    ------
+    DeviceError
+        If the package nidaqmx is not installed.
+
+    References
+    ----------
+    nidaqmx-python 1.x, https://nidaqmx-python.readthedocs.io: ``Timing.cfg_samp_clk_timing``,
+    ``StartTrigger.cfg_dig_edge_start_trig``, ``AnalogUnscaledReader``,
+    ``AIChannel.ai_dev_scaling_coeff``.
+    """
+
+    def __init__(self, config: NiDaqConfig) -> None:
+        self._config = config
+        self._daq = load("nidaqmx")
+        self._constants = load("nidaqmx.constants")
+        self._readers = load("nidaqmx.stream_readers")
+        self._system = load("nidaqmx.system")
+        self._lock = threading.RLock()  # play and stop come from different threads when a node ends
+        self._rate_hz = 0.0
+        self._armed: Excitation | None = None
+        self._output: Any = None
+        self._input: Any = None
+        self._scales: list[CountScale] = []
+        self._raw_dtype: type[np.signedinteger] = np.int16
+        self._drive = np.empty(0)
+        self._maybe_on = False  # until 0 V has been written
+        self._index = 0
+        self._start_ns = 0
+        self._closed = False
+
+    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
+        """What was asked."""
+        return list(excitations)
+
+    def configure(self, sample_rate_hz: float) -> DeviceInfo:
+        """Check devices, ranges and rate by setting up the inputs once; nothing moves."""
+        config = self._config
+        names = []
+        with translated("configure"):
+            for name in sorted({channel.channel.split("/")[0] for channel in config.inputs}):
+                device = self._system.Device(name)
+                names.append(f"{device.product_type} ({name})")
+                simultaneous = bool(device.ai_simultaneous_sampling_supported)
+                if config.actuator and not simultaneous and np.isnan(config.channel_delay_s):
+                    raise DeviceError(
+                        f"nidaqmx: {name} samples one channel after the other: measure the delay "
+                        "by a loop-back and give it as channel_delay_s"
+                    )
+            output = self._system.Device(config.output_channel.split("/")[0])
+            reach_v = max(output.ao_voltage_rngs, default=0.0)
+        if config.max_voltage_v > reach_v:
+            raise DeviceError(
+                f"nidaqmx: output.max_voltage_v: {config.max_voltage_v:g}, the device reaches "
+                f"{reach_v:g} V"
+            )
+        self._rate_hz = sample_rate_hz
+        with translated("configure"):
+            task = self._make_input(samples=2)
+            try:
+                task.control(self._constants.TaskMode.TASK_VERIFY)
+                real_hz = float(task.timing.samp_clk_rate)
+            finally:
+                task.close()
+        if abs(real_hz - sample_rate_hz) > _RATE_TOLERANCE * sample_rate_hz:
+            raise DeviceError(
+                f"nidaqmx: sample_rate_hz: {sample_rate_hz:.9g}, the device would sample at "
+                f"{real_hz:.9g}: expected a rate that it makes exactly"
+            )
+        return DeviceInfo(
+            name=", ".join(names),
+            simulated=False,
+            input_kind=config.input_kind,
+            between_samples=config.between_samples,
+            output_peak_v=config.max_voltage_v,
+            channel_delay_s=config.channel_delay_s,
+            anti_alias_filter=config.anti_alias_filter,
+        )
+
+    def arm(self, excitation: Excitation) -> None:
+        """Load one period into the output and commit both tasks; nothing moves."""
+        period = excitation.period()
+        peak_v = float(np.max(np.abs(period)))
+        if not peak_v <= self._config.max_voltage_v:
+            raise DeviceError(
+                f"nidaqmx: peak {peak_v:.3g} V, output.max_voltage_v is "
+                f"{self._config.max_voltage_v:.3g} V"
+            )
+        if excitation.sample_rate_hz != self._rate_hz:
+            raise DeviceError(
+                f"nidaqmx: sample_rate_hz: {excitation.sample_rate_hz:g}, configured was "
+                f"{self._rate_hz:g}"
+            )
+        with self._lock:
+            if self._closed:
+                raise DeviceError("nidaqmx: closed")
+            self._close_tasks()
+            try:
+                with translated("arm"):
+                    # a reader may be late by the buffer, and two periods always fit
+                    late = round(self._config.buffer_s * self._rate_hz)
+                    self._input = self._make_input(max(late, 2 * period.size))
+                    self._output = self._make_output(period)
+                    commit = self._constants.TaskMode.TASK_COMMIT
+                    self._input.control(commit)
+                    self._output.control(commit)
+            except DeviceError as error:
+                raise self._stopped_after(error) from error
+            self._armed = excitation
+            self._drive = period
+            self._index = 0
+
+    def play(self) -> None:
+        """Start the output, which waits for the trigger, then the inputs, which give it."""
+        with self._lock:
+            if self._armed is None or self._closed:
+                raise DeviceError("nidaqmx: nothing armed to play")
+            try:
+                with translated("play"):
+                    self._maybe_on = True
+                    self._output.start()
+                    self._input.start()
+                    self._start_ns = time.time_ns()
+            except DeviceError as error:
+                raise self._stopped_after(error) from error
+
+    def read_block(self, timeout_s: float) -> Block:
+        """The next period, whole; on any error the output is set to 0 V first."""
+        task, output, excitation = self._input, self._output, self._armed
+        if excitation is None or task is None or output is None:
+            raise DeviceError("nidaqmx: nothing plays")
+        n = excitation.samples_per_period
+        raw = np.zeros((len(self._scales), n), self._raw_dtype)  # (channels, N)
+        try:
+            with translated(f"block {self._index}"):
+                reader = self._readers.AnalogUnscaledReader(task.in_stream)
+                read = reader.read_int16 if self._raw_dtype is np.int16 else reader.read_int32
+                count = read(raw, number_of_samples_per_channel=n, timeout=timeout_s)
+                # an output that ran dry is silent on the input's side: this call raises its error
+                ended = output.is_task_done()
+            if count != n:
+                raise DeviceError(f"nidaqmx: block {self._index}: {count} of {n} samples")
+            if ended:
+                raise DeviceError(f"nidaqmx: block {self._index}: the output has stopped")
+        except DeviceError as error:
+            raise self._stopped_after(error) from error
+        channels = [scale.channel(row) for scale, row in zip(self._scales, raw, strict=True)]
+        if not self._config.actuator:
+            channels.insert(0, Channel(self._drive))
+        block = Block(
+            self._index,
+            self._start_ns + round(self._index * excitation.period_s * 1e9),
+            channels[0],
+            channels[1],
+        )
+        self._index += 1
+        return block
+
+    def stop(self) -> None:
+        """End both tasks and set the output to 0 V."""
+        with self._lock:
+            self._armed = None
+            errors = self._close_tasks()
+            if self._maybe_on:
+                failed = self._zero()
+                self._maybe_on = bool(failed)
+                errors += failed
+            if errors:
+                raise DeviceError("; ".join(errors))
+
+    def close(self) -> None:
+        """Stop for good."""
+        with self._lock:
+            self._closed = True
+            self.stop()
+
+    def _stopped_after(self, error: DeviceError) -> DeviceError:
+        """Stop, and say what went wrong, with what went wrong in stopping."""
+        try:
+            self.stop()
+        except DeviceError as further:
+            return DeviceError(f"{error}; {further}")
+        return error
+
+    def _make_input(self, samples: int) -> Any:
+        """Inputs that run until stopped, with a buffer of this many samples per channel."""
+        task = self._daq.Task()
+        try:
+            channels = [self._add_input(task, channel) for channel in self._config.inputs]
+            task.timing.cfg_samp_clk_timing(
+                self._rate_hz,
+                sample_mode=self._constants.AcquisitionType.CONTINUOUS,
+                samps_per_chan=samples,
+            )
+            task.in_stream.input_buf_size = samples
+            task.in_stream.overwrite = self._constants.OverwriteMode.DO_NOT_OVERWRITE_UNREAD_SAMPLES
+            bits = {int(channel.ai_raw_samp_size) for channel in channels}
+            if bits not in ({16}, {32}):
+                raise DeviceError(f"nidaqmx: raw samples of {sorted(bits)} bits, expected 16 or 32")
+            self._raw_dtype = np.int16 if bits == {16} else np.int32
+            self._scales = [CountScale.of(channel, self._raw_dtype) for channel in channels]
+        except Exception:
+            task.close()
+            raise
+        return task
+
+    def _add_input(self, task: Any, channel: InputChannel) -> Any:
+        return task.ai_channels.add_ai_voltage_chan(
+            channel.channel,
+            terminal_config=self._constants.TerminalConfiguration[TERMINALS[channel.terminals]],
+            min_val=-channel.range_v,
+            max_val=channel.range_v,
+        )
+
+    def _make_output(self, period: npt.NDArray[np.float64]) -> Any:
+        """The period, repeated on the inputs' clock from the inputs' start on."""
+        clock = f"/{self._config.clock_device}/ai"
+        task = self._daq.Task()
+        try:
+            self._add_output(task)
+            task.timing.cfg_samp_clk_timing(
+                self._rate_hz,
+                source=f"{clock}/SampleClock",
+                sample_mode=self._constants.AcquisitionType.CONTINUOUS,
+                samps_per_chan=period.size,
+            )
+            task.triggers.start_trigger.cfg_dig_edge_start_trig(f"{clock}/StartTrigger")
+            task.out_stream.regen_mode = self._constants.RegenerationMode.ALLOW_REGENERATION
+            task.out_stream.output_buf_size = period.size
+            written = task.write(period, auto_start=False)
+            if written != period.size:
+                raise DeviceError(f"nidaqmx: {written} of {period.size} samples taken for output")
+        except Exception:
+            task.close()
+            raise
+        return task
+
+    def _add_output(self, task: Any) -> None:
+        limit_v = self._config.max_voltage_v
+        task.ao_channels.add_ao_voltage_chan(
+            self._config.output_channel, min_val=-limit_v, max_val=limit_v
+        )
+
+    def _close_tasks(self) -> list[str]:
+        """Abort and release; what could not be closed."""
+        errors = []
+        for task in (self._output, self._input):
+            if task is not None:
+                errors += attempt("stop", task.close)  # closing aborts
+        self._output = self._input = None
+        return errors
+
+    def _zero(self) -> list[str]:
+        def write_zero() -> None:
+            task = self._daq.Task()
+            try:
+                self._add_output(task)
+                task.write(0.0, auto_start=True)
+            finally:
+                task.close()
+
+        errors = attempt("zero", write_zero)
+        return [f"THE OUTPUT MAY NOT BE AT ZERO: {error}" for error in errors]

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording as an acquisition device."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Channel, Origin, Record
+from tactile_resonance.recording.files import read_recording
+from tactile_resonance.recording.recording import Recording
+from tactile_resonance.recording.store import (
+    StoredMeasurement,
+    list_measurements,
+    read_measurement,
+)
+
+
+class ReplayDevice:
+    """Plays back what was recorded, whatever it is asked for; keeps `AcquisitionDevice`.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of a `RecordStore`: times, contact, counts and everything else come back as recorded.
+        Or a ``.npz``, ``.mat`` or ``.csv`` file for `read_recording`, one measurement: its channels
+        are taken as measured and band-limited and its phases as given, for it does not say; contact
+        and delay stay unknown, and its blocks carry the time of the replay.
+    speed : float
+        Signal time over real time; 0: as fast as possible.
+
+    Raises
+    ------
+    ValueError
+        If the path holds no recording, or `speed` is negative.
+    OSError
+        If it cannot be opened.
+    """
+
+    def __init__(self, path: Path, speed: float = 1.0) -> None:
+        if not speed >= 0:
+            raise ValueError(f"speed: {speed}, expected 0 (as fast as possible) or above")
+        self._path = path
+        self._speed = speed
+        self._next = 0
+        self._next_after = 0
+        self._file: StoredMeasurement | None = None
+        self._measurement: StoredMeasurement | None = None
+        self._blocks: dict[int, Record] = {}
+        self._armed: Excitation | None = None
+        self._start_s = 0.0
+        self._start_ns = 0
+        self._index = 0
+        self._stopped = threading.Event()
+        self._closed = False
+        if path.is_dir():
+            self._entries, problems = list_measurements(path)
+            if not self._entries:
+                raise ValueError(
+                    f"{path}: no measurement in it, expected a folder of records {problems[:3]}"
+                )
+        else:
+            self._file = _measurement_of_file(read_recording(path), path.name)
+
+    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
+        """The realisations recorded, each with as many periods; see `AcquisitionDevice.plan`.
+
+        A measurement that was cut off ends where it was. What was begun without a single record is
+        passed over.
+        """
+        asked = excitations[0]
+        if self._file is not None:
+            if self._next > 0:
+                raise DeviceError(f"replay: the recording is over: {self._path} was played")
+            self._next_after = 1
+            self._measurement = self._file
+            named = {
+                "measurement_id": asked.measurement_id,
+                "label": asked.label or self._path.name,
+            }
+            return [replace(excitation, **named) for excitation in self._file.excitations]
+        self._measurement = self._find(asked.measurement_id)
+        last = self._measurement.records[-1]
+        recorded = {e.realisation: e for e in self._measurement.excitations}
+        planned = []
+        for realisation in range(last.realisation + 1):
+            if realisation not in recorded:
+                raise DeviceError(
+                    f"replay: measurement {self._measurement.measurement_id}: the excitation of "
+                    f"realisation {realisation} is not readable {list(self._measurement.problems)}"
+                )
+            excitation = recorded[realisation]
+            is_last = realisation == last.realisation
+            periods = last.block_index + 1 if is_last else excitation.periods
+            planned.append(replace(excitation, periods=periods, realisations=last.realisation + 1))
+        return planned
+
+    def configure(self, sample_rate_hz: float) -> DeviceInfo:
+        """What the recording says of its device."""
+        if self._measurement is None:
+            raise DeviceError("replay: nothing planned to play")
+        record = self._measurement.records[0]
+        if record.sample_rate_hz != sample_rate_hz:
+            raise DeviceError(
+                f"replay: sample_rate_hz: {sample_rate_hz:g}, recorded was "
+                f"{record.sample_rate_hz:g}"
+            )
+        return DeviceInfo(
+            name=f"replay of {self._path.name}",
+            simulated=record.origin.simulated,
+            input_kind=record.input_kind,
+            between_samples=record.between_samples,
+            output_peak_v=float("inf"),
+            channel_delay_s=record.channel_delay_s,
+            anti_alias_filter=record.anti_alias_filter,
+            frame_id=record.origin.frame_id if self._file is None else "",
+        )
+
+    def arm(self, excitation: Excitation) -> None:
+        """Make the blocks of one realisation ready."""
+        if self._measurement is None:
+            raise DeviceError("replay: nothing planned to play")
+        self._armed = excitation
+        self._blocks = {
+            record.block_index: record
+            for record in self._measurement.records
+            if record.realisation == excitation.realisation
+        }
+
+    def play(self) -> None:
+        """Start the clock. Only now is the measurement used up."""
+        if self._armed is None or self._closed:
+            raise DeviceError("replay: nothing armed to play")
+        self._next = self._next_after
+        self._index = 0
+        self._start_s = time.monotonic()
+        self._start_ns = time.time_ns()
+        self._stopped.clear()
+
+    def read_block(self, timeout_s: float) -> Block:
+        """The next block, when its last sample would have been taken; a gap is an error."""
+        excitation = self._armed
+        if excitation is None:
+            raise DeviceError("replay: nothing plays")
+        index = self._index
+        if self._speed > 0:
+            due_s = self._start_s + (index + 1) * excitation.period_s / self._speed
+            wait_s = due_s - time.monotonic()
+            if self._stopped.wait(max(0.0, min(wait_s, timeout_s))):
+                raise DeviceError("replay: stopped")
+            if wait_s > timeout_s:
+                raise DeviceError(f"replay: no block within {timeout_s:g} s")
+        record = self._blocks.get(index)
+        where = f"block {index} of realisation {excitation.realisation}"
+        if record is None:
+            raise DeviceError(f"replay: {where} is missing in {self._path}")
+        n = excitation.samples_per_period
+        if not record.actuator.samples.size == record.sensor.samples.size == n:
+            raise DeviceError(
+                f"replay: {where} has {record.actuator.samples.size} and "
+                f"{record.sensor.samples.size} samples, expected one period of {n}"
+            )
+        self._index += 1
+        passed_ns = round(index * excitation.period_s * 1e9)
+        return Block(
+            index,
+            record.origin.time_ns or self._start_ns + passed_ns,
+            record.actuator,
+            record.sensor,
+            record.origin.contact,
+        )
+
+    def stop(self) -> None:
+        """End what plays."""
+        self._armed = None
+        self._stopped.set()
+
+    def close(self) -> None:
+        """Stop for good."""
+        self._closed = True
+        self.stop()
+
+    def _find(self, measurement_id: int) -> StoredMeasurement:
+        """The one named, or the next that holds a record."""
+        if measurement_id:
+            for entry in self._entries:
+                if entry.measurement_id == measurement_id:
+                    # out of turn: the turn of the others stays what it is
+                    self._next_after = self._next
+                    measurement = read_measurement(entry)
+                    if measurement.records:
+                        return measurement
+                    raise DeviceError(
+                        f"replay: measurement {measurement_id} holds no readable record "
+                        f"{list(measurement.problems)}"
+                    )
+            raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
+        for position in range(self._next, len(self._entries)):
+            measurement = read_measurement(self._entries[position])
+            if measurement.records:
+                self._next_after = position + 1
+                return measurement
+        raise DeviceError(
+            f"replay: the recording is over: all {len(self._entries)} measurements of {self._path} "
+            "were played"
+        )
+
+
+def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:
+    """The recording of a file as if a device had taken it; ids are 0, times unknown."""
+    harmonics = recording.excited_harmonics
+    if harmonics is None:
+        harmonics = find_excited_harmonics(recording.u)
+    realisations, periods, n = recording.u.shape
+    excitations, records = [], []
+    for realisation in range(realisations):
+        line = np.fft.rfft(recording.u[realisation].mean(axis=0))[harmonics] / n  # (F,)
+        excitations.append(
+            Excitation(
+                harmonics=harmonics,
+                amplitude_v=2 * np.abs(line),
+                phase_rad=np.angle(line),
+                sample_rate_hz=recording.sample_rate_hz,
+                samples_per_period=n,
+                periods=periods,
+                realisation=realisation,
+                realisations=realisations,
+                random_phases=False,
+                label=label,
+            )
+        )
+        records += [
+            Record(
+                actuator=Channel(recording.u[realisation, period]),
+                sensor=Channel(recording.y[realisation, period]),
+                sample_rate_hz=recording.sample_rate_hz,
+                samples_per_period=n,
+                realisation=realisation,
+                block_index=period,
+                origin=Origin(label=label),
+            )
+            for period in range(periods)
+        ]
+    return StoredMeasurement(0, tuple(excitations), tuple(records), (), ())

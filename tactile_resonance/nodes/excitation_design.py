@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the goal of a measurement and the node's parameters to the excitations asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rclpy.node import Node
+
+from tactile_resonance.action import Measure
+from tactile_resonance.drivers.acquisition import DeviceInfo
+from tactile_resonance.multisine import Excitation, Grid, design_multisine
+from tactile_resonance.nodes.parameters import Parameter, values
+
+GRIDS = {
+    Measure.Goal.GRID_FULL: Grid.FULL,
+    Measure.Goal.GRID_ODD: Grid.ODD,
+    Measure.Goal.GRID_ODD_RANDOM: Grid.ODD_RANDOM,
+}
+
+PARAMETERS = (
+    Parameter("sample_rate_hz", 50e3, "Sample rate of both channels [Hz].", 1.0, 1e7),
+    Parameter("samples_per_period", 20000, "Samples of one period.", 4, 10**8),
+    Parameter("f_min_hz", 10.0, "Lowest excited line [Hz].", 1e-3, 1e7),
+    Parameter("f_max_hz", 10e3, "Highest excited line [Hz].", 1e-3, 1e7),
+    Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
+    Parameter(
+        "max_level_v",
+        4.0,
+        "The sensor's limit: a level above is refused [V rms].",
+        1e-6,
+        1e3,
+        read_only=True,
+    ),
+    Parameter(
+        "grid",
+        "full",
+        "Which harmonics are excited.",
+        choices=tuple(grid.value for grid in GRIDS.values()),
+    ),
+    Parameter("periods", 8, "Periods of each realisation.", 1, 10**6),
+    Parameter("realisations", 1, "Realisations of the phases in each measurement.", 1, 10**6),
+    Parameter(
+        "seed",
+        1,
+        "Seed of the phases of the first measurement; each further one takes the next.",
+        1,
+        2**62,
+    ),
+)
+
+
+def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation]:
+    """All realisations of a goal; zero in the goal means the node's parameter.
+
+    The measurement id is the goal's, so 0 where it names none; excitation ids are 0.
+
+    Parameters
+    ----------
+    node : Node
+        Has declared `PARAMETERS`.
+    goal : Measure.Goal
+    measurements : int
+        How many came before: the seed moves on.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+    """
+    rate, samples, low, high, level, max_level, grid, periods, realisations, seed = values(
+        node, *(parameter.name for parameter in PARAMETERS)
+    )
+    level = goal.level_v or level
+    if not level <= max_level:
+        raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
+    if goal.grid and goal.grid not in GRIDS:
+        raise ValueError(f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter")
+    realisations = goal.realisations or realisations
+    return [
+        design_multisine(
+            sample_rate_hz=rate,
+            samples_per_period=samples,
+            band_hz=(goal.f_min_hz or low, goal.f_max_hz or high),
+            level_v=level,
+            grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
+            seed=goal.seed or seed + measurements,
+            realisation=realisation,
+            realisations=realisations,
+            periods=goal.periods or periods,
+            measurement_id=goal.measurement_id,
+            label=goal.label,
+        )
+        for realisation in range(realisations)
+    ]
+
+
+def check_output(excitations: Sequence[Excitation], info: DeviceInfo) -> None:
+    """ValueError if a peak is more than the device can put out."""
+    for excitation in excitations:
+        peak_v = excitation.level_v * excitation.crest_factor()
+        if peak_v > info.output_peak_v:
+            raise ValueError(
+                f"level_v: peak {peak_v:.3g} V, {info.name} puts out at most "
+                f"{info.output_peak_v:.3g} V"
+            )

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder that receives every excitation and record of a device, one file each.
+
+``FOLDER/<number>-<measurement id>/excitation-<realisation>.npz`` and
+``.../record-<realisation>-<block>.npz``; the number counts the measurements of the folder from 1.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Record
+from tactile_resonance.recording.stored_file import read_stored, sync_folder, write_stored
+
+_MEASUREMENT = re.compile(r"(\d+)-(\d+)")
+_EXCITATION = re.compile(r"excitation-(\d+)\.npz")
+_RECORD = re.compile(r"record-(\d+)-(\d+)\.npz")
+_SAMPLE_BYTES = 8  # at most: floating point; counts take less
+_FILE_BYTES = 16384  # fields beside the samples, and what the file system rounds up to
+
+
+class RecordStore:
+    """Writes what a device plays and reads, before anybody else sees it.
+
+    Parameters
+    ----------
+    folder : Path
+        Made at the first measurement where it does not exist; several runs may share it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._measurements: dict[int, Path] = {}
+
+    def begin(self, excitations: Sequence[Excitation]) -> None:
+        """Prepare for a measurement, before anything of it is played.
+
+        Parameters
+        ----------
+        excitations : sequence of Excitation
+            All that will be played, with one measurement id.
+
+        Raises
+        ------
+        ValueError
+            If the folder holds this measurement already, or what is planned does not fit on it.
+        OSError
+            If the folder cannot be made or written.
+        """
+        key = excitations[0].measurement_id
+        existed = self.folder.is_dir()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not existed:
+            sync_folder(self.folder.parent)
+        entries, _ = list_measurements(self.folder)
+        if key in {entry.measurement_id for entry in entries}:
+            raise ValueError(
+                f"measurement_id: {key} is in {self.folder} already, expected a new one"
+            )
+        planned = sum(_planned_bytes(excitation) for excitation in excitations)
+        free = shutil.disk_usage(self.folder).free
+        if planned > free:
+            raise ValueError(
+                f"record_folder: {self.folder} has {free / 1e6:.0f} MB free, the measurement may "
+                f"take {planned / 1e6:.0f} MB"
+            )
+        number = max((entry.number for entry in entries), default=0) + 1
+        path = self.folder / f"{number:06d}-{key}"
+        path.mkdir()
+        sync_folder(self.folder)
+        self._measurements[key] = path
+
+    def add_excitation(self, excitation: Excitation) -> None:
+        """Write one realisation; OSError where that fails."""
+        folder = self._folder_of(excitation.measurement_id)
+        write_stored(folder / f"excitation-{excitation.realisation:05d}.npz", excitation)
+
+    def add_record(self, record: Record) -> None:
+        """Write one block; OSError where that fails."""
+        folder = self._folder_of(record.origin.measurement_id)
+        name = f"record-{record.realisation:05d}-{record.block_index:07d}.npz"
+        write_stored(folder / name, record)
+
+    def _folder_of(self, measurement_id: int) -> Path:
+        if measurement_id not in self._measurements:
+            raise ValueError(f"measurement_id: {measurement_id}, expected one that was begun")
+        return self._measurements[measurement_id]
+
+
+@dataclass(frozen=True)
+class StoredEntry:
+    """Where one measurement is: its number in the store, id and folder."""
+
+    number: int
+    measurement_id: int
+    folder: Path
+
+
+@dataclass(frozen=True)
+class StoredMeasurement:
+    """What is readable of one measurement.
+
+    Attributes
+    ----------
+    measurement_id : int
+    excitations : tuple of Excitation
+        By realisation.
+    records : tuple of Record
+        By realisation and block.
+    gaps : tuple of (realisation, block)
+        Blocks that should lie before a recorded one and do not; an early end is no gap.
+    problems : tuple of str
+        Damaged and foreign files, by name.
+    """
+
+    measurement_id: int
+    excitations: tuple[Excitation, ...]
+    records: tuple[Record, ...]
+    gaps: tuple[tuple[int, int], ...]
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StoreContent:
+    """All measurements of a store, in the order they were begun, and what could not be read."""
+
+    measurements: tuple[StoredMeasurement, ...]
+    problems: tuple[str, ...]
+
+
+def list_measurements(folder: Path) -> tuple[list[StoredEntry], list[str]]:
+    """Measurements of a store in order, and what else lies there; OSError if unreadable."""
+    entries, problems = [], []
+    for path in sorted(folder.iterdir()):
+        match = _MEASUREMENT.fullmatch(path.name)
+        if match and path.is_dir():
+            entries.append(StoredEntry(int(match[1]), int(match[2]), path))
+        else:
+            problems.append(f"{path.name}: not a measurement of a store")
+    return sorted(entries, key=lambda entry: (entry.number, entry.measurement_id)), problems
+
+
+def read_measurement(entry: StoredEntry) -> StoredMeasurement:
+    """Everything readable of one measurement; OSError if its folder cannot be listed."""
+    excitations: list[Excitation] = []
+    records: list[Record] = []
+    problems: list[str] = []
+    for path in sorted(entry.folder.iterdir()):
+        if path.name.endswith(".npz.part"):
+            continue  # being written when its writer was killed; nobody has seen it
+        try:
+            if match := _EXCITATION.fullmatch(path.name):
+                excitation = read_stored(path, Excitation)
+                found: tuple[int, ...] = (excitation.measurement_id, excitation.realisation)
+                _check_name(path, found, (entry.measurement_id, int(match[1])))
+                excitations.append(excitation)
+            elif match := _RECORD.fullmatch(path.name):
+                record = read_stored(path, Record)
+                found = (record.origin.measurement_id, record.realisation, record.block_index)
+                _check_name(path, found, (entry.measurement_id, int(match[1]), int(match[2])))
+                records.append(record)
+            else:
+                raise ValueError(f"{path.name}: neither excitation nor record")
+        except ValueError as error:
+            problems.append(f"{entry.folder.name}/{error}")
+    excitations.sort(key=lambda excitation: excitation.realisation)
+    records.sort(key=lambda record: (record.realisation, record.block_index))
+    return StoredMeasurement(
+        entry.measurement_id,
+        tuple(excitations),
+        tuple(records),
+        tuple(_gaps(excitations, records)),
+        tuple(problems),
+    )
+
+
+def read_store(folder: Path) -> StoreContent:
+    """Everything readable of a store, all in memory; see `read_measurement` for one of many."""
+    entries, problems = list_measurements(folder)
+    measurements = tuple(read_measurement(entry) for entry in entries)
+    named = [problem for measurement in measurements for problem in measurement.problems]
+    return StoreContent(measurements, (*problems, *named))
+
+
+def _planned_bytes(excitation: Excitation) -> int:
+    block = 2 * _SAMPLE_BYTES * excitation.samples_per_period + _FILE_BYTES
+    return excitation.periods * block + 3 * 8 * excitation.harmonics.size + _FILE_BYTES
+
+
+def _check_name(path: Path, found: tuple[int, ...], named: tuple[int, ...]) -> None:
+    if found != named:
+        raise ValueError(f"{path.name}: holds what belongs to {found}, its name says {named}")
+
+
+def _gaps(excitations: list[Excitation], records: list[Record]) -> list[tuple[int, int]]:
+    """(realisation, block) of what is missing before the last record."""
+    if not records:
+        return []
+    planned = {excitation.realisation: excitation for excitation in excitations}
+    seen = {(record.realisation, record.block_index) for record in records}
+    last = records[-1]
+    expected = []
+    for realisation in range(last.realisation + 1):
+        blocks = 1 + max((b for m, b in seen if m == realisation), default=-1)
+        if realisation < last.realisation and realisation in planned:
+            n = planned[realisation].samples_per_period
+            periods = max(1, last.actuator.samples.size // n)  # in each block
+            blocks = max(blocks, -(-planned[realisation].periods // periods))
+        expected += [(realisation, block) for block in range(blocks)]
+    return [place for place in expected if place not in seen]

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One measurement of a store as a `Recording`, ready for analysis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Record
+from tactile_resonance.recording.recording import Recording, make_recording
+from tactile_resonance.recording.store import (
+    StoredEntry,
+    StoredMeasurement,
+    list_measurements,
+    read_measurement,
+)
+
+_MOST_LISTED = 20
+
+
+def read_store_recording(
+    folder: Path, measurement_id: int | None = None, periods: int | None = None
+) -> Recording:
+    """One measurement of a store, ready for analysis.
+
+    Parameters
+    ----------
+    folder : Path
+    measurement_id : int, optional
+        Which one; not needed where there is only one.
+    periods : int, optional
+        Use the first this many of each realisation; all that were planned when absent.
+
+    Returns
+    -------
+    Recording
+        Realisations of which every period is there; its notes tell what was left out.
+
+    Raises
+    ------
+    ValueError
+        If the measurement is not told, not there, or no realisation is complete.
+    OSError
+        If the folder cannot be listed.
+    """
+    measurement = read_measurement(_choose(folder, measurement_id))
+    key = measurement.measurement_id
+    if not measurement.excitations:
+        raise ValueError(f"measurement {key}: holds no readable excitation {measurement.problems}")
+    first = measurement.excitations[0]
+    notes = [*measurement.problems]
+    channels: list[tuple[npt.NDArray, npt.NDArray]] = []
+    for excitation in measurement.excitations:
+        if not _same_lines(excitation, first):
+            raise ValueError(
+                f"measurement {key}: realisation {excitation.realisation} differs from realisation "
+                f"{first.realisation} in sample rate, period or lines, expected the same"
+            )
+        wanted = periods or excitation.periods
+        blocks = _leading_blocks(measurement, excitation.realisation)
+        n = excitation.samples_per_period
+        u, y = (
+            np.concatenate([np.empty(0, np.float32), *(getattr(b, name).volts() for b in blocks)])
+            for name in ("actuator", "sensor")
+        )
+        whole = min(u.size, y.size) // n
+        if whole < wanted:
+            notes.append(
+                f"realisation {excitation.realisation} left out: {whole} of {wanted} consecutive "
+                "periods are there"
+            )
+            continue
+        channels.append((u[: wanted * n].reshape(wanted, n), y[: wanted * n].reshape(wanted, n)))
+    if len(measurement.excitations) < first.realisations:
+        notes.append(
+            f"{len(measurement.excitations)} of {first.realisations} realisations were played"
+        )
+    if not channels:
+        raise ValueError(
+            f"measurement {key}: no complete realisation ({'; '.join(notes)}), expected one, or "
+            "fewer periods asked for"
+        )
+    recording = make_recording(
+        np.stack([u for u, _ in channels]),  # (M, P, N)
+        np.stack([y for _, y in channels]),
+        sample_rate_hz=first.sample_rate_hz,
+        samples_per_period=first.samples_per_period,
+        excited_harmonics=first.harmonics,
+    )
+    return replace(recording, notes=tuple(notes))
+
+
+def _leading_blocks(measurement: StoredMeasurement, realisation: int) -> list[Record]:
+    """Blocks of a realisation up to the first gap."""
+    mine = [record for record in measurement.records if record.realisation == realisation]
+    return [record for index, record in enumerate(mine) if record.block_index == index]
+
+
+def _same_lines(one: Excitation, other: Excitation) -> bool:
+    return (
+        one.sample_rate_hz == other.sample_rate_hz
+        and one.samples_per_period == other.samples_per_period
+        and np.array_equal(one.harmonics, other.harmonics)
+    )
+
+
+def _choose(folder: Path, measurement_id: int | None) -> StoredEntry:
+    entries, problems = list_measurements(folder)
+    ids = ", ".join(str(entry.measurement_id) for entry in entries[:_MOST_LISTED])
+    if len(entries) > _MOST_LISTED:
+        ids += f" and {len(entries) - _MOST_LISTED} more"
+    if not entries:
+        raise ValueError(
+            f"{folder}: no measurement in it, expected a folder of records {problems[:3]}"
+        )
+    if measurement_id is None and len(entries) == 1:
+        return entries[0]
+    if measurement_id is None:
+        raise ValueError(f"measurement_id: not told which, {folder} holds {ids}")
+    for entry in entries:
+        if entry.measurement_id == measurement_id:
+            return entry
+    raise ValueError(f"measurement_id: {measurement_id}, {folder} holds {ids}")

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One excitation or record in one .npz file: there whole or not at all, and bit-exact."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Record
+
+T = TypeVar("T", Excitation, Record)
+Fields = dict[str, npt.NDArray[Any]]
+
+_FORMAT = "tactile_resonance {} 1"
+_DTYPE = ":dtype"  # suffix of the field that tells which integer type an array had
+_DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
+           SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+
+
+def write_stored(path: Path, value: Excitation | Record) -> None:
+    """Write one object durably: a reader, or a power cut, finds the whole file or none.
+
+    Parameters
+    ----------
+    path : Path
+        In a folder that exists; a file of this name is replaced.
+    value : Excitation or Record
+        Each field becomes one array named after it (``origin.contact.force_n``). Integer arrays are
+        held in the smallest signed type that holds them exactly.
+
+    Raises
+    ------
+    ValueError
+        If an array is neither of signed integers nor floating point.
+    OSError
+        If it cannot be written; nothing is left behind.
+    """
+    content: Fields = {"format": np.array(_FORMAT.format(type(value).__name__))}
+    _flatten("", value, content)
+    # a damaged zip directory can lose a field without an error
+    content["fields"] = np.array(sorted(content))
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            np.savez(file, **content)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def read_stored(path: Path, kind: type[T]) -> T:
+    """What `write_stored` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged or something else; one line that names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in archive.files}
+        if str(content.get("format")) != _FORMAT.format(kind.__name__):
+            raise ValueError(f"no {kind.__name__} of format 1")
+        if sorted(content.keys() - {"fields"}) != content["fields"].tolist():
+            raise ValueError("a field is lost")
+        return _unflatten("", kind, content)
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise ValueError(f"{path.name}: damaged or foreign file ({reason})") from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable."""
+    if os.name == "nt":  # Windows cannot open folders; its file system journals names
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _flatten(prefix: str, value: Any, content: Fields) -> None:
+    for field in fields(value):
+        name, item = prefix + field.name, getattr(value, field.name)
+        if is_dataclass(item):
+            _flatten(f"{name}.", item, content)
+        elif isinstance(item, np.ndarray):
+            content[name] = item
+            if item.dtype.kind == "i":
+                content[name + _DTYPE] = np.array(item.dtype.str)
+                content[name] = item.astype(_smallest(item))
+            elif item.dtype.kind != "f":
+                raise ValueError(f"{name}: values of type {item.dtype}, expected int or float")
+        elif isinstance(item, Enum):
+            content[name] = np.array(item.value)
+        elif item is not None:  # None: no field
+            content[name] = np.array(item)
+
+
+def _unflatten(prefix: str, kind: type, content: Mapping[str, npt.NDArray[Any]]) -> Any:
+    hints = get_type_hints(kind)
+    values: dict[str, Any] = {}
+    for field in fields(kind):
+        name, hint = prefix + field.name, hints[field.name]
+        if is_dataclass(hint):
+            values[field.name] = _unflatten(f"{name}.", hint, content)  # type: ignore[arg-type]
+            continue
+        array = content.get(name)
+        if array is None:
+            # a file may be older than the field
+            if field.default is MISSING:
+                raise ValueError(f"{name} is missing")
+        elif name + _DTYPE in content:
+            values[field.name] = array.astype(np.dtype(str(content[name + _DTYPE])), casting="safe")
+        elif array.ndim == 0:
+            is_enum = isinstance(hint, type) and issubclass(hint, Enum)
+            values[field.name] = hint(array.item()) if is_enum else array.item()
+        else:
+            is_tuple = str(field.type).startswith("tuple")
+            values[field.name] = tuple(array.tolist()) if is_tuple else array
+    return kind(**values)
+
+
+def _smallest(values: npt.NDArray[np.signedinteger]) -> type[np.signedinteger]:
+    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
+    for dtype in (np.int8, np.int16, np.int32):
+        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
+            return dtype
+    return np.int64

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The NI driver on a stand-in of nidaqmx; nothing here has seen hardware."""
+
+import inspect
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.drivers.acquisition import DeviceError
+from tactile_resonance.drivers.nidaq import NiDaqDevice
+from tactile_resonance.drivers.nidaq_config import read_nidaq_config
+from tactile_resonance.drivers.nidaq_scale import CountScale
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.record import BetweenSamples, InputKind
+
+sys.path.insert(0, str(Path(__file__).parent))
+import fake_nidaqmx
+
+EXAMPLE = share_path("config/devices/nidaqmx.yaml")
+CONFIG = read_nidaq_config(EXAMPLE)
+RATE_HZ = 50e3
+EXCITATION = design_multisine(
+    sample_rate_hz=RATE_HZ, samples_per_period=500, band_hz=(100.0, 10e3), periods=4, seed=1
+)
+
+
+@pytest.fixture
+def hardware(monkeypatch):
+    return fake_nidaqmx.install(monkeypatch)
+
+
+def armed(config=CONFIG, excitation=EXCITATION):
+    device = NiDaqDevice(config)
+    (planned,) = device.plan([excitation])
+    device.configure(planned.sample_rate_hz)
+    device.arm(planned)
+    return device
+
+
+def test_periods_come_whole_from_rest_and_in_order(hardware):
+    device = armed()
+    device.play()
+    blocks = [device.read_block(1.0) for _ in range(4)]
+    device.stop()
+    assert [block.index for block in blocks] == [0, 1, 2, 3]
+    period_ns = round(EXCITATION.period_s * 1e9)
+    assert np.all(np.diff([block.time_ns for block in blocks]) == period_ns)
+    half_count_v = hardware.coefficients[1] / 2
+    for block in blocks:
+        assert block.actuator.samples.dtype == np.int32
+        assert block.contact is None
+        for channel, gain in ((block.actuator, 1.0), (block.sensor, 0.5)):
+            error = channel.volts() - gain * EXCITATION.period()
+            assert np.max(np.abs(error)) <= half_count_v * (1 + 1e-9)
+            assert not channel.saturated
+
+
+def test_clock_trigger_and_order_of_calls(hardware):
+    device = armed()
+    assert hardware.pin_v == 0.0
+    assert "output.start" not in hardware.names()
+    device.play()
+    names = hardware.names()
+    assert names.index("output.start") < names.index("input.start")
+    for committed in ("output.TASK_COMMIT", "input.TASK_COMMIT"):
+        assert names.index(committed) < names.index("output.start")
+    clocks = [call for call in hardware.calls if call[0].endswith(".clock")]
+    continuous = fake_nidaqmx.Constants.AcquisitionType.CONTINUOUS
+    assert ("input.clock", RATE_HZ, "", continuous) in clocks
+    assert ("output.clock", RATE_HZ, "/Dev1/ai/SampleClock", continuous) in clocks
+    assert ("output.trigger", "/Dev1/ai/StartTrigger") in hardware.calls
+    diff = fake_nidaqmx.Constants.TerminalConfiguration.DIFF
+    assert ("input.channel", "Dev1/ai0", diff, -5.0, 5.0) in hardware.calls
+    assert ("input.channel", "Dev1/ai1", diff, -1.0, 1.0) in hardware.calls
+    assert ("output.channel", "Dev1/ao0", -5.0, 5.0) in hardware.calls
+    (output,) = (t for t in hardware.open_tasks if t.kind == "output")
+    (source,) = (t for t in hardware.open_tasks if t.kind == "input")
+    constants = fake_nidaqmx.Constants
+    assert output.out_stream.regen_mode is constants.RegenerationMode.ALLOW_REGENERATION
+    assert output.out_stream.output_buf_size == 500
+    keep = constants.OverwriteMode.DO_NOT_OVERWRITE_UNREAD_SAMPLES
+    assert source.in_stream.overwrite is keep
+    assert source.in_stream.input_buf_size == 500_000
+    device.close()
+
+
+def test_device_says_what_it_is(hardware):
+    info = NiDaqDevice(CONFIG).configure(RATE_HZ)
+    assert "PCIe-6376" in info.name
+    assert not info.simulated
+    assert info.input_kind is InputKind.MEASURED
+    assert info.between_samples is BetweenSamples.BAND_LIMITED
+    assert info.output_peak_v == 5.0
+    assert np.isnan(info.channel_delay_s)
+    assert hardware.open_tasks == []
+    assert hardware.pin_v == 0.0
+
+
+def test_a_commanded_drive_is_what_was_asked(hardware):
+    device = armed(replace(CONFIG, actuator=None))
+    device.play()
+    block = device.read_block(1.0)
+    device.stop()
+    np.testing.assert_array_equal(block.actuator.samples, EXCITATION.period())
+    assert device.configure(RATE_HZ).input_kind is InputKind.COMMANDED
+
+
+@pytest.mark.parametrize("ended", ["stop", "close"])
+def test_output_is_zero_and_free_after_the_end(hardware, ended):
+    device = armed()
+    device.play()
+    device.read_block(1.0)
+    assert hardware.pin_v != 0.0
+    getattr(device, ended)()
+    assert hardware.pin_v == 0.0
+    assert hardware.open_tasks == []
+    device.stop()  # harmless
+    with pytest.raises(DeviceError, match="nothing plays"):
+        device.read_block(1.0)
+    with pytest.raises(DeviceError, match="nothing armed"):
+        device.play()
+
+
+def test_a_closed_device_cannot_be_armed(hardware):
+    device = armed()
+    device.close()
+    with pytest.raises(DeviceError, match="closed"):
+        device.arm(EXCITATION)
+    assert hardware.open_tasks == []
+
+
+def test_realisations_follow_each_other(hardware):
+    device = armed()
+    for level in (1.0, 0.5):
+        excitation = replace(EXCITATION, amplitude_v=level * EXCITATION.amplitude_v)
+        device.arm(excitation)
+        device.play()
+        first = device.read_block(1.0)
+        assert first.index == 0
+        np.testing.assert_allclose(first.actuator.volts(), excitation.period(), atol=2e-4)
+        device.stop()
+    assert hardware.pin_v == 0.0
+
+
+def test_overrun_is_named_and_the_output_zeroed(hardware):
+    device = armed()
+    device.play()
+    device.read_block(1.0)
+    hardware.samples_late = 500_001
+    with pytest.raises(DeviceError, match="nidaqmx: block 1: overrun, blocks are lost"):
+        device.read_block(1.0)
+    assert hardware.pin_v == 0.0
+    assert hardware.open_tasks == []
+
+
+def test_an_output_that_ran_dry_is_named(hardware):
+    device = armed()
+    device.play()
+    hardware.output_dies_at = 700
+    device.read_block(1.0)
+    with pytest.raises(DeviceError, match="block 1: DAC conversion attempted") as raised:
+        device.read_block(1.0)
+    assert "\n" not in str(raised.value)
+    assert hardware.pin_v == 0.0
+
+
+@pytest.mark.parametrize(
+    ("call", "step"),
+    [
+        ("output.trigger", "arm"),
+        ("output.write", "arm"),
+        ("input.TASK_COMMIT", "arm"),
+        ("output.start", "play"),
+        ("input.start", "play"),
+        ("input.read", "read"),
+    ],
+)
+def test_any_failure_leaves_zero_volts_and_no_task(hardware, call, step):
+    device = NiDaqDevice(CONFIG)
+    device.configure(RATE_HZ)
+    hardware.fail_on[call] = fake_nidaqmx.DaqError("It broke.", -50000)
+    steps = {"arm": lambda: device.arm(EXCITATION), "play": device.play}
+    steps["read"] = lambda: device.read_block(1.0)
+    for name, run in steps.items():
+        if name == step:
+            with pytest.raises(DeviceError, match=r"nidaqmx: .*It broke. Status Code: -50000$"):
+                run()
+            break
+        run()
+    hardware.fail_on.clear()
+    assert hardware.open_tasks == []
+    assert hardware.pin_v == 0.0
+
+
+def test_an_output_that_cannot_be_zeroed_is_shouted_and_tried_again(hardware):
+    device = armed()
+    device.play()
+    hardware.fail_on["output.write"] = fake_nidaqmx.DaqError("Device removed.", -50405)
+    hardware.samples_late = 10**9
+    with pytest.raises(DeviceError, match="overrun.*THE OUTPUT MAY NOT BE AT ZERO.*removed"):
+        device.read_block(1.0)
+    assert hardware.pin_v != 0.0
+    with pytest.raises(DeviceError, match="MAY NOT BE AT ZERO"):
+        device.stop()
+    hardware.fail_on.clear()
+    device.stop()
+    assert hardware.pin_v == 0.0
+
+
+def test_what_the_device_cannot_do_is_refused(hardware):
+    device = NiDaqDevice(CONFIG)
+    hardware.rate_error = 1e-6
+    with pytest.raises(DeviceError, match="sample_rate_hz: 50000, .* at 50000.05"):
+        device.configure(RATE_HZ)
+    hardware.rate_error = 0.0
+    with pytest.raises(DeviceError, match="max_voltage_v: 12, the device reaches 10 V"):
+        NiDaqDevice(replace(CONFIG, max_voltage_v=12.0)).configure(RATE_HZ)
+    hardware.simultaneous = False
+    with pytest.raises(DeviceError, match="one channel after the other"):
+        device.configure(RATE_HZ)
+    assert NiDaqDevice(replace(CONFIG, channel_delay_s=4e-6)).configure(
+        RATE_HZ
+    ).channel_delay_s == pytest.approx(4e-6)
+    hardware.simultaneous = True
+    device.configure(RATE_HZ)
+    loud = replace(EXCITATION, amplitude_v=10 * EXCITATION.amplitude_v)
+    with pytest.raises(DeviceError, match="output.max_voltage_v is 5 V"):
+        device.arm(loud)
+    with pytest.raises(DeviceError, match="sample_rate_hz: 1000, configured was 50000"):
+        device.arm(replace(EXCITATION, sample_rate_hz=1000.0))
+    assert "output.start" not in hardware.names()
+
+
+def test_saturation_is_flagged(hardware):
+    peak_v = np.max(np.abs(EXCITATION.period()))
+    hardware.range_v = 0.9 * peak_v
+    device = armed()
+    device.play()
+    block = device.read_block(1.0)
+    device.stop()
+    assert block.actuator.saturated
+    assert not block.sensor.saturated
+
+
+def test_counts_where_the_converter_is_straight_else_volts():
+    counts = np.array([-30000, 0, 12345], np.int16)
+    straight = CountScale(np.array([0.01, 3e-4, 1e-15]), (-10.0, 10.0), np.int16)
+    channel = straight.channel(counts)
+    assert channel.is_counts
+    np.testing.assert_allclose(channel.volts(), 0.01 + 3e-4 * counts, rtol=1e-15)
+    bent = CountScale(np.array([0.01, 3e-4, 1e-12, 1e-16]), (-10.0, 10.0), np.int16)
+    channel = bent.channel(counts)
+    assert not channel.is_counts
+    x = counts.astype(float)
+    np.testing.assert_allclose(channel.volts(), 0.01 + 3e-4 * x + 1e-12 * x**2 + 1e-16 * x**3)
+    for end in (-(2**15), 2**15 - 1):
+        assert straight.channel(np.array([end], np.int16)).saturated
+    with pytest.raises(DeviceError, match="expected a slope"):
+        CountScale(np.array([0.0, 0.0]), (-10.0, 10.0), np.int16)
+
+
+def test_wide_converters_are_read_as_such(hardware):
+    hardware.raw_bits, hardware.coefficients = 32, [0.0, 5e-9]
+    device = armed()
+    device.play()
+    block = device.read_block(1.0)
+    device.stop()
+    np.testing.assert_allclose(block.actuator.volts(), EXCITATION.period(), atol=2.6e-9)
+    hardware.raw_bits = 8
+    with pytest.raises(DeviceError, match=r"raw samples of \[8\] bits"):
+        device.configure(RATE_HZ)
+
+
+def test_missing_package_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "nidaqmx", None)
+    with pytest.raises(DeviceError, match="install the package") as raised:
+        NiDaqDevice(CONFIG)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"output": {"channel": "Dev1/ao0"}}, "output.max_voltage_v: missing"),
+        ({"between_samples": "linear"}, "between_samples: 'linear', accepted are"),
+        ({"channel_delay_s": "1e-6"}, "channel_delay_s: '1e-6', expected a number"),
+        ({"buffer_s": 0}, "buffer_s: 0, expected a positive number"),
+        ({"gain": 3}, "gain: no such field"),
+        ({"sensor": {"channel": 3}}, "sensor.channel: 3, expected a name"),
+        ({"sensor": None}, "sensor: None, expected fields"),
+        (
+            {"sensor": {"channel": "Dev1/ai0", "range_v": 1.0, "terminals": "rse"}},
+            "sensor.channel: Dev1/ai0, expected another",
+        ),
+        (
+            {"actuator": {"source": "commanded", "channel": "Dev1/ai0"}},
+            "actuator.channel: no such field",
+        ),
+    ],
+)
+def test_wrong_configuration_is_named(tmp_path, change, message):
+    content = yaml.safe_load(EXAMPLE.read_text()) | change
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ValueError, match=message) as raised:
+        read_nidaq_config(path)
+    assert str(raised.value).startswith("mine.yaml: ")
+
+
+def test_stand_in_agrees_with_the_real_package():
+    """Every name, argument and constant of the stand-in exists in the package itself."""
+    pytest.importorskip("nidaqmx", reason="nidaqmx is not installed")
+    from nidaqmx import Task, constants, error_codes, stream_readers, system
+    from nidaqmx.task import InStream, OutStream, Timing
+    from nidaqmx.task.channels import AIChannel
+    from nidaqmx.task.collections import AIChannelCollection, AOChannelCollection
+    from nidaqmx.task.triggering import StartTrigger
+
+    pairs = [
+        (fake_nidaqmx.Task, Task, ("__init__", "write", "control", "start", "is_task_done")),
+        (fake_nidaqmx.Task, Task, ("close",)),
+        (fake_nidaqmx.Timing, Timing, ("cfg_samp_clk_timing",)),
+        (fake_nidaqmx.StartTrigger, StartTrigger, ("cfg_dig_edge_start_trig",)),
+        (fake_nidaqmx.AIChannelCollection, AIChannelCollection, ("add_ai_voltage_chan",)),
+        (fake_nidaqmx.AOChannelCollection, AOChannelCollection, ("add_ao_voltage_chan",)),
+        (
+            fake_nidaqmx.AnalogUnscaledReader,
+            stream_readers.AnalogUnscaledReader,
+            ("__init__", "read_int16", "read_int32"),
+        ),
+    ]
+    for ours, theirs, names in pairs:
+        for name in names:
+            mine = list(inspect.signature(getattr(ours, name)).parameters)
+            real = list(inspect.signature(getattr(theirs, name)).parameters)
+            assert real[: len(mine)] == mine, name
+    for name, ours in vars(fake_nidaqmx.Constants).items():
+        for member in ours if isinstance(ours, type) else ():
+            assert getattr(constants, name)[member.name].value == member.value
+    for owner, names in (
+        (Timing, ("samp_clk_rate",)),
+        (InStream, ("input_buf_size", "overwrite")),
+        (OutStream, ("output_buf_size", "regen_mode")),
+        (AIChannel, ("ai_dev_scaling_coeff", "ai_raw_samp_size", "ai_rng_low", "ai_rng_high")),
+        (
+            system.Device,
+            ("product_type", "ai_simultaneous_sampling_supported", "ao_voltage_rngs"),
+        ),
+        (Task, ("in_stream", "out_stream", "timing", "triggers", "ai_channels", "ao_channels")),
+    ):
+        for name in names:
+            assert isinstance(getattr(owner, name), property), name
+    codes = {code.value for code in error_codes.DAQmxErrors}
+    assert {-200279, -200222, -200283, -200361, -200010, -200284, -200018} <= codes

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No block is dropped silently: on disk before it is heard, refused before it is played."""
+
+import array
+import shutil
+import signal
+import struct
+import time
+
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from tactile_resonance.action import Measure
+
+from tactile_resonance import msg
+from tactile_resonance.nodes.conversions import pose_to_message, record_to_message
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM
+from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.record import Contact
+from tactile_resonance.recording.store import read_store
+
+TOPICS = {
+    "excitation": (msg.Excitation, EXCITATIONS),
+    "record": (msg.Record, RESULTS),
+    "frf": (msg.FRF, RESULTS),
+    "poles": (msg.Poles, RESULTS),
+    "bench/block": (msg.Record, RESULTS),
+}
+# short periods: many blocks in little time
+SHORT = {"samples_per_period": 2000, "f_min_hz": 100.0}
+
+
+class Client:
+    """Asks for measurements and hears everything; moves the tip as a robot would."""
+
+    def __enter__(self):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("client", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.heard = {topic: [] for topic in TOPICS}
+        for topic, (kind, qos) in TOPICS.items():
+            self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
+        self.pose = self.node.create_publisher(PoseStamped, "tcp_pose", STREAM)
+        self.node.create_timer(0.05, self.move)
+        self.moves = 0
+        self.client = ActionClient(self.node, Measure, "measure")
+        return self
+
+    def __exit__(self, *_):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def move(self):
+        self.moves += 1
+        contact = Contact(
+            position_m=(1e-5 * self.moves, 0.0, 0.0), frame_id="table", time_ns=time.time_ns()
+        )
+        self.pose.publish(pose_to_message(contact))
+
+    def wait(self, done, timeout_s=30.0):
+        deadline = time.monotonic() + timeout_s
+        while not done():
+            assert time.monotonic() < deadline, {t: len(m) for t, m in self.heard.items()}
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def ask(self, **goal):
+        """Future of the result of a goal."""
+        self.wait(self.client.server_is_ready)
+        accepted = self.client.send_goal_async(Measure.Goal(**goal))
+        self.wait(accepted.done)
+        return accepted.result().get_result_async()
+
+    def measure(self, **goal):
+        result = self.ask(**goal)
+        self.wait(result.done)
+        return result.result().result
+
+    def join(self, **goal):
+        """Measure until every topic's last message is heard: all have found each other by then."""
+        for _ in range(20):
+            key = self.measure(**goal).measurement_id
+            deadline = time.monotonic() + 1.0
+            while time.monotonic() < deadline:
+                self.executor.spin_once(timeout_sec=0.05)
+                if all(self.finished(topic, key) for topic in ("record", "frf", "poles")):
+                    return
+        raise AssertionError("the nodes are not heard")
+
+    def of(self, topic, key):
+        return [m for m in self.heard[topic] if m.measurement_id == key]
+
+    def finished(self, topic, key):
+        return any(m.final for m in self.of(topic, key))
+
+
+def bits(message):
+    """Everything in a message, to the bit; its serialised form has padding of any value."""
+    if hasattr(message, "get_fields_and_field_types"):
+        return [bits(getattr(message, name)) for name in message.get_fields_and_field_types()]
+    if isinstance(message, array.array):
+        return message.tobytes()
+    return struct.pack("d", message) if isinstance(message, float) else message
+
+
+def start(nodes, names, **parameters):
+    for name in names:
+        nodes.start(name, parameters.get(name))
+
+
+def assert_on_disk(content, messages):
+    """Every message is in the store, to the bit."""
+    stored = {
+        (m.measurement_id, r.realisation, r.block_index): r
+        for m in content.measurements
+        for r in m.records
+    }
+    for message in messages:
+        record = stored[(message.measurement_id, message.realisation, message.block_index)]
+        assert bits(record_to_message(record)) == bits(message)
+
+
+def test_kill_leaves_every_published_record_on_disk(domain, tmp_path):
+    records = tmp_path / "records"
+    with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
+        start(
+            nodes,
+            ("excitation_node", "frf_node", "poles_node", "fake_hardware_node"),
+            excitation_node={"record_folder": records, **SHORT},
+            fake_hardware_node={"speed": 2.0},
+        )
+        client.join(periods=3)
+        client.heard["record"].clear()
+        client.ask(periods=100_000, label="to be killed")
+        client.wait(lambda: len(client.heard["record"]) >= 25)
+        node = nodes._processes["excitation_node"]
+        node.send_signal(signal.SIGKILL)
+        node.wait()
+        for _ in range(20):  # what was on its way
+            client.executor.spin_once(timeout_sec=0.05)
+    content = read_store(records)
+    assert content.problems == ()
+    last = content.measurements[-1]
+    assert last.gaps == ()
+    assert last.excitations[0].label == "to be killed"
+    assert len(last.records) >= len(client.heard["record"]) >= 25
+    assert_on_disk(content, client.heard["record"])
+
+
+def test_what_cannot_be_recorded_is_refused_before_anything_is_played(domain, tmp_path):
+    blocked = tmp_path / "a file"
+    blocked.write_text("no folder")
+    with NodeProcesses(tmp_path / "log") as bench, Client() as client:
+        start(bench, ("fake_hardware_node",), fake_hardware_node={"speed": 0.0})
+        with NodeProcesses(tmp_path / "log") as nodes:
+            start(nodes, ("excitation_node",), excitation_node={"record_folder": blocked / "x"})
+            result = client.measure(periods=3)
+            assert result.outcome == Measure.Result.REFUSED
+            assert result.message.startswith("record_folder: ")
+            assert "a file" in result.message
+        with NodeProcesses(tmp_path / "log") as nodes:
+            start(nodes, ("excitation_node",), excitation_node={"record_folder": tmp_path / "r"})
+            result = client.measure(periods=2**32 - 1)
+            assert result.outcome == Measure.Result.REFUSED
+            assert "MB free, the measurement may take 14" in result.message
+            assert list((tmp_path / "r").iterdir()) == []
+            assert client.heard["excitation"] == []
+            assert client.heard["bench/block"] == []
+            # and what fits is measured as if nothing had happened
+            assert client.measure(periods=3).outcome == Measure.Result.DONE
+
+
+def test_a_disk_that_goes_away_ends_the_measurement(domain, tmp_path):
+    records = tmp_path / "records"
+    with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
+        start(
+            nodes,
+            ("excitation_node", "fake_hardware_node"),
+            excitation_node={"record_folder": records, **SHORT},
+            fake_hardware_node={"speed": 2.0},
+        )
+        result = client.ask(periods=100_000)
+        client.wait(lambda: len(client.heard["record"]) >= 5)
+        shutil.rmtree(records)
+        client.wait(result.done)
+        result = result.result().result
+        assert result.outcome == Measure.Result.FAILED
+        assert result.message.startswith("record_folder: ")
+        # only what had been written was handed out
+        client.wait(lambda: client.heard["record"][-1].block_index == result.blocks - 1)
+        # and the bench is silent
+        for _ in range(10):
+            client.executor.spin_once(timeout_sec=0.05)
+        before = len(client.heard["bench/block"])
+        for _ in range(20):
+            client.executor.spin_once(timeout_sec=0.05)
+        assert len(client.heard["bench/block"]) == before
+
+
+def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
+    records = tmp_path / "records"
+    readers = ("frf_node", "poles_node")
+    with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
+        start(
+            nodes,
+            ("excitation_node", "fake_hardware_node", *readers),
+            excitation_node={"record_folder": records, "frame_id": "left/tip"},
+            fake_hardware_node={"speed": 0.0},
+        )
+        client.join(periods=3)
+        keys = [
+            client.measure(periods=4, realisations=2, label=f"point {k}", seed=k).measurement_id
+            for k in (1, 2)
+        ]
+        client.wait(lambda: all(client.finished(t, keys[1]) for t in ("record", "frf", "poles")))
+        recorded = {
+            (topic, key): [bits(m) for m in client.of(topic, key)]
+            for topic in ("record", "frf", "poles")
+            for key in keys
+        }
+        assert {len(messages) for messages in recorded.values()} == {8}
+        assert client.of("poles", keys[0])[-1].f0_hz[0] == pytest.approx(250, abs=50)
+        assert client.of("record", keys[1])[-1].tip_pose.pose.position.x > 0
+    content = read_store(records)
+    warm_up = [m.measurement_id for m in content.measurements if m.measurement_id not in keys]
+    assert [m.measurement_id for m in content.measurements[-2:]] == keys
+
+    with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
+        start(
+            nodes,
+            ("excitation_node", *readers),
+            excitation_node={
+                "device": "replay",
+                "device_config": records,
+                "replay_speed": 0.0,
+                "frame_id": "elsewhere",
+            },
+        )
+        client.join(measurement_id=warm_up[0])
+        # out of turn, the warm-up did not count
+        replayed = [client.measure().measurement_id for _ in content.measurements]
+        assert replayed == [m.measurement_id for m in content.measurements]
+        client.wait(lambda: all(client.finished(t, keys[1]) for t in ("record", "frf", "poles")))
+        for (topic, key), messages in recorded.items():
+            assert [bits(m) for m in client.of(topic, key)] == messages
+        result = client.measure()
+        assert result.outcome == Measure.Result.REFUSED
+        assert "the recording is over" in result.message
