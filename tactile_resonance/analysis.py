@@ -86,7 +86,7 @@ def analyse(
             f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}"
         )
     structure = structure or ModelStructure()
-    warnings = []
+    warnings = list(recording.notes)
     start = time.perf_counter()
     harmonics = recording.excited_harmonics
     if harmonics is None:

@@ -20,6 +20,7 @@ from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
+from tactile_resonance.recording.store_recording import read_store_recording
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -29,7 +30,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="FRF and poles of a recorded measurement",
         description="Estimate the frequency response of a periodic record and the poles of one band of it.",
     )
-    parser.add_argument("record", type=Path, help=".npz, .mat or .csv file")
+    parser.add_argument(
+        "record", type=Path, help=".npz, .mat or .csv file, or a folder of records of the nodes"
+    )
+    parser.add_argument(
+        "--measurement", type=int, metavar="ID", help="which one of a folder with several"
+    )
     parser.add_argument("--u", default="u", metavar="FIELD", help="actuator field (default: u)")
     parser.add_argument("--y", default="y", metavar="FIELD", help="sensor field (default: y)")
     parser.add_argument("--sample-rate", type=float, metavar="HZ", help="wins over the file's")
@@ -104,15 +110,18 @@ def parse_segments(text: str) -> list[tuple[int, int]]:
 def run(options: argparse.Namespace) -> int:
     """Read, analyse, then write: nothing is written unless all went well."""
     _check_outputs(options)
-    recording = read_recording(
-        options.record,
-        u=options.u,
-        y=options.y,
-        sample_rate_hz=options.sample_rate,
-        samples_per_period=options.samples_per_period,
-        periods=options.periods,
-        segments=options.segments,
-    )
+    if options.record.is_dir():
+        recording = read_store_recording(options.record, options.measurement, options.periods)
+    else:
+        recording = read_recording(
+            options.record,
+            u=options.u,
+            y=options.y,
+            sample_rate_hz=options.sample_rate,
+            samples_per_period=options.samples_per_period,
+            periods=options.periods,
+            segments=options.segments,
+        )
     structure = ModelStructure.with_residual(options.order)
     if options.numerator_order is not None:
         structure = replace(structure, numerator_order=options.numerator_order)

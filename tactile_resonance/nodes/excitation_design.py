@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from rclpy.node import Node
 
 from tactile_resonance.action import Measure
+from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.nodes.parameters import Parameter, values
@@ -47,6 +48,13 @@ PARAMETERS = (
         1,
         2**62,
     ),
+    Parameter(
+        "compression_passes",
+        0,
+        "Passes that make the peaks small; 0 leaves the phases random. For linear work only.",
+        0,
+        10**5,
+    ),
 )
 
 
@@ -68,7 +76,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     ValueError
         Names the field, its value, and what is accepted.
     """
-    rate, samples, low, high, level, max_level, grid, periods, realisations, seed = values(
+    rate, samples, low, high, level, max_level, grid, periods, realisations, seed, passes = values(
         node, *(parameter.name for parameter in PARAMETERS)
     )
     level = goal.level_v or level
@@ -77,7 +85,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     if goal.grid and goal.grid not in GRIDS:
         raise ValueError(f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter")
     realisations = goal.realisations or realisations
-    return [
+    excitations = [
         design_multisine(
             sample_rate_hz=rate,
             samples_per_period=samples,
@@ -93,6 +101,9 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
         )
         for realisation in range(realisations)
     ]
+    if passes:
+        return [compress_crest_factor(each, passes=passes) for each in excitations]
+    return excitations
 
 
 def check_output(excitations: Sequence[Excitation], info: DeviceInfo) -> None:

@@ -133,7 +133,8 @@ def as_table(points: Sequence[MeasuredPoint]) -> str:
             lead = f"{name:<16} {len(group):>6}" if k == 0 else " " * 23
             lines.append(
                 f"{lead}  {quantity:<14} {mean[k]:>11.{digits}f}  {stds[k]:>11.2g}  "
-                f"{spread[k]:>9.2g}  {truth[k]:>12.{digits}f}  {error[k]:>11.2f}  {worst[k]:>11.2f}"
+                f"{'-' if len(group) == 1 else f'{spread[k]:.2g}':>9}  {truth[k]:>12.{digits}f}  "
+                f"{error[k]:>11.2f}  {worst[k]:>11.2f}"
             )
     return "\n".join(lines)
 

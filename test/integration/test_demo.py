@@ -2,6 +2,7 @@
 """The demo as a user starts it."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -63,6 +64,20 @@ def test_four_concentrations_are_told_apart(domain, tmp_path):
     for percent in (10, 12, 14, 16):
         assert f"gelatine {percent} %" in answer.stdout
     assert processes_of(tmp_path) == []
+    # the records lie there too, and give the same poles again
+    records = tmp_path / "run" / "records"
+    options = ["--measurement", rows[0]["measurement_id"], "--band", "200", "300"]
+    answer = subprocess.run(
+        [sys.executable, "-m", "tactile_resonance.cli", "analyze", records, *options]
+        + ["--method", "frf", "--json", tmp_path / "again.json"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert answer.returncode == 0, answer.stderr
+    again = json.loads((tmp_path / "again.json").read_text())["poles"][0]
+    # streamed and at once agree to 1e-9 of the response; a millionth of its standard deviation here
+    assert abs(again["f0_hz"] - float(rows[0]["f0_hz"])) < 1e-6 * float(rows[0]["f0_std_hz"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

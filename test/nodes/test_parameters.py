@@ -76,3 +76,20 @@ def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
         assert made.get_parameter(name).value == before
     finally:
         made.destroy_node()
+
+
+def test_compressed_phases_for_one_realisation_only(ros):
+    from tactile_resonance.action import Measure
+    from tactile_resonance.nodes import excitation_design
+
+    node = excitation_node.ExcitationNode()
+    try:
+        node.set_parameters([RosParameter("compression_passes", value=300)])
+        goal = Measure.Goal(f_max_hz=500.0)
+        (compressed,) = excitation_design.design(node, goal, 0)
+        assert not compressed.random_phases
+        assert compressed.crest_factor() < 2.2
+        with pytest.raises(ValueError, match="compressed phases are not random"):
+            excitation_design.design(node, Measure.Goal(realisations=2), 0)
+    finally:
+        node.destroy_node()
