@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter as RosParameter
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes import devices
+from tactile_resonance.nodes.excitation_node import ExcitationNode
 from tactile_resonance.nodes.parameters import declare
 from tactile_resonance.processes import free_domain_id
 
@@ -47,6 +48,19 @@ def test_a_device_that_is_not_there_is_named(make, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
     with pytest.raises(DeviceError, match="install the package"):
         make(device="nidaqmx", device_config=str(share_path("config/devices/nidaqmx.yaml")))
+
+
+def test_a_node_that_ends_closes_its_device(monkeypatch):
+    closed = []
+
+    class Device:
+        def close(self):
+            closed.append(True)
+
+    monkeypatch.setattr(devices, "make_device", lambda _: Device())
+    with rclpy.init(domain_id=free_domain_id(os.environ)):
+        ExcitationNode().destroy_node()
+    assert closed == [True]
 
 
 def test_records_go_where_the_parameter_says(tmp_path):
