@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.result import Poles
@@ -162,6 +163,7 @@ def draw_phantoms(points: Sequence[MeasuredPoint], band_hz: tuple[float, float])
         close = figure.add_subplot(grid[2 * from_the_highest : 2 * from_the_highest + 2, 2])
         close.set_title(f"{name}, magnified", fontsize="small", color=colour)
         close.tick_params(labelsize="x-small")
+        close.xaxis.set_major_locator(MaxNLocator(4))
         close.ticklabel_format(useOffset=False)
         for axes in (plane, close):
             _draw_poles(axes, group, colour)
