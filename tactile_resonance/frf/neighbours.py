@@ -42,6 +42,46 @@ class Neighbourhood:
         first, last = int(self.lines[0]), int(self.lines[-1])
         return slice(first, last + 1) if last - first + 1 == self.lines.size else self.lines
 
+    @cached_property
+    def folded(self) -> tuple[FloatArray, FloatArray] | None:
+        """Projector for sums and differences of the bins at either side; None where sides differ.
+
+        (n, 1 + W // 2) for the line and the sums, (m, W // 2) for the differences ``upper - lower``,
+        n + m = 1 + dof, by growing distance: together half the work of `projector`.
+        """
+        if not is_symmetric(self.offsets[1:]):
+            return None
+        upper = self.projector[:, 1 + self.offsets.size // 2 :]
+        odd = upper[:, 0] == -self.projector[:, self.offsets.size // 2]
+        even = np.concatenate([self.projector[~odd, :1], upper[~odd]], axis=1)
+        return even, upper[odd]
+
+    def project_folded(
+        self,
+        sums: npt.NDArray[np.complexfloating],
+        differences: npt.NDArray[np.complexfloating],
+    ) -> ComplexArray:
+        """Same as `project`, from the line with the sums (..., 1 + W // 2, 2, L) and the differences.
+
+        Raises
+        ------
+        ValueError
+            If the neighbours are not symmetric.
+        """
+        if self.folded is None:
+            raise ValueError("offsets: not symmetric, expected as many bins on either side")
+        even, odd = self.folded
+        batch, lines = sums.shape[:-3], sums.shape[-2:]
+        result = np.empty((*batch, even.shape[0] + odd.shape[0], *lines), sums.dtype)
+        flat = result.reshape(*batch, -1, 2 * lines[-1]).view(float)  # (..., 1 + dof, 4 L)
+        for matrix, bins, rows in (
+            (even, sums, slice(0, even.shape[0])),
+            (odd, differences, slice(even.shape[0], None)),
+        ):
+            columns = bins.reshape(*batch, -1, 2 * lines[-1]).view(float)
+            np.matmul(matrix, columns, out=flat[..., rows, :])
+        return result
+
     def project(self, bins: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """(..., 1 + dof, 2, L) projector times the bins (..., W, 2, L), C-contiguous."""
         # a real matrix times complex numbers: channels, real and imaginary parts are more columns
@@ -134,14 +174,39 @@ def extrapolation_projector(offsets: npt.NDArray[np.integer], order: int) -> Flo
     powers = position[:, None] ** np.arange(order + 1)  # (B, order + 1)
     q, r = np.linalg.qr(powers, mode="complete")
     extrapolation = q[:, : order + 1] @ np.linalg.solve(r[: order + 1].T, np.eye(order + 1)[0])
+    residual_basis = q[:, order + 1 :]
+    if is_symmetric(offsets):
+        # any orthonormal basis serves; one of even and odd vectors is what folding needs
+        extrapolation = (extrapolation + extrapolation[::-1]) / 2
+        residual_basis = _even_and_odd_complement(powers)
     residual_dof = offsets.size - order - 1
     # variance of the line's own noise (1) and of the extrapolated polynomial
     mean_variance = 1 + extrapolation @ extrapolation
     projector = np.zeros((1 + residual_dof, 1 + offsets.size))
     projector[0, 0] = 1
     projector[0, 1:] = -extrapolation
-    projector[1:, 1:] = q[:, order + 1 :].T * np.sqrt(mean_variance / residual_dof)
+    projector[1:, 1:] = residual_basis.T * np.sqrt(mean_variance / residual_dof)
     return projector
+
+
+def is_symmetric(offsets: npt.NDArray[np.integer]) -> bool:
+    """True for ascending offsets with as many, as far, on either side of zero."""
+    return bool(np.array_equal(offsets, -offsets[::-1]))
+
+
+def _even_and_odd_complement(powers: FloatArray) -> FloatArray:
+    """(B, B - order - 1) orthonormal, orthogonal to `powers` (B, order + 1), even vectors first.
+
+    For symmetric positions even and odd powers are orthogonal, so each half has its own complement.
+    """
+    half = powers.shape[0] // 2
+    columns = []
+    for parity in (0, 1):
+        mine = powers[half:, parity::2]  # (B / 2, n)
+        q, _ = np.linalg.qr(mine, mode="complete")
+        upper = q[:, mine.shape[1] :] / np.sqrt(2)
+        columns.append(np.concatenate([(-1) ** parity * upper[::-1], upper]))
+    return np.concatenate(columns, axis=1)
 
 
 def _nearest(centre: int, first: int, last: int, periods: int, count: int) -> IntArray:

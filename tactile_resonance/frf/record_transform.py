@@ -55,6 +55,30 @@ class PairSpectrum:
                 bins[..., index, sign, :] = self.values[..., row, columns]
         return bins
 
+    def gather_folded(
+        self, places: tuple[tuple[Place, Place], ...]
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Line and sums (..., 1 + W // 2, 2, L), and differences, of bins at either side of the line.
+
+        `places` are those of the line, then of W bins symmetric about it, ascending.
+        """
+        values, half = self.values, len(places) // 2
+        (row, columns), _ = places[0]
+        line = values[..., row, columns]
+        sums = np.empty((*line.shape[:-1], half + 1, 2, line.shape[-1]), values.dtype)
+        differences = np.empty((*line.shape[:-1], half, 2, line.shape[-1]), values.dtype)
+        for sign, (row, columns) in enumerate(places[0]):
+            sums[..., 0, sign, :] = values[..., row, columns]
+        for index in range(half):
+            for sign in (0, 1):
+                (row, columns) = places[1 + half + index][sign]
+                upper = values[..., row, columns]
+                (row, columns) = places[half - index][sign]
+                lower = values[..., row, columns]
+                np.add(upper, lower, out=sums[..., index + 1, sign, :])
+                np.subtract(upper, lower, out=differences[..., index, sign, :])
+        return sums, differences
+
 
 @dataclass(frozen=True, eq=False)
 class PairTransform:

@@ -206,3 +206,27 @@ def test_bad_records_are_named():
     gap[1, 7] = np.nan
     with pytest.raises(ValueError, match="not finite"):
         plan(gap, good)
+
+
+@pytest.mark.parametrize(("periods", "order", "dof"), [(8, 2, 6), (8, 5, 4), (3, 0, 1), (2, 2, 6)])
+def test_sums_and_differences_project_as_the_bins_do(periods, order, dof):
+    plan = LocalPolynomialPlan(np.arange(60, 80), 400, periods, order, dof)
+    (group,) = plan.groups
+    even, odd = group.folded
+    assert even.size + odd.size < 0.62 * group.projector.size
+    rng = np.random.default_rng(0)
+    bins = rng.standard_normal((2, group.offsets.size, 2, 20, 2)) @ np.array([1, 1j])
+    half = group.offsets.size // 2
+    upper, lower = bins[:, 1 + half :], bins[:, half:0:-1]
+    sums = np.concatenate([bins[:, :1], upper + lower], axis=1)
+    np.testing.assert_allclose(
+        group.project_folded(sums, upper - lower), group.project(bins), rtol=1e-12, atol=1e-18
+    )
+
+
+def test_one_sided_neighbours_do_not_fold():
+    plan = LocalPolynomialPlan(np.array([1]), 400, 8, 2, 12)
+    (group,) = plan.groups
+    assert group.folded is None
+    with pytest.raises(ValueError, match="not symmetric"):
+        group.project_folded(np.zeros((9, 2, 1), complex), np.zeros((8, 2, 1), complex))

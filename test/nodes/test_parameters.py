@@ -80,6 +80,7 @@ def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
 
 def test_compressed_phases_for_one_realisation_only(ros):
     from tactile_resonance.action import Measure
+
     from tactile_resonance.nodes import excitation_design
 
     node = excitation_node.ExcitationNode()
