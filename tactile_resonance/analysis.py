@@ -17,6 +17,7 @@ from tactile_resonance.frf.estimate import estimate_distortion, estimate_frf
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.joint import identify_poles_from_records
@@ -59,6 +60,7 @@ def analyse(
     frf_method: str = "local polynomial",
     poles_method: str = "auto",
     with_distortion: bool = False,
+    channel_delay_s: float = 0.0,
 ) -> Analysis:
     """FRF at all excited lines, poles in a band.
 
@@ -75,6 +77,9 @@ def analyse(
         realisation), or from the FRF. ``auto`` takes the first where there is one realisation.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.
+    channel_delay_s : float
+        Delay of the sensor channel behind the actuator channel, from a loop-back
+        (`frf.skew.skew_from_loopback`); taken out of the FRF. Where it is 0, a skew is only suspected.
 
     Raises
     ------
@@ -108,14 +113,22 @@ def analyse(
         transient_removed=recording.u.shape[-2] > 1,
     ).marked(frf)
     estimated = time.perf_counter()
+    if channel_delay_s:
+        frf = correct_skew(frf, channel_delay_s)
+    else:
+        suspicion = suspected_skew(frf)
+        if suspicion is not None:
+            warnings.append(f"frf: {suspicion.message}")
     if band_hz is None:
         band_hz = strongest_resonance_band(frf)
         warnings.append(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
     if poles_method == "auto":
-        poles_method = "joint" if recording.u.shape[0] == 1 else "frf"
-    poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure)
+        poles_method = "joint" if recording.u.shape[0] == 1 and not channel_delay_s else "frf"
+    poles = _poles(
+        recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s
+    )
     identified = time.perf_counter()
     distortion = None
     if with_distortion:
@@ -152,7 +165,10 @@ def _poles(
     method: str,
     band_hz: tuple[float, float],
     structure: ModelStructure,
+    channel_delay_s: float,
 ) -> Poles:
+    if method == "joint" and channel_delay_s:
+        raise ValueError("method: joint takes no channel delay, use frf")
     if method == "frf":
         return identify_poles(frf, band_hz, structure)
     if recording.u.shape[0] > 1:

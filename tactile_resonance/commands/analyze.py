@@ -87,6 +87,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help=f"how transients are dealt with (default: {METHODS[0]})",
     )
     parser.add_argument(
+        "--channel-delay",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="of the sensor channel behind the actuator channel, from a loop-back; taken out",
+    )
+    parser.add_argument(
         "--distortion",
         action="store_true",
         help="even and odd distortion at the lines left out; --plot then draws FILE_distortion too",
@@ -143,6 +150,7 @@ def run(options: argparse.Namespace) -> int:
         frf_method=options.frf,
         poles_method=options.method,
         with_distortion=options.distortion,
+        channel_delay_s=options.channel_delay,
     )
     print(as_text(analysis))
     if options.json:

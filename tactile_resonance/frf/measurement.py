@@ -7,7 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_resonance.frf.fault_types import Fault, FaultKind, FaultReport
+from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.streaming import FrfStream
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Origin, Record
@@ -40,6 +43,7 @@ class MeasurementFrf:
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
+        self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._first: Record | None = None
         self._last: Record | None = None
         self._forces_n: list[float] = []
@@ -75,6 +79,7 @@ class MeasurementFrf:
                 max_periods=excitation.periods,
             )
         self._remember(record)
+        self._check(u.reshape(-1, n), y.reshape(-1, n), excitation)
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
             self._note(
@@ -86,10 +91,17 @@ class MeasurementFrf:
         return self.frf()
 
     def frf(self) -> FRF:
-        """The FRF so far; status FAILED where no period could be used."""
+        """The FRF so far; status FAILED where no period could be used.
+
+        A delay of the sensor channel that the record states is taken out.
+        """
         frf = self._frf
         if frf is None:
             frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
+        delay_s = float("nan") if self._last is None else self._last.channel_delay_s
+        if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
+            frf = correct_skew(frf, delay_s)
+        frf = FaultReport(tuple(self._faults.values())).marked(frf)
         if not self._notes:
             return frf
         status = FrfStatus.FAILED if frf.status is FrfStatus.FAILED else FrfStatus.SUSPECT
@@ -126,6 +138,21 @@ class MeasurementFrf:
             self._frf = single
         elif stream.periods >= max(self._periods.values()):
             self._frf = stream.robust().frf
+
+    def _check(self, u: np.ndarray, y: np.ndarray, excitation: Excitation) -> None:
+        """Keep the worst fault of each kind that one block (P, N) shows by itself."""
+        report = find_faults(
+            u,
+            y,
+            sample_rate_hz=excitation.sample_rate_hz,
+            harmonics=excitation.harmonics,
+            transient_removed=True,
+        )
+        for fault in report.faults:
+            key = fault.kind, fault.channel
+            known = self._faults.get(key)
+            if known is None or fault.value > known.value:
+                self._faults[key] = fault
 
     def _remember(self, record: Record) -> None:
         if self._first is None:

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,6 +107,28 @@ def test_saturation_is_said(channels):
         measurement.add(record(u[0, p], y[0, p], 0, p, saturated=p == 1), excitation(0))
     assert measurement.saturated
     assert "sensor saturated" in measurement.frf().message
+
+
+def test_a_stated_channel_delay_is_taken_out(channels):
+    """The sensor lags by two samples; told so, the response has no phase."""
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(4):
+        taken = record(u[0, p], y[0, p], 0, p)
+        frf = measurement.add(replace(taken, channel_delay_s=2 / RATE_HZ), excitation(0))
+    np.testing.assert_allclose(np.angle(frf.g), 0, atol=0.05)
+    np.testing.assert_allclose(np.abs(frf.g), 0.5, rtol=0.05)
+
+
+def test_faults_of_a_block_are_named(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(3):
+        clipped = np.clip(y[0, p], -0.6, 0.6) if p == 1 else y[0, p]
+        frf = measurement.add(record(u[0, p], clipped, 0, p), excitation(0))
+    assert frf.status is FrfStatus.SUSPECT
+    assert "sensor" in frf.message
+    assert "saturat" in frf.message or "clip" in frf.message
 
 
 def test_origin_is_the_middle_and_the_mean(channels):
