@@ -91,6 +91,12 @@ class Client:
                     return
         raise AssertionError("the nodes are not heard")
 
+    def measure_to_the_end(self, **goal):
+        """Measure, and wait for its poles before the next, as a scan does; the id."""
+        key = self.measure(**goal).measurement_id
+        self.wait(lambda: all(self.finished(topic, key) for topic in ("record", "frf", "poles")))
+        return key
+
     def of(self, topic, key):
         return [m for m in self.heard[topic] if m.measurement_id == key]
 
@@ -213,10 +219,9 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
         )
         client.join(periods=3)
         keys = [
-            client.measure(periods=4, realisations=2, label=f"point {k}", seed=k).measurement_id
+            client.measure_to_the_end(periods=4, realisations=2, label=f"point {k}", seed=k)
             for k in (1, 2)
         ]
-        client.wait(lambda: all(client.finished(t, keys[1]) for t in ("record", "frf", "poles")))
         recorded = {
             (topic, key): [bits(m) for m in client.of(topic, key)]
             for topic in ("record", "frf", "poles")
@@ -242,9 +247,8 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
         )
         client.join(measurement_id=warm_up[0])
         # out of turn, the warm-up did not count
-        replayed = [client.measure().measurement_id for _ in content.measurements]
+        replayed = [client.measure_to_the_end() for _ in content.measurements]
         assert replayed == [m.measurement_id for m in content.measurements]
-        client.wait(lambda: all(client.finished(t, keys[1]) for t in ("record", "frf", "poles")))
         for (topic, key), messages in recorded.items():
             assert [bits(m) for m in client.of(topic, key)] == messages
         result = client.measure()
