@@ -46,9 +46,11 @@ class FrfNode(Node):
         except ValueError as error:
             self.get_logger().error(f"excitation {message.excitation_id}: {error}")
             return
-        if excitation.realisation == 0:
-            self._excitations.clear()
+        # records of the measurement before may still be queued: forget the oldest only
+        self._excitations.pop(excitation.excitation_id, None)
         self._excitations[excitation.excitation_id] = excitation
+        while len(self._excitations) > EXCITATIONS.depth:
+            del self._excitations[next(iter(self._excitations))]
         # excitation and record travel on topics of their own: a record may come first
         waiting, self._waiting = self._waiting, []
         for record in waiting:
@@ -71,7 +73,12 @@ class FrfNode(Node):
                 )
             return
         measurement = self._measurement
-        if measurement is None or record.origin.measurement_id != measurement.measurement_id:
+        first = record.realisation == 0 and record.block_index == 0  # a replay may repeat an id
+        if (
+            measurement is None
+            or first
+            or record.origin.measurement_id != measurement.measurement_id
+        ):
             measurement = self._measurement = self._begin(record.origin.measurement_id)
         frf = measurement.add(record, excitation)
         self._publisher.publish(

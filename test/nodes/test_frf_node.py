@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the FRF node does with messages in the order in which a fast bench sends them."""
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+import rclpy
+
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.nodes.conversions import (
+    excitation_to_message,
+    frf_from_message,
+    record_to_message,
+)
+from tactile_resonance.nodes.frf_node import FrfNode
+from tactile_resonance.processes import free_domain_id
+from tactile_resonance.record import Channel, Origin, Record
+
+N, RATE_HZ, PERIODS = 200, 1000.0, 3
+
+
+@pytest.fixture
+def node(monkeypatch):
+    with rclpy.init(domain_id=free_domain_id(os.environ)):
+        node = FrfNode()
+        node.published = []
+        monkeypatch.setattr(node._publisher, "publish", node.published.append)
+        yield node
+        node.destroy_node()
+
+
+def excitation(key):
+    return design_multisine(
+        sample_rate_hz=RATE_HZ,
+        samples_per_period=N,
+        band_hz=(50, 200),
+        seed=key,
+        periods=PERIODS,
+        measurement_id=key,
+        excitation_id=100 + key,
+    )
+
+
+def messages(key):
+    made = excitation(key)
+    u = made.period()
+    records = [
+        record_to_message(
+            Record(
+                Channel(u),
+                Channel(0.1 * key * u),
+                RATE_HZ,
+                N,
+                block_index=block,
+                origin=Origin(key, 100 + key, final=block == PERIODS - 1),
+            )
+        )
+        for block in range(PERIODS)
+    ]
+    return excitation_to_message(made, 0, "tip"), records
+
+
+def finals(node):
+    return {m.measurement_id: frf_from_message(m)[0] for m in node.published if m.final}
+
+
+def test_records_queued_behind_the_next_excitation_are_not_lost(node):
+    (first, first_records), (second, second_records) = messages(1), messages(2)
+    node._on_excitation(first)
+    node._on_record(first_records[0])
+    node._on_excitation(second)
+    for record in first_records[1:] + second_records:
+        node._on_record(record)
+    assert len(node.published) == 2 * PERIODS
+    for key, frf in finals(node).items():
+        np.testing.assert_allclose(frf.g, 0.1 * key, rtol=1e-9)
+        assert frf.periods == PERIODS
+
+
+def test_records_may_come_before_their_excitation(node):
+    message, records = messages(3)
+    for record in records:
+        node._on_record(record)
+    assert node.published == []
+    node._on_excitation(message)
+    assert [m.final for m in node.published] == [False, False, True]
+
+
+def test_a_measurement_replayed_twice_starts_anew(node):
+    message, records = messages(4)
+    for _ in range(2):
+        node._on_excitation(message)
+        for record in records:
+            node._on_record(record)
+    assert [m.periods for m in node.published] == [1, 2, 3, 1, 2, 3]
+    assert not any("lost" in m.message for m in node.published)
+
+
+def test_what_does_not_fit_is_refused_and_the_next_is_taken(node):
+    message, records = messages(5)
+    node._on_excitation(message)
+    node._on_record(records[0])
+    records[1].sensor_v.append(0.0)
+    node._on_record(records[1])
+    broken = excitation_to_message(excitation(6), 0, "tip")
+    broken.phase_rad.append(1.0)
+    node._on_excitation(broken)
+    assert len(node.published) == 1
+    message, records = messages(7)
+    node._on_excitation(message)
+    for record in records:
+        node._on_record(record)
+    assert 7 in finals(node)
