@@ -72,5 +72,5 @@ def _draw_case(axes: Axes, distortion: Distortion) -> None:
             axes.plot(
                 lines.frequency_hz, decibel(lines.noise_power), color="0.6", label="noise", **style
             )
-    axes.legend(fontsize="small", markerscale=4, loc="upper right")
+    axes.legend(fontsize="small", markerscale=4, loc="center left")
     axes.grid(alpha=0.3)
