@@ -58,7 +58,9 @@ def run(options: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes as Ctrl-C does
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # both end the nodes in order, even where a shell made this process ignore Ctrl-C
+        signal.signal(number, signal.default_int_handler)
     print(
         f"{len(places)} points on {scene.name}, simulated. To listen: "
         f"ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
