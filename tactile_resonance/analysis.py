@@ -191,9 +191,9 @@ def analysis_as_json(analysis: Analysis) -> str:
     content = {
         "frf": {
             "frequency_hz": frf.frequency_hz.tolist(),
-            "real": frf.g.real.tolist(),
-            "imag": frf.g.imag.tolist(),
-            "variance": _list(frf.variance),
+            "real": _numbers(frf.g.real),
+            "imag": _numbers(frf.g.imag),
+            "variance": None if frf.variance is None else _numbers(frf.variance),
         },
         "poles": [
             {
@@ -245,7 +245,15 @@ def _distortion(distortion: Distortion | None) -> dict | None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all."""
+    """Write a file that is there whole or not at all.
+
+    Raises
+    ------
+    ValueError
+        If something other than a regular file stands there: a device would be replaced.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError(f"output: {path} is no regular file, expected a new one or one to replace")
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
@@ -259,6 +267,11 @@ def write_whole(path: Path, content: bytes) -> None:
 
 def _list(array: npt.NDArray[np.floating] | None) -> list | None:
     return None if array is None or not np.all(np.isfinite(array)) else array.tolist()
+
+
+def _numbers(values: npt.NDArray[np.floating]) -> list[float | None]:
+    """Elements; null where there is no number."""
+    return [_number(value) for value in values]
 
 
 def _number(value: float) -> float | None:

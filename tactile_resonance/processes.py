@@ -87,8 +87,11 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
     Ports follow the DDS interoperability wire protocol (OMG DDSI-RTPS 2.2, section 9.6.1.1): unicast
     discovery of participant 0 listens on 7400 + 250 domain + 10.
     """
-    if environment.get("ROS_DOMAIN_ID"):
-        return int(environment["ROS_DOMAIN_ID"])
+    given = environment.get("ROS_DOMAIN_ID", "")
+    if given:
+        if not (given.isascii() and given.isdigit() and int(given) <= 232):
+            raise ValueError(f"ROS_DOMAIN_ID: {given!r}, expected a number from 0 to 232")
+        return int(given)
     first = os.getpid() % 100
     for step in range(100):
         domain = 1 + (first + step) % 100  # 1..100: portable, below the ephemeral ports

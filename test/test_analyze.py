@@ -2,6 +2,7 @@
 """The analyze command as a user meets it: a process, its streams, its files."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -143,7 +144,9 @@ def test_silverbox_as_the_issue_of_a_user(shared_data, tmp_path):
     assert abs(pole["damping_ratio"] - 0.04877) < 3 * 0.00016
 
 
-@pytest.mark.parametrize("options", [(), ("--method", "frf"), ("--frf", "average", "--method", "frf")])
+@pytest.mark.parametrize(
+    "options", [(), ("--method", "frf"), ("--frf", "average", "--method", "frf")]
+)
 @pytest.mark.parametrize("domain", ["s", "z"])
 def test_every_method_agrees_with_the_truth(options, domain, tmp_path, capsys):
     """A record from rest: the transient is in it."""
@@ -194,3 +197,55 @@ def test_a_known_channel_delay_is_taken_out(tmp_path, capsys):
     assert abs(error()) > 10
     assert cli.main([*arguments, "--method", "joint", "--channel-delay", "1e-6"]) == 1
     assert "joint takes no channel delay" in capsys.readouterr().err
+
+
+def test_outputs_never_replace_what_they_must_not(good, tmp_path, capsys):
+    before = good.read_bytes()
+    fifo = tmp_path / "device"
+    os.mkfifo(fifo)
+    for options, message in (
+        (["--json", good], "is the record itself"),
+        (["--json", fifo], "no regular file"),
+        (["--json", tmp_path], "no regular file"),
+        (["--json", tmp_path / "a.png", "--plot", tmp_path / "a.png"], "expected two files"),
+    ):
+        assert cli.main(["analyze", str(good), *map(str, options)]) == 1
+        printed = capsys.readouterr()
+        assert message in printed.err
+        assert printed.out == ""
+    assert good.read_bytes() == before
+    assert fifo.is_fifo()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["device", "good.npz"]
+
+
+def test_lines_without_input_are_null(tmp_path, capsys):
+    content = record(noise=1e-3)
+    content["excited_harmonics"] = np.arange(20, 160)  # 40..160 are excited, at 2.5 Hz
+    spectrum = np.fft.rfft(content["u"].reshape(6, N), axis=-1)
+    spectrum[:, :40] = 0
+    content["u"] = np.fft.irfft(spectrum, N).ravel()
+    content["u"] -= content["u"].mean()
+    path, out = tmp_path / "a.npz", tmp_path / "out.json"
+    np.savez(path, **content)
+    assert cli.main(["analyze", str(path), "--band", "200", "300", "--json", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "lines" in printed.out
+    assert json.loads(out.read_text())["frf"]["frequency_hz"][0] == 50.0
+
+
+@pytest.mark.parametrize("method", ["joint", "frf"])
+@pytest.mark.parametrize("through", [0.0, 1.0], ids=["noise alone", "a flat system"])
+def test_noise_is_not_taken_for_a_resonance(tmp_path, capsys, method, through):
+    """Of ten records without any resonance none gives a pole (one in 10 000 is allowed to)."""
+    path, out = tmp_path / "a.npz", tmp_path / "out.json"
+    for seed in range(10):
+        content = record(periods=6, seed=seed)
+        noise = 0.1 * np.random.default_rng(100 + seed).standard_normal(6 * N)
+        content["y"] = through * content["u"] + noise
+        np.savez(path, **content)
+        arguments = ["analyze", str(path), "--band", "200", "300", "--method", method]
+        assert cli.main([*arguments, "--json", str(out)]) == 0
+        found = json.loads(out.read_text())
+        assert found["status"] in ("no resonance", "not converged"), (seed, found["poles"])
+        assert all(pole["covariance"] is None for pole in found["poles"])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,9 +118,16 @@ def parse_segments(text: str) -> list[tuple[int, int]]:
 def run(options: argparse.Namespace) -> int:
     """Read, analyse, then write: nothing is written unless all went well."""
     _check_outputs(options)
+    if options.periods is not None and options.periods < 1:
+        raise ValueError(f"periods: {options.periods}, expected at least 1")
     if options.record.is_dir():
+        for name in ("sample_rate", "samples_per_period", "segments"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"{name}: not for a folder of records, which say it themselves")
         recording = read_store_recording(options.record, options.measurement, options.periods)
     else:
+        if options.measurement is not None:
+            raise ValueError("measurement: only for a folder of records")
         recording = read_recording(
             options.record,
             u=options.u,
@@ -152,20 +160,26 @@ def run(options: argparse.Namespace) -> int:
         with_distortion=options.distortion,
         channel_delay_s=options.channel_delay,
     )
-    print(as_text(analysis))
+    outputs: dict[Path, bytes] = {}
     if options.json:
-        write_whole(options.json, analysis_as_json(analysis).encode())
+        outputs[options.json] = analysis_as_json(analysis).encode()
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
         from tactile_resonance.report.analysis_figure import draw_analysis
-        from tactile_resonance.report.drawing import save_figure
+        from tactile_resonance.report.drawing import figure_bytes
 
-        save_figure(draw_analysis(analysis, options.record.name), options.plot)
+        figure = draw_analysis(analysis, options.record.name)
+        outputs[options.plot] = figure_bytes(figure, options.plot.suffix)
         if analysis.distortion is not None:
             from tactile_resonance.report.distortion_figure import draw_distortion
 
             figure = draw_distortion({options.record.name: analysis.distortion}, "Distortion")
-            save_figure(figure, options.plot.with_stem(f"{options.plot.stem}_distortion"))
+            path = options.plot.with_stem(f"{options.plot.stem}_distortion")
+            outputs[path] = figure_bytes(figure, path.suffix)
+    # all is made before anything is written
+    for path, content in outputs.items():
+        write_whole(path, content)
+    print(as_text(analysis))
     return 0
 
 
@@ -203,8 +217,18 @@ def _check_outputs(options: argparse.Namespace) -> None:
     """Refuse an impossible output before any work is done."""
     for name in ("json", "plot"):
         path = getattr(options, name)
-        if path is not None and not path.parent.is_dir():
-            raise ValueError(f"{name}: {path}, expected a file in a folder that exists")
+        if path is None:
+            continue
+        if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+            raise ValueError(f"{name}: {path}, expected a file in a folder that can be written")
+        if path.exists() and not path.is_file():
+            raise ValueError(
+                f"{name}: {path} is no regular file, expected a new one or one to replace"
+            )
+        if path.exists() and options.record.exists() and path.samefile(options.record):
+            raise ValueError(f"{name}: {path} is the record itself, expected another file")
+    if options.json is not None and options.json == options.plot:
+        raise ValueError(f"json, plot: both {options.json}, expected two files")
     accepted = (".png", ".pdf", ".svg")
     if options.plot is not None and options.plot.suffix.lower() not in accepted:
         raise ValueError(f"plot: {options.plot}, accepted are {', '.join(accepted)}")

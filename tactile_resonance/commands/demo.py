@@ -98,6 +98,10 @@ def _check(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and value < least:
             raise ValueError(f"{name}: {value}, expected at least {least}")
+    if not 0 < options.level <= 4:
+        raise ValueError(f"level: {options.level:g}, the simulated sensor bears up to 4 V rms")
+    if options.seed > 2**62:
+        raise ValueError(f"seed: {options.seed}, expected at most 2^62")
 
 
 def _places(scene: PhantomScene, most: int | None) -> list[tuple[str, int, tuple[float, float, float]]]:

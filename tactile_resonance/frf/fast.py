@@ -44,7 +44,7 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     status, message = response_status(spectra.spectra, spectra.covariance)
     return FRF(
         frequency_hz=spectra.frequency_hz(sample_rate_hz),
-        g=spectra.spectra[..., 0, :] / spectra.spectra[..., 1, :],
+        g=response(spectra.spectra),
         variance_noise=variance,
         noise_dof=spectra.noise_dof,
         spectra=spectra.spectra,
@@ -54,6 +54,12 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         status=status,
         message=message,
     )
+
+
+def response(spectra: ComplexArray) -> ComplexArray:
+    """(..., F) Y/U of mean spectra (..., 2, F); NaN where there is no input."""
+    u = spectra[..., 1, :]
+    return spectra[..., 0, :] / np.where(u == 0, np.nan, u)
 
 
 def response_status(
@@ -71,6 +77,9 @@ def response_status(
     if covariance is None:
         return FrfStatus.NO_COVARIANCE, "one period of one realisation: no covariance"
     power = np.abs(spectra[..., 1, :]) ** 2  # (..., F)
+    silent = int(np.count_nonzero(power == 0))
+    if silent:
+        return FrfStatus.SUSPECT, f"no input at {silent} of {power.size} lines: no response there"
     weak = power < 10 ** (WEAK_INPUT_DB / 10) * covariance[..., 1, 1, :].real
     if np.any(weak):
         return (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_resonance.frf.fast import response_status
+from tactile_resonance.frf.fast import response, response_status
 from tactile_resonance.frf.result import FRF, ComplexArray, FloatArray, FrfStatus
 from tactile_resonance.frf.spectra import PeriodicSpectra, ratio_variance
 
@@ -84,7 +84,7 @@ def robust_frf(
     realisations = each.shape[-3]
     if reference is not None:
         return _with_reference(spectra, sample_rate_hz, np.asarray(reference))
-    g_each = each[..., 0, :] / each[..., 1, :]  # (..., M, F)
+    g_each = response(each)  # (..., M, F)
     g = g_each.mean(axis=-2)
     variance_total = np.var(g_each, axis=-2, ddof=1) / realisations
     variance_noise = None
@@ -162,6 +162,6 @@ def _robust_status(each: ComplexArray, covariance: ComplexArray | None) -> tuple
         return (
             FrfStatus.OK,
             "one period per realisation: noise cannot be told from distortion, the variance over "
-            "realisations holds both",
+            "realisations holds both, and a transient would not show",
         )
     return response_status(each, covariance)

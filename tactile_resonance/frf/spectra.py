@@ -214,7 +214,7 @@ def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
         (Pintelon &
         Schoukens 2012, chapter 2).
     """
-    u = mean[..., 1, :]
+    u = np.where(mean[..., 1, :] == 0, np.nan, mean[..., 1, :])
     g = mean[..., 0, :] / u
     return (
         covariance[..., 0, 0, :].real

@@ -26,6 +26,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 # A cost that noise alone exceeds once in a thousand fits counts as model error.
 MODEL_ERROR_PROBABILITY = 1e-3
+# A mode that noise makes is taken for one this often.
+NOISE_PASSES_FOR_A_MODE = 1e-4
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
 
@@ -265,6 +267,19 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
                 model.zero_sensitivity(zeros), coefficients[n : n + m, n : n + m]
             )
 
+    found = poles
+    if known and residue is not None:
+        real = _significant(batch.residues[index][there], residue, int(batch.lines[index]))
+        there[there] = real
+        poles, residue = poles[real], residue[real]
+        if not real.any():
+            status, residue = PolesStatus.NO_RESONANCE, None
+            notes = [
+                f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
+                "noise makes"
+                for pole in found
+            ] + list(notes)
+
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
         return values if values.size and np.isfinite(values).all() else None
@@ -294,6 +309,25 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         status=status,
         message=message,
     )
+
+
+def _significant(residues: ComplexArray, covariance: FloatArray, lines: int) -> npt.NDArray[np.bool_]:
+    """(n,) modes whose residue noise alone would not make.
+
+    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
+    zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
+    (Bonferroni). Where it cannot be computed the mode is kept.
+    """
+    limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / max(lines, 1))
+    kept = np.ones(residues.size, bool)
+    for k, (residue, matrix) in enumerate(zip(residues, covariance, strict=True)):
+        vector = np.array([residue.real, residue.imag])
+        try:
+            distance = vector @ np.linalg.solve(matrix, vector)
+        except np.linalg.LinAlgError:
+            continue
+        kept[k] = not distance < limit
+    return kept
 
 
 def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:

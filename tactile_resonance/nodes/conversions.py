@@ -23,6 +23,7 @@ from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
+from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 
 GRIDS = {
     Grid.CUSTOM: msg.Excitation.GRID_CUSTOM,
@@ -40,6 +41,13 @@ BETWEEN_SAMPLES = {
 }
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 POLES_STATUS = {status: getattr(msg.Poles, f"STATUS_{status.name}") for status in PolesStatus}
+
+COVARIANCE_ARRAYS = ("sensor_variance", "actuator_variance", "covariance_real", "covariance_imag")
+FRF_ARRAYS = (
+    *("real", "imag", "variance_noise", "variance_total"),
+    *("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"),
+    *COVARIANCE_ARRAYS,
+)
 
 E = TypeVar("E", bound=Enum)
 
@@ -121,6 +129,10 @@ def record_to_message(record: Record) -> msg.Record:
 
 def record_from_message(message: msg.Record) -> Record:
     """Record of a message; its samples are views of the message's memory."""
+    if not MIN_RATE_HZ <= message.sample_rate_hz <= MAX_RATE_HZ:
+        raise ValueError(
+            f"sample_rate_hz: {message.sample_rate_hz:g}, expected {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz"
+        )
     channels = []
     for name in ("actuator", "sensor"):
         counts = _view(getattr(message, f"{name}_counts"))
@@ -147,7 +159,7 @@ def record_from_message(message: msg.Record) -> Record:
         between_samples=_key(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
         channel_delay_s=message.channel_delay_s,
         anti_alias_filter=message.anti_alias_filter,
-        origin=_read_origin(message),
+        origin=origin_from_message(message),
     )
 
 
@@ -183,6 +195,15 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
 
 def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
     """FRF of a message, and what it belongs to."""
+    lines = len(message.frequency_hz)
+    for name in FRF_ARRAYS:
+        values = getattr(message, name)
+        if len(values) != lines and (len(values) or name in ("real", "imag")):
+            raise ValueError(f"{name}: {len(values)} values for {lines} lines, expected as many")
+    groups = (("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"), COVARIANCE_ARRAYS)
+    for names in groups:
+        if len({len(getattr(message, name)) for name in names}) > 1:
+            raise ValueError(f"{', '.join(names)}: some empty, expected all or none")
     spectra = covariance = None
     if len(message.sensor_real):
         spectra = np.stack([_complex(message, "sensor_"), _complex(message, "actuator_")])
@@ -209,7 +230,7 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         status=_key(FRF_STATUS, message.status, "status"),
         message=message.message,
     )
-    return frf, _read_origin(message)
+    return frf, origin_from_message(message)
 
 
 def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
@@ -269,7 +290,7 @@ def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
         status=_key(POLES_STATUS, message.status, "status"),
         message=message.message,
     )
-    return poles, _read_origin(message)
+    return poles, origin_from_message(message)
 
 
 def time_message(time_ns: int) -> Time:
@@ -320,7 +341,8 @@ def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> 
     message.contact_force_std_n = float(origin.contact.force_std_n)
 
 
-def _read_origin(message: msg.Record | msg.FRF | msg.Poles) -> Origin:
+def origin_from_message(message: msg.Record | msg.FRF | msg.Poles) -> Origin:
+    """What a record, FRF or poles belong to."""
     return Origin(
         measurement_id=message.measurement_id,
         excitation_id=message.excitation_id,

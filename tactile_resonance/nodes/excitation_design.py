@@ -19,6 +19,8 @@ GRIDS = {
     Measure.Goal.GRID_ODD_RANDOM: Grid.ODD_RANDOM,
 }
 
+MOST_REALISATIONS = 1000  # each is designed, with all its lines, before the first is played
+
 PARAMETERS = (
     Parameter("sample_rate_hz", 50e3, "Sample rate of both channels [Hz].", 1.0, 1e7),
     Parameter("samples_per_period", 20000, "Samples of one period.", 4, 10**8),
@@ -40,7 +42,9 @@ PARAMETERS = (
         choices=tuple(grid.value for grid in GRIDS.values()),
     ),
     Parameter("periods", 8, "Periods of each realisation.", 1, 10**6),
-    Parameter("realisations", 1, "Realisations of the phases in each measurement.", 1, 10**6),
+    Parameter(
+        "realisations", 1, "Realisations of the phases in each measurement.", 1, MOST_REALISATIONS
+    ),
     Parameter(
         "seed",
         1,
@@ -85,6 +89,8 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     if goal.grid and goal.grid not in GRIDS:
         raise ValueError(f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter")
     realisations = goal.realisations or realisations
+    if realisations > MOST_REALISATIONS:
+        raise ValueError(f"realisations: {realisations}, accepted is up to {MOST_REALISATIONS}")
     excitations = [
         design_multisine(
             sample_rate_hz=rate,

@@ -15,7 +15,7 @@ from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import devices, excitation_design
 from tactile_resonance.nodes.conversions import (
@@ -51,6 +51,9 @@ class ExcitationNode(Node):
     of its own, so that its blocking calls never hold up the executor.
     """
 
+    # before the node is there: what fails on the way is cleaned up through destroy_node
+    _device: AcquisitionDevice | None = None
+
     def __init__(self) -> None:
         super().__init__("excitation_node")
         declare(self, PARAMETERS)
@@ -77,8 +80,9 @@ class ExcitationNode(Node):
         )
 
     def destroy_node(self) -> None:
-        """Silence the output first."""
-        self._device.close()
+        """Silence the output first, where a device was opened at all."""
+        if self._device is not None:
+            self._device.close()
         super().destroy_node()
 
     def _on_pose(self, message: PoseStamped) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.duration import Duration
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
@@ -49,6 +50,9 @@ PARAMETERS = (
 )
 
 
+ACKNOWLEDGED_WITHIN_S = 5.0
+
+
 class FakeHardwareNode(Node):
     """Serves `bench/play` and `bench/stop`, hands out `bench/block`.
 
@@ -57,10 +61,12 @@ class FakeHardwareNode(Node):
     modes), both with the stamp of the pose they belong to.
     """
 
+    # before the node is there: what fails on the way is cleaned up through destroy_node
+    _playing: threading.Thread | None = None
+    _stop = threading.Event()
+
     def __init__(self) -> None:
         super().__init__("fake_hardware_node")
-        self._playing: threading.Thread | None = None
-        self._stop = threading.Event()
         declare(self, PARAMETERS)
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
@@ -172,6 +178,9 @@ class FakeHardwareNode(Node):
                 return
             first_ns = start_ns + round(block.start_time_s * 1e9)
             self._blocks.publish(record_to_message(self._record(block, excitation, first_ns)))
+            if speed == 0:
+                # no clock holds the bench back: wait until readers have the block
+                self._blocks.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_WITHIN_S))
 
     def _record(self, block: Block, excitation: Excitation, first_ns: int) -> Record:
         return Record(

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.frf.measurement import MeasurementFrf
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.conversions import (
     excitation_from_message,
@@ -58,11 +60,24 @@ class FrfNode(Node):
 
     def _on_record(self, message: msg.Record) -> None:
         try:
-            self._take(record_from_message(message))
+            record = record_from_message(message)
         except ValueError as error:
             self.get_logger().error(f"record of excitation {message.excitation_id}: {error}")
+            return
+        self._take(record)
 
     def _take(self, record: Record) -> None:
+        """Publish an FRF, or why there is none: a reader waits for an answer to every record."""
+        try:
+            self._estimate(record)
+        except ValueError as error:
+            self.get_logger().error(f"record of excitation {record.origin.excitation_id}: {error}")
+            nothing = FRF(
+                np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=str(error)
+            )
+            self._publisher.publish(frf_to_message(nothing, record.origin, float("nan"), False))
+
+    def _estimate(self, record: Record) -> None:
         excitation = self._excitations.get(record.origin.excitation_id)
         if excitation is None:
             self._waiting.append(record)

@@ -10,7 +10,11 @@ from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.nodes.conversions import frf_from_message, poles_to_message
+from tactile_resonance.nodes.conversions import (
+    frf_from_message,
+    origin_from_message,
+    poles_to_message,
+)
 from tactile_resonance.nodes.parameters import Parameter, declare, values
 from tactile_resonance.nodes.running import RESULTS, run_node
 
@@ -39,21 +43,23 @@ class PolesNode(Node):
         self.create_subscription(msg.FRF, "frf", self._on_frf, RESULTS)
 
     def _on_frf(self, message: msg.FRF) -> None:
-        frf, origin = frf_from_message(message)
-        self._publisher.publish(poles_to_message(self._identify(frf), origin))
+        origin = origin_from_message(message)
+        try:
+            frf, _ = frf_from_message(message)
+            poles = self._identify(frf)
+        except ValueError as error:
+            self.get_logger().error(f"FRF of measurement {origin.measurement_id}: {error}")
+            poles = Poles(status=PolesStatus.FAILED, message=str(error))
+        self._publisher.publish(poles_to_message(poles, origin))
 
     def _identify(self, frf: FRF) -> Poles:
         """Poles, or the reason why there are none: a reader waits for an answer to every FRF."""
         low_hz, high_hz, order, terms = values(
             self, "band_low_hz", "band_high_hz", "order", "residual_terms"
         )
-        if frf.status is FrfStatus.FAILED:
+        if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
             return Poles(status=PolesStatus.FAILED, message=frf.message)
-        try:
-            structure = ModelStructure.with_residual(order, terms)
-            return identify_poles(frf, (low_hz, high_hz), structure)
-        except ValueError as error:
-            return Poles(status=PolesStatus.FAILED, message=str(error))
+        return identify_poles(frf, (low_hz, high_hz), ModelStructure.with_residual(order, terms))
 
 
 def main() -> None:

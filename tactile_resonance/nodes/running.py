@@ -7,11 +7,20 @@ import sys
 from collections.abc import Callable
 
 import rclpy
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    NameValidationException,
+    ParameterException,
+)
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from tactile_resonance.drivers.acquisition import DeviceError
+
+RCLError = rclpy_implementation.RCLError
 
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
 RESULTS = QoSProfile(
@@ -48,6 +57,10 @@ def run_node(make: Callable[[], Node]) -> None:
                 node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (ValueError, OSError, DeviceError) as error:
+    except (
+        *(ValueError, OSError, DeviceError, ParameterException),
+        *(InvalidParameterValueException, InvalidParameterTypeException, NameValidationException),
+        RCLError,
+    ) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

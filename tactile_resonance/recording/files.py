@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -90,7 +89,7 @@ def _read_npz(path: Path) -> Mapping[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError, AttributeError) as error:
+    except Exception as error:
         raise ValueError(f"{path.name}: no .npz record ({_first_line(error)})") from error
 
 
@@ -108,11 +107,16 @@ def _read_mat(path: Path) -> Mapping[str, np.ndarray]:
 
 def _read_csv(path: Path) -> Mapping[str, np.ndarray]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             dialect = csv.Sniffer().sniff(file.readline(), delimiters=",;\t")
             file.seek(0)
             names = [name.strip() for name in next(csv.reader(file, dialect))]
-            columns = np.loadtxt(file, delimiter=dialect.delimiter, ndmin=2)
+            rows = [line for line in file if line.strip()]
+        if not rows:
+            raise ValueError("no numbers under the header")
+        if len(set(names)) < len(names):
+            raise ValueError(f"columns named alike: {', '.join(names)}")
+        columns = np.loadtxt(rows, delimiter=dialect.delimiter, ndmin=2)
     except (csv.Error, ValueError, StopIteration, UnicodeDecodeError) as error:
         raise ValueError(
             f"{path.name}: no .csv record ({_first_line(error)}); expected a header line with the names "

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 1e12
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -71,8 +73,11 @@ def make_recording(
     ValueError
         Names the field, its value, and what is accepted.
     """
-    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
-        raise ValueError(f"sample_rate_hz: {sample_rate_hz:g}, expected a positive frequency")
+    if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ:
+        raise ValueError(
+            f"sample_rate_hz: {sample_rate_hz:g}, expected a positive frequency, {MIN_RATE_HZ:g} to "
+            f"{MAX_RATE_HZ:g} Hz"
+        )
     channels = [_as_samples(x, name) for x, name in ((u, u_name), (y, y_name))]
     if channels[0].shape != channels[1].shape:
         raise ValueError(

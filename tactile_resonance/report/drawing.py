@@ -25,11 +25,16 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write the figure, whole or not at all; the suffix decides the format."""
+def figure_bytes(figure: Figure, suffix: str) -> bytes:
+    """Content of the file; the suffix decides the format."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lstrip(".") or "png", dpi=150)
-    write_whole(path, buffer.getvalue())
+    figure.savefig(buffer, format=suffix.lstrip(".").lower() or "png", dpi=150)
+    return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write the figure, whole or not at all."""
+    write_whole(path, figure_bytes(figure, path.suffix))
 
 
 def decibel(power: npt.ArrayLike) -> npt.NDArray[np.float64]:

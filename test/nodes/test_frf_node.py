@@ -110,9 +110,31 @@ def test_what_does_not_fit_is_refused_and_the_next_is_taken(node):
     broken = excitation_to_message(excitation(6), 0, "tip")
     broken.phase_rad.append(1.0)
     node._on_excitation(broken)
-    assert len(node.published) == 1
+    assert [m.status for m in node.published] == [1, 3]  # no covariance yet; failed
+    assert "200 and 201 samples" in node.published[1].message
     message, records = messages(7)
     node._on_excitation(message)
     for record in records:
         node._on_record(record)
     assert 7 in finals(node)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, float("nan"), 1e-15])
+def test_a_record_without_a_sample_rate_does_no_harm(node, rate_hz):
+    message, records = messages(8)
+    records[0].sample_rate_hz = rate_hz
+    node._on_excitation(message)
+    node._on_record(records[0])
+    assert node.published == []
+    records[0].sample_rate_hz = RATE_HZ
+    for record in records:
+        node._on_record(record)
+    assert 8 in finals(node)
+
+
+def test_a_record_that_does_not_fit_may_come_before_its_excitation(node):
+    message, records = messages(9)
+    records[0].sensor_v.append(0.0)
+    node._on_record(records[0])
+    node._on_excitation(message)
+    assert [m.status for m in node.published] == [3]

@@ -90,6 +90,8 @@ def test_compressed_phases_for_one_realisation_only(ros):
         (compressed,) = excitation_design.design(node, goal, 0)
         assert not compressed.random_phases
         assert compressed.crest_factor() < 2.2
+        with pytest.raises(ValueError, match="realisations: 1000000, accepted is up to 1000"):
+            excitation_design.design(node, Measure.Goal(realisations=10**6), 0)
         with pytest.raises(ValueError, match="compressed phases are not random"):
             excitation_design.design(node, Measure.Goal(realisations=2), 0)
     finally:
