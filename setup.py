@@ -30,8 +30,15 @@ def shared(folder):
     return list(grouped.items())
 
 
+OPTIONS = {}
+if not BUILT_FOR_ROS:
+    # metadata in the source tree would hide that of the ROS installation from its executables
+    (HERE / "build").mkdir(exist_ok=True)
+    OPTIONS = {"egg_info": {"egg_base": "build"}}
+
 setup(
     name=NAME,
+    options=OPTIONS,
     version=manifest.findtext("version"),
     description=" ".join(manifest.findtext("description").split()),
     license="Apache-2.0",

@@ -141,10 +141,12 @@ def analyse(
         )
     if poles.status is PolesStatus.TOO_FEW_LINES:
         raise ValueError(f"band: {poles.message}")
-    if frf.message and frf.message not in poles.message:
+    if frf.message:
         warnings.append(f"frf: {frf.message}")
-    if poles.message:
-        warnings.append(f"poles: {poles.message}")
+    # the poles repeat what the FRF has to say
+    of_the_poles = poles.message.replace(frf.message, "") if frf.message else poles.message
+    if of_the_poles.strip("; "):
+        warnings.append(f"poles: {of_the_poles.strip('; ')}")
     return Analysis(
         frf,
         poles,

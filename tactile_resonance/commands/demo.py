@@ -104,7 +104,9 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"seed: {options.seed}, expected at most 2^62")
 
 
-def _places(scene: PhantomScene, most: int | None) -> list[tuple[str, int, tuple[float, float, float]]]:
+def _places(
+    scene: PhantomScene, most: int | None
+) -> list[tuple[str, int, tuple[float, float, float]]]:
     """(phantom, index in it, position) of every point to measure."""
     counts: dict[str, int] = {}
     places = []
@@ -132,7 +134,11 @@ def _measure(nodes: NodeProcesses, places: list, options: argparse.Namespace) ->
         session.wait_for_nodes(START_TIMEOUT_S)
         session.warm_up(places[0][2])
         with tqdm(
-            total=len(places) * options.periods, unit="block", file=sys.stderr, leave=False
+            total=len(places) * options.periods,
+            unit="block",
+            file=sys.stderr,
+            leave=False,
+            disable=None,
         ) as bar:
             for number, (phantom, index, position) in enumerate(places):
                 bar.set_description(f"{phantom}, point {index + 1}")

@@ -9,7 +9,7 @@ from tactile_resonance.frf.result import FRF
 
 # Half width of the band in units of the resonance's own half width: wide enough to see the mode die
 # out.
-HALF_WIDTHS = 10.0
+HALF_WIDTHS = 5.0
 FEWEST_LINES_EACH_SIDE = 20
 
 

@@ -280,6 +280,14 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
                 for pole in found
             ] + list(notes)
 
+    if status is PolesStatus.OK and poles.size and not known:
+        status = PolesStatus.NO_COVARIANCE
+        notes = [
+            "the variance of each line has too few degrees of freedom to tell the uncertainty: "
+            "record more periods or realisations",
+            *notes,
+        ]
+
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
         return values if values.size and np.isfinite(values).all() else None
