@@ -129,6 +129,24 @@ def test_unknown_options_are_told_in_one_line(capsys):
         assert printed.startswith("tactile_resonance: ")
 
 
+def test_distortion_of_the_silverbox(shared_data, tmp_path, capsys):
+    """Even-line output about -48 dB (reference page of the data), in text, JSON and figure."""
+    ends = [48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196]
+    out, plot = tmp_path / "out.json", tmp_path / "out.png"
+    arguments = [
+        *("analyze", shared_data / "silverbox" / "SNLS80mV.mat", "--u", "V1", "--y", "V2"),
+        *("--sample-rate", 610.3515625, "--samples-per-period", 8192, "--band", 40, 110),
+        *("--segments", ",".join(f"{end - 8192}:{end}" for end in ends), "--distortion"),
+        *("--json", out, "--plot", plot),
+    ]
+    assert cli.main([str(argument) for argument in arguments]) == 0
+    assert "Even lines: output -48." in capsys.readouterr().out
+    even = json.loads(out.read_text())["distortion"]["even"]
+    assert even["rms_output_level_db"] == pytest.approx(-48, abs=1)
+    assert len(even["level_db"]) == len(even["frequency_hz"]) > 1000
+    assert (tmp_path / "out_distortion.png").read_bytes()[:4] == b"\x89PNG"
+
+
 def test_silverbox_as_the_issue_of_a_user(shared_data, tmp_path):
     """Reference: f0 69.536 +- 0.012 Hz, damping ratio 0.04877 +- 0.00016."""
     ends = [48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196]

@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+from tactile_resonance import cli
+
+
+def test_variance_figure_is_drawn_and_marked_as_simulated(tmp_path, capsys):
+    assert cli.main(["figures", "variance", "--output", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    for source in ("period", "repetition", "position", "preparation"):
+        assert f"over {source}: -" in printed
+    assert (tmp_path / "variance.png").stat().st_size > 20_000
