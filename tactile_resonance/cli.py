@@ -9,14 +9,6 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-# One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they give.
-# Before numpy is imported, which reads it once.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-from tactile_resonance.commands import analyze, benchmark, demo, figures
-
-
 class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong in one line, as all other errors are said."""
 
@@ -27,15 +19,8 @@ class OneLineParser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
-    parser = OneLineParser(
-        prog="tactile_resonance",
-        description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
-    )
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze, figures, benchmark):
-        command.add_parser(commands)
-    parsed = parser.parse_args(arguments)
     try:
+        parsed = _parser().parse_args(arguments)
         return parsed.run(parsed)
     except (ValueError, OSError) as error:
         print(f"tactile_resonance: {_one_line(error)}", file=sys.stderr)
@@ -43,6 +28,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("tactile_resonance: interrupted", file=sys.stderr)
         return 130
+
+
+def _parser() -> OneLineParser:
+    """Parser of all commands; loads them here, so that an interrupt meanwhile ends in order."""
+    # One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they
+    # give. Before numpy is imported, which reads it once.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from tactile_resonance.commands import analyze, benchmark, demo, figures
+
+    parser = OneLineParser(
+        prog="tactile_resonance",
+        description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for command in (demo, analyze, figures, benchmark):
+        command.add_parser(commands)
+    return parser
 
 
 def _one_line(error: BaseException) -> str:
