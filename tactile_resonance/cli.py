@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+
 class OneLineParser(argparse.ArgumentParser):
     """Says what is wrong in one line, as all other errors are said."""
 
