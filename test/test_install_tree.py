@@ -35,6 +35,21 @@ def test_index_executables_config_and_launch(prefix):
         assert os.access(executable, os.X_OK), name
 
 
+def wait_for_node(name, timeout_s=40):
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    watcher = rclpy.create_node("watcher", context=context)
+    try:
+        deadline = time.monotonic() + timeout_s
+        while name not in watcher.get_node_names() and time.monotonic() < deadline:
+            time.sleep(0.1)
+    finally:
+        watcher.destroy_node()
+        rclpy.shutdown(context=context)
+
+
 def test_an_executable_runs_and_ends_on_interrupt(prefix, tmp_path, monkeypatch):
     from tactile_resonance.processes import free_domain_id
 
@@ -47,7 +62,7 @@ def test_an_executable_runs_and_ends_on_interrupt(prefix, tmp_path, monkeypatch)
         text=True,
         cwd=tmp_path,
     )
-    time.sleep(4)
+    wait_for_node("poles_node")
     assert node.poll() is None, node.communicate()[0]
     node.send_signal(signal.SIGINT)
     output, _ = node.communicate(timeout=10)

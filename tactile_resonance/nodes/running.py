@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 
@@ -47,7 +48,11 @@ STREAM = QoSProfile(
 
 
 def run_node(make: Callable[[], Node]) -> None:
-    """Spin one node until it is interrupted or ROS shuts down."""
+    """Spin one node until it is interrupted or ROS shuts down.
+
+    An interrupt ends it even where a shell started it in the background, interrupts ignored.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with rclpy.init():
             node = make()
