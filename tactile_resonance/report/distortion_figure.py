@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tactile_resonance.frf.detection import DetectionLines
 from tactile_resonance.frf.distortion import Distortion
 from tactile_resonance.report.drawing import decibel, new_figure
 
@@ -65,12 +66,22 @@ def _draw_case(axes: Axes, distortion: Distortion) -> None:
             lines.frequency_hz,
             decibel(lines.power),
             color=colour,
-            label=f"{name} distortion, {float(np.max(lines.rms_level_db)):.1f} dB",
+            label=_label(name, lines),
             **style,
         )
         if lines.noise_power is not None and name == "even":
             axes.plot(
                 lines.frequency_hz, decibel(lines.noise_power), color="0.6", label="noise", **style
             )
-    axes.legend(fontsize="small", markerscale=4, loc="center left")
+    axes.legend(fontsize="small", markerscale=4, loc="lower left")
     axes.grid(alpha=0.3)
+
+
+def _label(name: str, lines: DetectionLines) -> str:
+    """Level of a parity, and whether it is more than noise: noise must not pass for distortion."""
+    level = f"{float(np.max(lines.rms_level_db)):.1f} dB"
+    if lines.above_noise is None:
+        return f"{name} lines, {level}, noise unknown"
+    if not np.any(lines.above_noise):
+        return f"{name} lines, {level}, no more than noise"
+    return f"{name} distortion, {level}"
