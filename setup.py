@@ -56,7 +56,12 @@ setup(
         "tqdm>=4.60,<5",
     ],
     # what drives hardware is installed by those who have it
-    extras_require={"nidaqmx": ["nidaqmx>=1.0,<2"]},
+    extras_require={
+        "nidaqmx": ["nidaqmx>=1.0,<2"],
+        "robot": ["ur-rtde>=1.6.5,<1.7"],
+        "can": ["python-can>=4.5,<5"],
+        "recording": ["rosbags>=0.11.1,<0.12"],
+    },
     entry_points={
         "console_scripts": [
             f"{NAME} = {NAME}.cli:main",
