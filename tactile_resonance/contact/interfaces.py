@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two devices that contact control needs: an arm and a force source.
+
+`drivers/` keeps these contracts on real protocols and on the wall clock, `simulation/` in lockstep
+virtual time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+
+
+class Mount(str, Enum):
+    """Where the force sensor sits."""
+
+    TOOL = "tool"
+    TABLE = "table"
+
+
+class ForceFault(str, Enum):
+    """Why a force source cannot be relied on."""
+
+    SILENT = "silent"
+    STUCK = "stuck"
+    INVALID = "invalid"  # a value that is no number or outside of the sensor's range
+    OVERLOAD = "overload"
+    INCOMPLETE = "incomplete"  # frames of a wrench lost more often than tolerated
+    LINK_LOST = "link_lost"
+    REFUSED = "refused"  # the sensor answers a command with an error
+
+
+class ArmFault(str, Enum):
+    """Why an arm cannot be relied on."""
+
+    LINK_LOST = "link_lost"
+    STALE = "stale"  # the robot's time stamp is too old
+    PROTECTIVE_STOP = "protective_stop"
+    EMERGENCY_STOP = "emergency_stop"
+    PROGRAM_STOPPED = "program_stopped"
+    NOT_REMOTE = "not_remote"
+    REGISTERS_IN_USE = "registers_in_use"
+    PROGRAM_NOT_STARTED = "program_not_started"
+    COMMAND_REFUSED = "command_refused"
+    CLIENT_DIED = "client_died"
+
+
+class ForceError(Exception):
+    """A force source failed.
+
+    Attributes
+    ----------
+    fault : ForceFault
+    """
+
+    def __init__(self, fault: ForceFault, message: str) -> None:
+        super().__init__(f"force: {message}")
+        self.fault = fault
+
+
+class ArmError(Exception):
+    """An arm failed.
+
+    Attributes
+    ----------
+    fault : ArmFault
+    """
+
+    def __init__(self, fault: ArmFault, message: str) -> None:
+        super().__init__(f"arm: {message}")
+        self.fault = fault
+
+
+@dataclass(frozen=True)
+class ForceInfo:
+    """What a force source can do; figures of one axis of force.
+
+    Attributes
+    ----------
+    name : str
+    rate_hz : float
+    noise_rms_n, resolution_n, range_n : float
+        Noise of one sample, smallest step, largest force [N].
+    mount : Mount
+    clock_uncertainty_s : float
+        Standard deviation of `WrenchSample.time_ns` against this machine's clock [s].
+    """
+
+    name: str
+    rate_hz: float
+    noise_rms_n: float
+    resolution_n: float
+    range_n: float
+    mount: Mount
+    clock_uncertainty_s: float = 0.0
+
+
+class ForceSource(Protocol):
+    """A stream of wrenches at the tip."""
+
+    @property
+    def info(self) -> ForceInfo:
+        """What it can do."""
+        ...
+
+    def start(self) -> None:
+        """Connect and stream. Raises `ForceError`."""
+        ...
+
+    def read(self) -> list[WrenchSample]:
+        """Wrenches since the last call, oldest first, without waiting.
+
+        Empty where none came; raises `ForceError` where the source is found faulty. After the fault
+        has ended a call to `start` brings it back.
+        """
+        ...
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+        ...
+
+
+class Arm(Protocol):
+    """A six-axis arm that carries the tip. Poses and twists are in the robot's base."""
+
+    def connect(self) -> None:
+        """Connect and be ready to move; also after a fault has ended. Raises `ArmError`."""
+        ...
+
+    def state(self) -> ArmSample:
+        """Newest state, without waiting. Raises `ArmError` where the link is dead or the state old."""
+        ...
+
+    def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
+        """Move the tip with a twist (6,) [m/s, rad/s] until the next command, without waiting."""
+        ...
+
+    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Begin a straight move of the tip to a pose, without waiting for its end."""
+        ...
+
+    def moving(self) -> bool:
+        """Whether the last `move` is still under way."""
+        ...
+
+    def stop(self, deceleration_m_s2: float) -> None:
+        """Stop; works at any time and raises only where the link is dead."""
+        ...
+
+    def close(self) -> None:
+        """Stop and disconnect; never raises."""
+        ...

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What force sensors and robots report: time-stamped wrenches and robot states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose as Universal Robots write it.
+
+    Attributes
+    ----------
+    position_m : (3,) array
+    rotation_rad : (3,) array
+        Rotation vector: axis times angle [rad].
+    """
+
+    position_m: NDArray[np.float64]
+    rotation_rad: NDArray[np.float64]
+
+    @classmethod
+    def from_vector(cls, vector: NDArray[np.float64]) -> Pose:
+        """Take the six numbers of a UR pose, position [m] and rotation vector [rad]."""
+        return cls(np.array(vector[:3], dtype=float), np.array(vector[3:], dtype=float))
+
+    @property
+    def vector(self) -> NDArray[np.float64]:
+        """The six numbers of a UR pose, shape (6,)."""
+        return np.concatenate([self.position_m, self.rotation_rad])
+
+    @property
+    def rotation(self) -> Rotation:
+        """Rotation from this frame into the one that the pose is given in."""
+        return Rotation.from_rotvec(self.rotation_rad)
+
+
+@dataclass(frozen=True)
+class WrenchSample:
+    """One wrench.
+
+    Attributes
+    ----------
+    time_ns : int
+        When it was measured, on this machine's clock (``time.time_ns``; virtual time counts from 0).
+    force_n, torque_nm : (3,) arrays
+        What the environment exerts on the tip [N], [N m], in the frame `tip`: pressing on tissue gives
+        a positive z force.
+    overload : bool
+        A channel of the sensor is beyond its range: the figures are not to be used.
+    """
+
+    time_ns: int
+    force_n: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+    overload: bool = False
+
+
+@dataclass(frozen=True)
+class ArmSample:
+    """State of the robot.
+
+    Attributes
+    ----------
+    time_ns : int
+        When it held, on the clock of `WrenchSample`.
+    robot_time_s : float
+        The controller's own time stamp [s].
+    tip : Pose
+        Frame `tip` in the robot's base.
+    tip_velocity : (6,) array
+        Velocity [m/s] and angular velocity [rad/s] of the tip in the base.
+    moving_allowed : bool
+        Powered, in normal safety mode and its program running.
+    message : str
+        Why it may not move; empty where it may.
+    """
+
+    time_ns: int
+    robot_time_s: float
+    tip: Pose
+    tip_velocity: NDArray[np.float64]
+    moving_allowed: bool = True
+    message: str = ""
