@@ -97,6 +97,8 @@ def test_bins_give_after_every_block_what_the_whole_record_gives(node, monkeypat
     y = np.fft.irfft(np.fft.rfft(u, 4 * u.size) * g)[: u.size]  # from rest
     u, y = (x + 1e-4 * rng.standard_normal(x.size) for x in (u, y))
     frf_node = FrfNode()
+    frf_node.trigger_configure()
+    frf_node.trigger_activate()
     sent = []
     monkeypatch.setattr(frf_node._publisher, "publish", sent.append)
     frf_node._on_excitation(excitation_to_message(excitation, 0, "tip"))
