@@ -87,9 +87,7 @@ def analyse(
         If the band holds too few lines for the model, or the method does not fit the record.
     """
     if poles_method not in POLES_METHODS:
-        raise ValueError(
-            f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}"
-        )
+        raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
     structure = structure or ModelStructure()
     warnings = list(recording.notes)
     start = time.perf_counter()
@@ -126,9 +124,7 @@ def analyse(
         )
     if poles_method == "auto":
         poles_method = "joint" if recording.u.shape[0] == 1 and not channel_delay_s else "frf"
-    poles = _poles(
-        recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s
-    )
+    poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:

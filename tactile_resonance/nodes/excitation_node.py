@@ -8,9 +8,8 @@ import time
 from dataclasses import replace
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.node import Node
 from rclpy.task import Future
 
 from tactile_resonance import msg
@@ -23,7 +22,8 @@ from tactile_resonance.nodes.conversions import (
     excitation_to_message,
     record_to_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM, run_node
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.store import RecordStore
@@ -43,7 +43,7 @@ class Cancelled(Exception):
     """The goal was cancelled."""
 
 
-class ExcitationNode(Node):
+class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched) and `record`.
 
     Every record is on disk before it is published. Records carry the tip pose and the force heard
@@ -51,39 +51,38 @@ class ExcitationNode(Node):
     of its own, so that its blocking calls never hold up the executor.
     """
 
-    # before the node is there: what fails on the way is cleaned up through destroy_node
-    _device: AcquisitionDevice | None = None
-
     def __init__(self) -> None:
-        super().__init__("excitation_node")
-        declare(self, PARAMETERS)
+        super().__init__("excitation_node", PARAMETERS)
+        self._last_id = 0
+
+    def configure(self) -> None:
+        """Open the device; the store follows with the first measurement."""
         (self._frame_id,) = values(self, "frame_id")
-        self._excitations = self.create_publisher(msg.Excitation, "excitation", EXCITATIONS)
-        self._records = self.create_publisher(msg.Record, "record", RESULTS)
-        self._device = devices.make_device(self)
+        self._excitations = self.publish_on(msg.Excitation, "excitation", EXCITATIONS)
+        self._records = self.publish_on(msg.Record, "record", RESULTS)
+        self._device: AcquisitionDevice = devices.make_device(self)
+        self.resources.callback(self._device.close)
         self._store: RecordStore | None = None
         self._has_store = False
         self._pose = PoseStamped()
         self._force_n = float("nan")
         self._busy = threading.Lock()
         self._measurements = 0
-        self._last_id = 0
-        self.create_subscription(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.create_subscription(WrenchStamped, "wrench", self._on_wrench, STREAM)
-        self._server = ActionServer(
+        self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        self.listen(WrenchStamped, "wrench", self._on_wrench, STREAM)
+        server = ActionServer(
             self,
             Measure,
             "measure",
             self._on_goal,
+            goal_callback=self._on_request,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT_S,
         )
+        self.resources.callback(server.destroy)
 
-    def destroy_node(self) -> None:
-        """Silence the output first, where a device was opened at all."""
-        if self._device is not None:
-            self._device.close()
-        super().destroy_node()
+    def _on_request(self, _: Measure.Goal) -> GoalResponse:
+        return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._pose = message
@@ -140,7 +139,7 @@ class ExcitationNode(Node):
             self._busy.release()
             result.outcome = Measure.Result.REFUSED
             result.message = _reason(error)
-            self.get_logger().error(f"refused: {result.message}")
+            self.health.error(f"refused: {result.message}")
             return result
         planned = sum(excitation.periods for excitation in excitations)
         try:
@@ -153,7 +152,7 @@ class ExcitationNode(Node):
         except (OSError, DeviceError) as error:
             result.outcome = Measure.Result.FAILED
             result.message = _reason(error)
-            self.get_logger().error(f"failed: {result.message}")
+            self.health.error(f"failed: {result.message}")
         finally:
             self._busy.release()
         return result
@@ -215,6 +214,8 @@ class ExcitationNode(Node):
                 )
                 if goal.is_cancel_requested:
                     raise Cancelled
+                if not self.active:
+                    raise DeviceError("device: stopped, the node was deactivated")
         finally:
             self._device.stop()
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from rclpy.node import Node
-
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.identify import identify_poles
@@ -15,7 +13,8 @@ from tactile_resonance.nodes.conversions import (
     origin_from_message,
     poles_to_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import RESULTS, run_node
 
 PARAMETERS = (
@@ -33,14 +32,16 @@ PARAMETERS = (
 )
 
 
-class PolesNode(Node):
+class PolesNode(ManagedNode):
     """Every FRF that arrives becomes poles, with the same header."""
 
     def __init__(self) -> None:
-        super().__init__("poles_node")
-        declare(self, PARAMETERS)
-        self._publisher = self.create_publisher(msg.Poles, "poles", RESULTS)
-        self.create_subscription(msg.FRF, "frf", self._on_frf, RESULTS)
+        super().__init__("poles_node", PARAMETERS)
+
+    def configure(self) -> None:
+        """Topics in and out."""
+        self._publisher = self.publish_on(msg.Poles, "poles", RESULTS)
+        self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 
     def _on_frf(self, message: msg.FRF) -> None:
         origin = origin_from_message(message)
@@ -48,7 +49,7 @@ class PolesNode(Node):
             frf, _ = frf_from_message(message)
             poles = self._identify(frf)
         except ValueError as error:
-            self.get_logger().error(f"FRF of measurement {origin.measurement_id}: {error}")
+            self.health.error(f"FRF of measurement {origin.measurement_id}: {error}")
             poles = Poles(status=PolesStatus.FAILED, message=str(error))
         self._publisher.publish(poles_to_message(poles, origin))
 

@@ -89,9 +89,9 @@ def test_interrupted_demo_leaves_no_process(domain, tmp_path, number):
         text=True,
     )
     deadline = time.monotonic() + 60
-    while len(processes_of(tmp_path)) < 4 and time.monotonic() < deadline:
+    while len(processes_of(tmp_path)) < 5 and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert len(processes_of(tmp_path)) == 4
+    assert len(processes_of(tmp_path)) == 5
     time.sleep(3)
     demo.send_signal(number)
     _, errors = demo.communicate(timeout=20)
@@ -107,7 +107,7 @@ def test_killed_demo_takes_its_nodes_along(domain, tmp_path):
         stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + 60
-    while len(processes_of(tmp_path)) < 4 and time.monotonic() < deadline:
+    while len(processes_of(tmp_path)) < 5 and time.monotonic() < deadline:
         time.sleep(0.1)
     time.sleep(2)
     demo.kill()

@@ -69,11 +69,15 @@ class Client:
             self.executor.spin_once(timeout_sec=0.05)
 
     def ask(self, **goal):
-        """Future of the result of a goal."""
+        """Future of the result of a goal; asked until the node is active."""
         self.wait(self.client.server_is_ready)
-        accepted = self.client.send_goal_async(Measure.Goal(**goal))
-        self.wait(accepted.done)
-        return accepted.result().get_result_async()
+        for _ in range(100):
+            answer = self.client.send_goal_async(Measure.Goal(**goal))
+            self.wait(answer.done)
+            if answer.result().accepted:
+                return answer.result().get_result_async()
+            self.executor.spin_once(timeout_sec=0.1)
+        raise AssertionError("no node takes the goal")
 
     def measure(self, **goal):
         result = self.ask(**goal)
@@ -114,8 +118,7 @@ def bits(message):
 
 
 def start(nodes, names, **parameters):
-    for name in names:
-        nodes.start(name, parameters.get(name))
+    nodes.bring_up(names, parameters)
 
 
 def assert_on_disk(content, messages):

@@ -27,6 +27,8 @@ SPECTRA = ("sensor_real", "sensor_imag", "actuator_real", "actuator_imag")
 def node(monkeypatch):
     with rclpy.init(domain_id=free_domain_id(os.environ)):
         node = PolesNode()
+        node.trigger_configure()
+        node.trigger_activate()
         node.published = []
         monkeypatch.setattr(node._publisher, "publish", node.published.append)
         yield node
