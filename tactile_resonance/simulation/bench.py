@@ -19,6 +19,7 @@ from tactile_resonance.simulation.acquisition import (
 )
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.contact import ContactParameters, hertz_contact
+from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.lines import Lines, PeriodicExcitation
@@ -28,9 +29,13 @@ from tactile_resonance.simulation.parameters import SensorParameters, read_senso
 from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.truth import Truth, truth_of
+from tactile_resonance.simulation.varying import VaryingStream
 
 DEFAULT_EFFECTS = BenchEffects()
+NEGLIGIBLE_COUNTS = 1e-3  # of the converter
 _SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
+
+Stream = ResponseStream | NonlinearStream | VaryingStream
 
 
 @dataclass(frozen=True)
@@ -98,6 +103,25 @@ class SimulatedBench:
         coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
         return BenchRun(self.sensor, coupled, seed, effects, keep_parts)
 
+    def start_varying(
+        self,
+        history: ContactHistory,
+        *,
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
+    ) -> BenchRun:
+        """Return a run whose contact changes as `history` says, from its first time on.
+
+        Raises
+        ------
+        ValueError
+            If the nonlinearity is asked for: it is not modelled on a changing contact.
+        """
+        require(not effects.nonlinearity, "nonlinearity", True, "off while the contact changes")
+        coupled = history.coupled_at(self.sensor, 0.0)
+        return BenchRun(self.sensor, coupled, seed, effects, keep_parts, history)
+
 
 class BenchRun:
     """One stay of the tip at one point: excitations are played one after another, from rest.
@@ -113,26 +137,36 @@ class BenchRun:
         seed: int,
         effects: BenchEffects,
         keep_parts: bool,
+        history: ContactHistory | None = None,
     ) -> None:
         good = isinstance(seed, (int, np.integer)) and seed >= 0
         require(good, "seed", seed, "an integer, 0 or above")
         self.coupled = coupled
         self.seed = seed
         self.effects = effects
+        self._parameters = sensor
+        self._history = history
         self._acquisition = sensor.acquisition
         self._keep_parts = keep_parts
         skew = effects.channel_skew_s
         direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
         late_s = max(0.0, skew)
         self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
-        self._sensor: ResponseStream | NonlinearStream
+        self._sensor: Stream
         self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
-        if effects.nonlinearity:
+        negligible_v = self.negligible_v
+        if history is not None:
+            self._sensor = VaryingStream(
+                lambda time_s: history.coupled_at(sensor, time_s),
+                delay_s=late_s,
+                negligible_v=negligible_v,
+            )
+        elif effects.nonlinearity:
             self._sensor = NonlinearStream(coupled.modal, sensor.nonlinear, delay_s=late_s)
             if keep_parts:
                 self._linear = ResponseStream(coupled.modal, delay_s=late_s)
         else:
-            self._sensor = ResponseStream(coupled.modal, delay_s=late_s)
+            self._sensor = ResponseStream(coupled.modal, delay_s=late_s, negligible_v=negligible_v)
         self._lines: Lines | None = None
         self._realisation = -1
         self._index = 0
@@ -140,9 +174,19 @@ class BenchRun:
         hum = np.random.SeedSequence(seed, spawn_key=(_HUM,))
         self.hum_phase_rad = float(np.random.default_rng(hum).uniform(0, 2 * np.pi))
 
-    def truth(self, frequency_hz: ArrayLike = ()) -> Truth:
-        """Return the exact linear behaviour, with the response at `frequency_hz` [Hz]."""
-        return truth_of(self.coupled, frequency_hz)
+    @property
+    def negligible_v(self) -> float:
+        """What a converter would not tell [V]: no free decay is computed below it; 0: all are."""
+        return NEGLIGIBLE_COUNTS * self._acquisition.sensor_scale_v * self.effects.quantisation
+
+    def truth(self, frequency_hz: ArrayLike = (), *, time_s: float = 0.0) -> Truth:
+        """Return the exact linear behaviour, with the response at `frequency_hz` [Hz].
+
+        Of the contact at `time_s` since the start, where it changes.
+        """
+        if self._history is None:
+            return truth_of(self.coupled, frequency_hz)
+        return truth_of(self._history.coupled_at(self._parameters, time_s), frequency_hz)
 
     def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Block:
         """Return the next periods of an excitation as one block."""
@@ -194,7 +238,7 @@ class BenchRun:
         self._end_excitation()
         return block
 
-    def _streams(self) -> list[ResponseStream | NonlinearStream]:
+    def _streams(self) -> list[Stream]:
         linear = [] if self._linear is None else [self._linear]
         return [self._drive, self._sensor, *linear]
 
@@ -215,7 +259,7 @@ class BenchRun:
     def _make_block(self, lines: Lines, samples: int, ring_down: int = 0) -> Block:
         total = samples + ring_down
 
-        def run(stream: ResponseStream | NonlinearStream) -> FloatArray:
+        def run(stream: Stream) -> FloatArray:
             played = stream.play(lines, samples)
             if ring_down == 0:
                 return played
