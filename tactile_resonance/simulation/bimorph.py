@@ -139,7 +139,8 @@ class CoupledBimorph:
             # states sqrt(k_j) z_j; a term of no stiffness has none
             scale = np.divide(new, old, out=np.zeros_like(new), where=old > 0)
             x[x.size - old.size :] *= np.sqrt(scale)
-        return np.linalg.solve(after._expansion[2], x.astype(complex))[after.poles_rad_s.imag >= 0]
+        states = np.linalg.solve(after._expansion[2], x.astype(complex))
+        return np.asarray(states[after.poles_rad_s.imag >= 0])
 
     @property
     def poles_rad_s(self) -> ComplexArray:
