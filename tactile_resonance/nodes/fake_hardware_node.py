@@ -28,7 +28,8 @@ from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM, run_node
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
-from tactile_resonance.simulation.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.tissue import Tissue
