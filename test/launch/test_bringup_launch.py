@@ -22,10 +22,10 @@ from launch.actions import IncludeLaunchDescription, SetEnvironmentVariable
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from tactile_resonance.action import Measure
 
 from launch import LaunchDescription
 from tactile_resonance import msg
-from tactile_resonance.action import Measure
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.processes import free_domain_id
 
