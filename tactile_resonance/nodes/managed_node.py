@@ -12,12 +12,13 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import QoSProfile
 
+from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Parameter, declare
 
 # What a configuration may be refused with; anything else is a defect and keeps its traceback.
-REFUSALS = (ValueError, OSError, DeviceError, ParameterException)
+REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
 
 
 class ManagedNode(LifecycleNode):

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control loop in a thread of its own, beside the executor's."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from tactile_resonance.contact.interfaces import Arm, ForceSource
+from tactile_resonance.contact.loop import ContactLoop, Cycle
+from tactile_resonance.contact.machine import ContactController, ContactGoal, State
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+
+# A tip that cannot be drawn back in this time is left where the envelope stopped it.
+RETRACT_WITHIN_S = 12.0
+POLL_S = 0.01
+
+
+class MachineClock:
+    """`contact.loop.Clock` on this machine's clock."""
+
+    def now_ns(self) -> int:
+        """UNIX time [ns]."""
+        return time.time_ns()
+
+    def wait_until(self, time_ns: int) -> None:
+        """Sleep until then."""
+        time.sleep(max(0, time_ns - time.time_ns()) * 1e-9)
+
+
+class ContactThread:
+    """Runs a `ContactLoop` until it is closed; requests may come from any thread.
+
+    Parameters
+    ----------
+    arm, force : Arm, ForceSource
+        Connected and started.
+    parameters, limits : ContactParameters, Limits
+    listener : callable
+        Called with each cycle in the loop's thread; must return at once.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        force: ForceSource,
+        parameters: ContactParameters,
+        limits: Limits,
+        listener: Callable[[Cycle], None],
+    ) -> None:
+        self.controller = ContactController(parameters, limits)
+        self.loop = ContactLoop(arm, force, MachineClock(), self.controller, listener)
+        self.error: Exception | None = None
+        self._lock = threading.Lock()
+        self._running = True
+        self._thread = threading.Thread(target=self._run, name="contact", daemon=True)
+        self._thread.start()
+
+    def configure(self, parameters: ContactParameters, limits: Limits) -> None:
+        """Exchange parameters; ``ValueError`` unless idle."""
+        with self._lock:
+            self.controller.configure(parameters, limits)
+
+    def start(self, goal: ContactGoal, parameters: ContactParameters, limits: Limits) -> None:
+        """Begin a contact within these limits; ``ValueError`` where it is refused."""
+        with self._lock:
+            self.controller.configure(parameters, limits)
+            self.loop.start(goal)
+
+    def retract(self) -> None:
+        """Draw the tip back, beginning with the next cycle."""
+        with self._lock:
+            self.controller.retract()
+
+    def close(self) -> None:
+        """Draw the tip back where the link allows it, and end the loop."""
+        self.retract()
+        deadline = time.monotonic() + RETRACT_WITHIN_S
+        while self._thread.is_alive() and time.monotonic() < deadline:
+            if self.controller.state in (State.IDLE, State.FAULT):
+                break
+            time.sleep(POLL_S)
+        self._running = False
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while self._running:
+                # the wait for the next period is in the cycle: requests come in between two
+                with self._lock:
+                    self.loop.cycle()
+        except Exception as error:
+            self.error = error
