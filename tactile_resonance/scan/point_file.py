@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rosbags.interfaces import (
     Connection,
@@ -24,7 +25,7 @@ from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.messages import definition_and_hash
 
-BAG_VERSION = 9
+BAG_VERSION: Literal[9] = 9
 _FOREVER = QosTime(9223372036, 854775807)
 # So that a replay of the recording offers late readers what the node did.
 LATCHED = Qos(

@@ -116,7 +116,7 @@ class PhantomScene:
         Contact force asked for [N].
     regions : tuple of Region
     scan_points_m : tuple of (x, y) or (x, y, z)
-        Where to measure [m].
+        Where to measure [m]; empty where the scene gives them in another form.
     """
 
     name: str
@@ -148,7 +148,7 @@ class PhantomScene:
 def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene:
     """Read the phantoms of a scene file; by default ``config/scenes/gelatine_phantoms.yaml``.
 
-    Only the fields ``name``, ``force_n``, ``regions`` and ``scan_points`` are read here.
+    Only the fields ``name``, ``force_n``, ``regions`` and, where there, ``scan_points`` are read here.
 
     Raises
     ------
@@ -170,7 +170,11 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
             _read_region(entry, library, f"{where}: regions[{i}]")
             for i, entry in enumerate(entries)
         ),
-        scan_points_m=_read_points(section(content, "scan_points", where), where),
+        scan_points_m=(
+            _read_points(section(content, "scan_points", where), where)
+            if "scan_points" in content
+            else ()
+        ),
     )
 
 
