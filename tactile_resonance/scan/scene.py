@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.patterns import read_list, read_positions
+from tactile_resonance.scan.patterns import read_positions
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.simulation.fields import (
     known_keys,
@@ -27,13 +27,14 @@ from tactile_resonance.simulation.fields import (
     require,
     section,
 )
+from tactile_resonance.simulation.scene import read_scan_points
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.references import parse_classes, read_classes
 
 E = TypeVar("E", bound=Enum)
 
 # Of the simulated bench: what lies on its table.
-BENCH_KEYS = {"regions"}
+BENCH_KEYS = {"regions", "buried"}
 _KEYS = {
     *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions", "scan_points"),
     *("outputs", "precision", "blocks", "tissue_classes", "on_failure", "time_limits"),
@@ -190,19 +191,16 @@ def read_scan_scene(path: Path) -> ScanScene:
 
 
 def _read_positions(content: Mapping[str, Any], where: str) -> npt.NDArray[np.float64]:
-    """From ``positions``, or from ``scan_points``: every offset about every centre."""
+    """From ``positions``, or from ``scan_points`` as the simulated bench reads them."""
     given = [key for key in ("positions", "scan_points") if key in content]
     require(len(given) == 1, f"{where}: positions", given, "exactly one of positions, scan_points")
     fields = section(content, given[0], where)
-    where = f"{where}: {given[0]}"
     if given == ["positions"]:
-        return read_positions(fields, where)
-    known_keys(fields, {"centres_m", "offsets_m"}, where)
-    centres, offsets = (
-        read_list(fields.get(key), f"{where}.{key}") for key in ("centres_m", "offsets_m")
-    )
-    # NaN in either stays NaN: the surface decides
-    return (centres[:, None] + offsets[None, :]).reshape(-1, 3)
+        return read_positions(fields, f"{where}: positions")
+    points = read_scan_points(fields, where)
+    positions = np.full((len(points), 3), np.nan)
+    positions[:, : len(points[0])] = points
+    return positions
 
 
 def _read_outputs(content: Mapping[str, Any], where: str) -> tuple[Output, ...]:

@@ -97,11 +97,11 @@ def test_what_is_neither_ends_it():
     assert decision.called == ""
 
 
-def precise(blocks, noise_std, floor=0.0, limits=BlockLimits(3, 8), **wanted):
+def precise(blocks, noise_std, floor=0.0, **wanted):
     noise = np.diag([noise_std**2, (noise_std / 100) ** 2])
     total = noise + np.diag([floor**2, 0])
     wanted = Precise(**(wanted or {"f0_std_hz": 0.01}))
-    return decide([250.0, 0.03], noise, total, blocks, wanted, limits, 0.4)
+    return decide([250.0, 0.03], noise, total, blocks, wanted, BlockLimits(3, 8), 0.4)
 
 
 def test_stops_at_the_block_where_it_is_precise_enough():

@@ -124,8 +124,8 @@ def test_classes_need_names_of_their_own():
         classify([250, 0.03], NOISE, [CLASSES[0], CLASSES[0]])
     with pytest.raises(ValueError, match="one class or more"):
         classify([250, 0.03], NOISE, [])
+    fields = {"f0_hz": 250, "damping_ratio": 0.03, "f0_std_hz": 1, "damping_ratio_std": 1}
     with pytest.raises(ValueError, match=r"classes.a.correlation: got 2.0; accepted is -1 to 1"):
-        fields = {"f0_hz": 250, "damping_ratio": 0.03, "f0_std_hz": 1, "damping_ratio_std": 1}
         parse_classes({"a": {**fields, "correlation": 2.0}}, "classes")
     with pytest.raises(ValueError, match="classes.a.estimates: .*n at least 4"):
         parse_classes({"a": {"points": [[250, 0.03]]}}, "classes")
