@@ -78,7 +78,7 @@ class PhantomScene:
         Contact force asked for [N].
     regions : tuple of Region
     scan_points_m : tuple of (x, y) or (x, y, z)
-        Where to measure [m].
+        Where to measure [m]; empty where the scene says it in another form.
     buried : tuple of Buried
         Felt from the surface of whatever region is there.
     tip_radius_m, poisson_ratio : float
@@ -134,7 +134,7 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
     """Read the phantoms of a scene file; by default ``config/scenes/gelatine_phantoms.yaml``.
 
     Only the fields ``name``, ``force_n``, ``regions``, ``buried`` and ``scan_points`` are read
-    here; the tip is that of ``config/sensors/bimorph.yaml``.
+    here, the last two where they are there; the tip is that of ``config/sensors/bimorph.yaml``.
 
     Raises
     ------
@@ -158,7 +158,11 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
             _read_region(entry, library, f"{where}: regions[{i}]")
             for i, entry in enumerate(entries)
         ),
-        scan_points_m=_read_points(section(content, "scan_points", where), where),
+        scan_points_m=(
+            read_scan_points(section(content, "scan_points", where), where)
+            if "scan_points" in content
+            else ()
+        ),
         buried=tuple(
             _read_buried(entry, library, f"{where}: buried[{i}]") for i, entry in enumerate(buried)
         ),
@@ -188,7 +192,7 @@ def _read_buried(entry: object, library: TissueLibrary, where: str) -> Buried:
     return Buried(str(entry.get("name", tissue.name)), read_shape(entry, where), tissue)
 
 
-def _read_points(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
+def read_scan_points(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
     """Read ``centres_m`` x ``offsets_m``, centre by centre, or a ``grid``, row by row in x."""
     where = f"{where}: scan_points"
     known_keys(fields, {"centres_m", "offsets_m", "grid"}, where)

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Enough? After each block: one more, or stop, and why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
+
+FloatArray = npt.NDArray[np.float64]
+# Poles outside of both classes by this much are of neither, and no block more will change it.
+NEITHER_LEVEL = 1e-4
+# How far beyond what was asked the prediction for the last block must lie to give up before it: estimated
+# standard deviations scatter themselves.
+HOPELESS_FACTOR = 1.5
+
+
+class Verdict(str, Enum):
+    """What to do after a block; all but CONTINUE end the measurement."""
+
+    CONTINUE = "continue"
+    PRECISE = "precision reached"
+    SEPARATED = "classes separated"
+    NEITHER = "neither of the classes"
+    MOST_BLOCKS = "most blocks reached"
+    HOPELESS = "precision out of reach"
+
+
+@dataclass(frozen=True)
+class Precise:
+    """Standard deviations asked for; None: as it comes.
+
+    They are those of the total covariance where it is known, else of that from noise.
+    """
+
+    f0_std_hz: float | None = None
+    damping_ratio_std: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("f0_std_hz", "damping_ratio_std"):
+            value = getattr(self, name)
+            require(value is None or 0 < value < np.inf, name, value, "a number above 0")
+
+
+@dataclass(frozen=True)
+class Separate:
+    """Tell two tissues apart: each kind of error happens with at most ``1 - probability``."""
+
+    first: TissueClass
+    second: TissueClass
+    probability: float
+
+    def __post_init__(self) -> None:
+        require(0.5 < self.probability < 1, "probability", self.probability, "between 0.5 and 1")
+        names = (self.first.name, self.second.name)
+        require(names[0] != names[1], "separate", names, "two classes")
+
+
+@dataclass(frozen=True)
+class BlockLimits:
+    """Fewest and most blocks at a point."""
+
+    least: int = 3
+    most: int = 8
+
+    def __post_init__(self) -> None:
+        require(self.least >= 1, "least", self.least, "1 or above")
+        require(self.most >= self.least, "most", self.most, f"at least least = {self.least}")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do after a block.
+
+    Attributes
+    ----------
+    verdict : Verdict
+    reason : str
+        A sentence for people.
+    blocks : int
+        Measured so far.
+    blocks_saved : int
+        Allowed and not needed; 0 while it goes on.
+    saved_s : float
+        Time of those.
+    called : str
+        Class that was decided for; empty where none was.
+    """
+
+    verdict: Verdict
+    reason: str
+    blocks: int
+    blocks_saved: int = 0
+    saved_s: float = 0.0
+    called: str = ""
+
+    @property
+    def stop(self) -> bool:
+        """Whether the measurement ends."""
+        return self.verdict is not Verdict.CONTINUE
+
+
+def decide(
+    estimate: npt.ArrayLike,
+    noise: npt.ArrayLike | None,
+    total: npt.ArrayLike | None,
+    blocks: int,
+    wanted: Precise | Separate | None,
+    limits: BlockLimits,
+    block_s: float,
+) -> Decision:
+    """Whether the poles of all blocks so far are enough.
+
+    Parameters
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio from all blocks so far; NaN where there is none yet.
+    noise, total : (2, 2) float or None
+        Their covariances, as in `Poles`.
+    blocks : int
+        Measured so far, 1 or above.
+    wanted : Precise, Separate or None
+        None: measure until the most blocks.
+    limits : BlockLimits
+    block_s : float
+        Duration of one block [s].
+    """
+    covariance = _first_known(total, noise)
+    x = np.asarray(estimate, float)
+    verdict, reason, called = Verdict.CONTINUE, "fewer blocks than asked for at least", ""
+    if blocks >= limits.least and wanted is not None:
+        if covariance is None or not np.all(np.isfinite(x)):
+            reason = "no pole with a covariance yet"
+        elif isinstance(wanted, Separate):
+            verdict, reason, called = _separated(x, covariance, wanted)
+        else:
+            noise_part = _first_known(noise, None)
+            verdict, reason = _precise(covariance, noise_part, blocks, wanted, limits)
+    elif wanted is None:
+        reason = "no precision asked for"
+    if verdict is Verdict.CONTINUE and blocks >= limits.most:
+        verdict, reason = Verdict.MOST_BLOCKS, f"{blocks} blocks; {reason}"
+    saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
+    return Decision(verdict, reason, blocks, saved, saved * block_s, called)
+
+
+def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:
+    """Logarithm of p(estimate | first) / p(estimate | second), class spread included.
+
+    For poles of all blocks together, with covariance C / n, it equals the sum over n independent blocks
+    of covariance C where the classes have no spread: Wald's statistic. With spread it is still the
+    likelihood ratio of all that was seen.
+    """
+    first = log_density(estimate, covariance, wanted.first)
+    return first - log_density(estimate, covariance, wanted.second)
+
+
+def _separated(
+    estimate: FloatArray, covariance: FloatArray, wanted: Separate
+) -> tuple[Verdict, str, str]:
+    """Wald's sequential probability ratio test with equal errors (Ann. Math. Stat. 16 (1945) 117)."""
+    a, b = wanted.first, wanted.second
+    if classify(estimate, covariance, [a, b], NEITHER_LEVEL).name == UNKNOWN:
+        reason = f"outside of {a.name} and {b.name} ({NEITHER_LEVEL:g} of their members lie there)"
+        return Verdict.NEITHER, reason, ""
+    threshold = math.log(wanted.probability / (1 - wanted.probability))
+    ratio = log_likelihood_ratio(estimate, covariance, wanted)
+    text = f"log likelihood ratio {ratio:+.2f}, +-{threshold:.2f} asked for"
+    if abs(ratio) < threshold:
+        return Verdict.CONTINUE, text, ""
+    called = a.name if ratio > 0 else b.name
+    return Verdict.SEPARATED, f"{called}: {text}", called
+
+
+def _precise(
+    covariance: FloatArray,
+    noise: FloatArray | None,
+    blocks: int,
+    wanted: Precise,
+    limits: BlockLimits,
+) -> tuple[Verdict, str]:
+    """Noise falls with the number of blocks, distortion and model error stay."""
+    names = (("f0", "Hz", wanted.f0_std_hz), ("damping ratio", "", wanted.damping_ratio_std))
+    missing, hopeless = [], []
+    for k, (name, unit, asked) in enumerate(names):
+        std = math.sqrt(covariance[k, k])
+        if asked is None or std <= asked:
+            continue
+        text = f"std of {name} {std:.2g} {unit}".rstrip() + f", {asked:.2g} asked for"
+        missing.append(text)
+        falling = covariance[k, k] if noise is None else min(noise[k, k], covariance[k, k])
+        staying = covariance[k, k] - falling
+        last = math.sqrt(staying + falling * blocks / limits.most)
+        if last > HOPELESS_FACTOR * asked:
+            hopeless.append(f"{text}, {last:.2g} expected after {limits.most} blocks")
+    if not missing:
+        return Verdict.PRECISE, "standard deviations as asked for"
+    if hopeless and blocks < limits.most:
+        return Verdict.HOPELESS, "; ".join(hopeless)
+    return Verdict.CONTINUE, "; ".join(missing)
+
+
+def _first_known(*covariances: npt.ArrayLike | None) -> FloatArray | None:
+    for covariance in covariances:
+        if covariance is not None:
+            known = np.asarray(covariance, float)
+            if np.all(np.isfinite(known)):
+                return known
+    return None

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes as surfaces, and reading them from STL."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.simulation.fields import require
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_BINARY = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_NUMBER = rb"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+_VERTEX = re.compile(rb"vertex\s+" + rb"\s+".join([_NUMBER] * 3))
+_INSIDE = 1e-9  # of the barycentric coordinates: points on a shared edge belong to both triangles
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A mesh seen from above; its topmost face counts.
+
+    Normals are those of the corners, interpolated over each triangle, so that a finely meshed organ is
+    smooth; the normal of a corner is the mean of its faces' weighted by their angles there (Thuermer and
+    Wuethrich, J. Graphics Tools 3 (1998) 43). A sharp edge is rounded over the triangles beside it.
+
+    Attributes
+    ----------
+    corners_m : (c, 3) float
+    faces : (t, 3) int
+        Indices into the corners.
+    corner_normals : (c, 3) float
+    """
+
+    corners_m: FloatArray
+    faces: IntArray
+    corner_normals: FloatArray
+
+    @classmethod
+    def from_triangles(cls, triangles_m: npt.ArrayLike) -> TriangleMesh:
+        """Mesh of (t, 3, 3) triangles [m], all wound in the same sense.
+
+        Corners nearer than a millionth of the mesh's size are one.
+
+        Raises
+        ------
+        ValueError
+            If there is no triangle of finite size, or neighbours are wound in opposite senses.
+        """
+        triangles = np.asarray(triangles_m, float)
+        good = triangles.ndim == 3 and triangles.shape[1:] == (3, 3) and triangles.shape[0] > 0
+        require(good, "triangles", triangles.shape, "shape (t, 3, 3) with t above 0")
+        require(bool(np.all(np.isfinite(triangles))), "triangles", "NaN", "finite coordinates")
+        flat = triangles.reshape(-1, 3)
+        size = float(np.max(np.ptp(flat, axis=0)))
+        require(size > 0, "triangles", size, "a mesh larger than a point")
+        rounded = np.round((flat - flat.min(axis=0)) / (1e-6 * size)).astype(np.int64)
+        _, first, inverse = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+        faces = inverse.reshape(-1, 3)
+        distinct = (
+            (faces[:, 0] != faces[:, 1])
+            & (faces[:, 1] != faces[:, 2])
+            & (faces[:, 2] != faces[:, 0])
+        )
+        faces = faces[distinct]
+        require(len(faces) > 0, "triangles", 0, "one triangle of finite size or more")
+        _check_winding(faces)
+        corners = flat[first]
+        return cls(corners, faces, _corner_normals(corners, faces))
+
+    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
+        """(...) height of the topmost face [m], NaN beside the mesh."""
+        return self._over(xy_m)[0]
+
+    def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
+        """(..., 3) upward unit normal, NaN beside the mesh."""
+        return self._over(xy_m)[1]
+
+    def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
+        """(...) zeros."""
+        return np.zeros(np.shape(xy_m)[:-1])
+
+    def _over(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Height (...) and normal (..., 3)."""
+        xy = np.asarray(xy_m, float)
+        points = xy.reshape(-1, 2)
+        triangles = self.corners_m[self.faces]  # (t, 3, 3)
+        low, high = triangles[..., :2].min(axis=1), triangles[..., :2].max(axis=1)  # (t, 2)
+        margin = _INSIDE * float(np.max(np.ptp(self.corners_m, axis=0)))
+        heights, normals = np.full(len(points), np.nan), np.full((len(points), 3), np.nan)
+        for i, point in enumerate(points):
+            near = np.flatnonzero(
+                np.all((point >= low - margin) & (point <= high + margin), axis=1)
+            )
+            weights = _barycentric(triangles[near, :, :2], point)  # (k, 3)
+            hit = np.all(weights >= -_INSIDE, axis=1)  # NaN of upright faces: no hit
+            if not hit.any():
+                continue
+            height = np.where(hit, np.sum(weights * triangles[near, :, 2], axis=1), -np.inf)
+            top = int(np.argmax(height))
+            normal = weights[top] @ self.corner_normals[self.faces[near[top]]]
+            heights[i] = height[top]
+            # the topmost face looks upwards, however the mesh is wound
+            normals[i] = normal / np.linalg.norm(normal) * np.copysign(1.0, normal[2])
+        return heights.reshape(xy.shape[:-1]), normals.reshape(*xy.shape[:-1], 3)
+
+
+def read_stl(path: Path) -> FloatArray:
+    """(t, 3, 3) triangles of an STL file, binary or text, in the file's own unit.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read or holds no triangle.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"file: {path} cannot be read ({error.strerror})") from error
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) >= 84 and len(content) == 84 + _BINARY.itemsize * count:
+        corners = np.frombuffer(content, _BINARY, count, offset=84)["corners"].astype(float)
+    else:
+        numbers = _VERTEX.findall(content) if content.lstrip()[:5] == b"solid" else []
+        if len(numbers) % 3:
+            raise ValueError(
+                f"file: {path} has {len(numbers)} corners; accepted are three per face"
+            )
+        corners = np.array(numbers, dtype=float).reshape(-1, 3, 3)
+    if len(corners) == 0:
+        raise ValueError(f"file: {path} holds no triangle; accepted is STL, binary or text")
+    return corners
+
+
+def _check_winding(faces: IntArray) -> None:
+    """Neighbours run along their common edge in opposite directions."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    twice = int(np.sum(counts > 1))
+    require(twice == 0, "triangles", f"{twice} edges run twice in one sense", "one winding for all")
+
+
+def _corner_normals(corners: FloatArray, faces: IntArray) -> FloatArray:
+    triangles = corners[faces]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    total = np.zeros_like(corners)
+    for k in range(3):
+        a = triangles[:, (k + 1) % 3] - triangles[:, k]
+        b = triangles[:, (k + 2) % 3] - triangles[:, k]
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
+        np.add.at(total, faces[:, k], angle[:, None] * normals)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.divide(total, length, out=np.full_like(total, np.nan), where=length > 0)
+
+
+def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
+    """(k, 3) weights of the corners of (k, 3, 2) triangles at a point (2,); NaN for upright faces."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+
+    def area(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
+        u, v = q - p, r - p
+        return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+    whole = area(a, b, c)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weights = np.stack([area(b, c, point), area(c, a, point), area(a, b, point)], axis=1)
+        return np.where(whole[:, None] == 0, np.nan, weights / whole[:, None])

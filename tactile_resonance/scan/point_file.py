@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One MCAP file: written out of sight, then there whole; and what such a file holds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+
+from tactile_resonance.recording.stored_file import sync_folder
+from tactile_resonance.scan.messages import definition_and_hash
+
+BAG_VERSION: Literal[9] = 9
+_FOREVER = QosTime(9223372036, 854775807)
+# So that a replay of the recording offers late readers what the node did.
+LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    64,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    *(_FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, False),
+)
+
+
+@dataclass(frozen=True)
+class TopicContent:
+    """One topic of a file."""
+
+    name: str
+    type_name: str
+    latched: bool
+    count: int
+
+
+@dataclass(frozen=True)
+class FileContent:
+    """What one finished file holds.
+
+    Attributes
+    ----------
+    name : str
+    start_ns, end_ns : int
+        Times of the first and the last message (UNIX time) [ns].
+    topics : tuple of TopicContent
+    """
+
+    name: str
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicContent, ...]
+
+    @property
+    def count(self) -> int:
+        """Messages of all topics."""
+        return sum(topic.count for topic in self.topics)
+
+
+class PointFileWriter:
+    """Writes one file; nobody sees it before `finish`, and then nobody loses it.
+
+    Parameters
+    ----------
+    hidden : Path
+        Folder for what is not finished, on the file system of `target`; a leftover of the same name is
+        replaced.
+    target : Path
+        The finished file, ending in ``.mcap``; must not exist.
+    """
+
+    def __init__(self, hidden: Path, target: Path) -> None:
+        if target.exists():
+            raise ValueError(
+                f"target: {target.name} exists already, finished files are not replaced"
+            )
+        self._target = target
+        self._folder = hidden / target.stem
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._writer = Writer(self._folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        self._connections: dict[str, Connection] = {}
+        self._counts: dict[str, int] = {}
+        self._latched: set[str] = set()
+        self._start_ns, self._end_ns = 2**63 - 1, 0
+        self._open = True
+
+    def write(
+        self,
+        topic: str,
+        type_name: str,
+        time_ns: int,
+        cdr: bytes | memoryview,
+        latched: bool = False,
+    ) -> None:
+        """Append one message.
+
+        Parameters
+        ----------
+        topic : str
+            Fully qualified.
+        type_name : str
+            Such as ``tactile_resonance/msg/Poles``; one per topic.
+        time_ns : int
+            When it was received (UNIX time) [ns].
+        cdr : bytes
+            Serialised, with the encapsulation header, as ``rclpy.serialization`` and rosbags make it.
+        latched : bool
+            Offered to late readers; the topic's first message decides.
+
+        Raises
+        ------
+        ValueError
+            If the type is not known or not that of the topic, or the file is finished.
+        """
+        if not self._open:
+            raise ValueError(f"{self._target.name}: finished or abandoned, expected an open file")
+        connection = self._connections.get(topic)
+        if connection is None:
+            definition, type_hash = definition_and_hash(type_name)
+            connection = self._writer.add_connection(
+                topic,
+                type_name,
+                msgdef=definition,
+                rihs01=type_hash,
+                offered_qos_profiles=[LATCHED] if latched else [],
+            )
+            self._connections[topic] = connection
+            self._counts[topic] = 0
+            if latched:
+                self._latched.add(topic)
+        if connection.msgtype != type_name:
+            raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
+        self._writer.write(connection, time_ns, cdr)
+        self._counts[topic] += 1
+        self._start_ns, self._end_ns = min(self._start_ns, time_ns), max(self._end_ns, time_ns)
+
+    def finish(self) -> FileContent:
+        """Complete the file and give it its name, durably.
+
+        Raises
+        ------
+        ValueError
+            If it holds no message, or is finished already.
+        OSError
+            If it cannot be written.
+        """
+        if not self._open or not self._connections:
+            raise ValueError(f"{self._target.name}: nothing written, expected one message or more")
+        self._open = False
+        self._writer.close()
+        written = self._folder / self._target.name
+        descriptor = os.open(written, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        written.rename(self._target)
+        sync_folder(self._target.parent)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        topics = tuple(
+            TopicContent(topic, connection.msgtype, topic in self._latched, self._counts[topic])
+            for topic, connection in self._connections.items()
+        )
+        return FileContent(self._target.name, self._start_ns, self._end_ns, topics)
+
+    def abandon(self) -> None:
+        """Leave nothing behind; does nothing after `finish`."""
+        if self._open:
+            self._open = False
+            self._writer.abort()
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def read_content(path: Path) -> FileContent:
+    """What a finished file holds, from its index.
+
+    Raises
+    ------
+    ValueError
+        If it is damaged or no MCAP file of ROS 2.
+    """
+    try:
+        with Reader(path) as reader:
+            topics = []
+            for connection in reader.connections:
+                extension = connection.ext
+                assert isinstance(extension, ConnectionExtRosbag2)
+                latched = LATCHED in extension.offered_qos_profiles
+                topics.append(
+                    TopicContent(connection.topic, connection.msgtype, latched, connection.msgcount)
+                )
+            return FileContent(path.name, reader.start_time, reader.end_time - 1, tuple(topics))
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
+    """(time [ns], type, CDR) of each message of a topic of one file or of a whole bag, in order.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    try:
+        with Reader(path) as reader:
+            wanted = [connection for connection in reader.connections if connection.topic == topic]
+            if wanted:
+                for connection, time_ns, cdr in reader.messages(connections=wanted):
+                    yield time_ns, connection.msgtype, bytes(cdr)
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+# What reading a cut or overwritten file has been seen to raise.
+_DAMAGE = (ReaderError, OSError, ValueError, TypeError, KeyError, IndexError, AssertionError,
+           EOFError, MemoryError, OverflowError)  # fmt: skip
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    reason = " ".join(str(error).split())[:120] or type(error).__name__
+    return ValueError(f"{path.name}: damaged or foreign file ({reason})")

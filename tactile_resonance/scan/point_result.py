@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What became of one scan point: one message in the recording, one row of ``results.csv``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.scan.messages import message_types
+
+TOPIC = "point_result"
+TYPE = "tactile_resonance/msg/PointResult"
+NAN = float("nan")
+
+
+class Outcome(IntEnum):
+    """What came of a point; the numbers are those of the message."""
+
+    DONE = 0
+    FAILED = 1
+    SKIPPED = 2
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """One attempt at one scan point; ``msg/PointResult.msg`` gives unit and meaning of each field.
+
+    ``time_ns`` and ``frame_id`` stand for the message's header.
+    """
+
+    index: int
+    attempt: int = 0
+    label: str = ""
+    outcome: Outcome = Outcome.DONE
+    reason: str = ""
+    x_m: float = NAN
+    y_m: float = NAN
+    z_m: float = NAN
+    normal_x: float = NAN
+    normal_y: float = NAN
+    normal_z: float = NAN
+    force_n: float = NAN
+    force_std_n: float = NAN
+    f0_hz: float = NAN
+    f0_std_hz: float = NAN
+    damping_ratio: float = NAN
+    damping_ratio_std: float = NAN
+    f0_damping_covariance_hz: float = NAN
+    pole_real_rad_s: float = NAN
+    pole_imag_rad_s: float = NAN
+    cost: float = NAN
+    expected_cost: float = NAN
+    poles_status: str = ""
+    tissue_class: str = ""
+    tissue_probability: float = NAN
+    blocks: int = 0
+    blocks_saved: int = 0
+    verdict: str = ""
+    saved_s: float = NAN
+    duration_s: float = NAN
+    measurement_id: int = 0
+    simulated: bool = False
+    notes: str = ""
+    time_ns: int = 0
+    frame_id: str = ""
+
+    @property
+    def position_m(self) -> npt.NDArray[np.float64]:
+        """(3,) point on the surface [m]."""
+        return np.array([self.x_m, self.y_m, self.z_m])
+
+    @property
+    def estimate(self) -> npt.NDArray[np.float64]:
+        """(2,) f0 [Hz] and damping ratio; NaN where not estimated."""
+        return np.array([self.f0_hz, self.damping_ratio])
+
+    @property
+    def covariance(self) -> npt.NDArray[np.float64]:
+        """(2, 2) of f0 [Hz] and damping ratio; NaN where unknown."""
+        cross = self.f0_damping_covariance_hz
+        return np.array([[self.f0_std_hz**2, cross], [cross, self.damping_ratio_std**2]])
+
+
+# in the order of the message, the header's two last
+COLUMNS = tuple(field.name for field in fields(PointResult))
+_KINDS = {field.name: str(field.type) for field in fields(PointResult)}
+_HEADER = ("time_ns", "frame_id")
+
+
+def to_message(result: PointResult) -> Any:
+    """Message as rosbags knows it, ready for ``message_types().serialize_cdr``."""
+    types = message_types().types
+    time = types["builtin_interfaces/msg/Time"](
+        sec=result.time_ns // 10**9, nanosec=result.time_ns % 10**9
+    )
+    header = types["std_msgs/msg/Header"](stamp=time, frame_id=result.frame_id)
+    content = {name: getattr(result, name) for name in COLUMNS if name not in _HEADER}
+    return types[TYPE](header=header, **content)
+
+
+def from_message(message: Any) -> PointResult:
+    """Result of a message, of rosbags or of ROS."""
+    content = {name: getattr(message, name) for name in COLUMNS if name not in _HEADER}
+    stamp = message.header.stamp
+    return PointResult(
+        **{**content, "outcome": Outcome(message.outcome)},
+        time_ns=stamp.sec * 10**9 + stamp.nanosec,
+        frame_id=message.header.frame_id,
+    )
+
+
+def as_csv(results: Iterable[PointResult]) -> str:
+    """One row each, numbers with all their digits, unknown numbers ``nan``."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for result in results:
+        writer.writerow([_write(getattr(result, name)) for name in COLUMNS])
+    return text.getvalue()
+
+
+def from_csv(text: str) -> list[PointResult]:
+    """What `as_csv` wrote.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing or a value is none of its kind.
+    """
+    reader = csv.DictReader(io.StringIO(text))
+    missing = set(COLUMNS) - set(reader.fieldnames or ())
+    if missing:
+        raise ValueError(f"results.csv: columns {sorted(missing)} are missing")
+    return [_read(row, number) for number, row in enumerate(reader, start=2)]
+
+
+def _write(value: object) -> str:
+    if isinstance(value, Outcome):
+        return value.name.lower()
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def _read(row: Mapping[str, str | None], line: int) -> PointResult:
+    content: dict[str, Any] = {}
+    for name, kind in _KINDS.items():
+        text = row[name]
+        try:
+            if text is None:
+                raise ValueError("nothing")
+            if kind == "Outcome":
+                content[name] = Outcome[text.upper()]
+            elif kind == "bool":
+                content[name] = {"True": True, "False": False}[text]
+            else:
+                content[name] = {"int": int, "float": float, "str": str}[kind](text)
+        except (ValueError, KeyError):
+            raise ValueError(
+                f"results.csv line {line}, {name}: got {text!r}; accepted is a value of type {kind}"
+            ) from None
+    return PointResult(**content)
+
+
+def same_result(a: PointResult, b: PointResult) -> bool:
+    """Equal in every field, NaN being equal to NaN."""
+
+    def equal(x: object, y: object) -> bool:
+        both = isinstance(x, float) and isinstance(y, float)
+        return x == y or (both and math.isnan(x) and math.isnan(y))  # type: ignore[arg-type]
+
+    return all(equal(getattr(a, name), getattr(b, name)) for name in COLUMNS)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What lies in the folder of a run, read without changing anything."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
+from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, from_message
+from tactile_resonance.scan.scan_point import ScanPoint
+
+FORMAT = "tactile_resonance run 1"
+RECORDING = "recording"
+_POINT = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
+
+
+@dataclass(frozen=True)
+class RunContent:
+    """A run, as far as it has come.
+
+    Attributes
+    ----------
+    path : Path
+    scene : str
+        Text of the scene file.
+    facts : mapping
+        Versions, seeds, what the plan skips.
+    points : tuple of ScanPoint
+        The plan.
+    files : tuple of FileContent
+        Finished files of the recording.
+    results : tuple of PointResult
+        Of every attempt, by point and attempt.
+    problems : tuple of str
+        Damaged and foreign files, by name.
+    """
+
+    path: Path
+    scene: str
+    facts: Mapping[str, Any]
+    points: tuple[ScanPoint, ...]
+    files: tuple[FileContent, ...] = ()
+    results: tuple[PointResult, ...] = ()
+    problems: tuple[str, ...] = ()
+
+    @cached_property
+    def latest(self) -> tuple[PointResult, ...]:
+        """The latest attempt at each finished point, by index."""
+        return tuple({result.index: result for result in self.results}.values())
+
+    @property
+    def next_point(self) -> ScanPoint | None:
+        """First point of the plan that is not finished; None where all are."""
+        finished = {result.index for result in self.results}
+        return next((point for point in self.points if point.index not in finished), None)
+
+    def with_file(self, file: FileContent, result: PointResult | None) -> RunContent:
+        """The same with one finished file more."""
+        results = self.results if result is None else (*self.results, result)
+        ordered = sorted(results, key=lambda r: (r.index, r.attempt))
+        return replace(self, files=(*self.files, file), results=tuple(ordered))
+
+
+def read_run(path: Path) -> RunContent:
+    """Everything readable of a run, of one that is being recorded too.
+
+    Raises
+    ------
+    ValueError
+        If it is no run.
+    """
+    path = Path(path)
+    try:
+        content = json.loads((path / "run.json").read_text(encoding="utf-8"))
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT!r}")
+        scene = (path / "scene.yaml").read_text(encoding="utf-8")
+        points = tuple(
+            ScanPoint.from_json(point, f"points[{i}]") for i, point in enumerate(content["points"])
+        )
+        facts = content["facts"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
+    run = RunContent(path, scene, facts, points)
+    problems = []
+    for file in sorted((path / RECORDING).iterdir()):
+        if file.suffix in (".yaml", ".part"):
+            continue
+        try:
+            run = run.with_file(*_read_file(file, len(points)))
+        except ValueError as error:
+            problems.append(str(error))
+    return replace(run, problems=tuple(problems))
+
+
+def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:
+    match = _POINT.fullmatch(path.name)
+    if match is None:
+        if not re.fullmatch(r"reference-.*\.mcap", path.name):
+            raise ValueError(f"{path.name}: neither of a point nor a reference")
+        return read_content(path), None
+    content = read_content(path)
+    found = [
+        from_message(message_types().deserialize_cdr(cdr, TYPE))
+        for _, _, cdr in read_messages(path, f"/{TOPIC}")
+    ]
+    if len(found) != 1:
+        raise ValueError(f"{path.name}: {len(found)} results, expected one")
+    named = (int(match[1]), int(match[2]))
+    if (found[0].index, found[0].attempt) != named or found[0].index >= points:
+        raise ValueError(f"{path.name}: holds point and attempt {found[0].index, found[0].attempt}")
+    return content, found[0]

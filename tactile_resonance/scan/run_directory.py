@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a run: whatever happens, every finished point is in it and the next one is known.
+
+::
+
+    RUN/scene.yaml                      the scene as it was given
+    RUN/run.json                        plan, versions, seeds, what was skipped; written once
+    RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
+    RUN/recording/reference-00-air.mcap references of the session
+    RUN/recording/metadata.yaml         makes all of them one rosbag2 recording
+    RUN/results.csv                     one row per finished point, its latest attempt
+
+A point is finished when its file is there. Files get their names when they are complete and on disk;
+``metadata.yaml`` and ``results.csv`` follow from the files and are made anew when a run is opened.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tactile_resonance.analysis import write_whole
+from tactile_resonance.recording.stored_file import sync_folder
+from tactile_resonance.scan.bag_metadata import write_bag_metadata
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import FileContent, PointFileWriter
+from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, as_csv, to_message
+from tactile_resonance.scan.run_content import FORMAT, RECORDING, RunContent, read_run
+from tactile_resonance.scan.scan_point import ScanPoint
+
+HIDDEN = ".unfinished"
+_REFERENCE = re.compile(r"[a-z0-9][a-z0-9_-]*")
+
+
+class RunDirectory:
+    """A run that is being recorded; the only one who writes to its folder.
+
+    Made by `create` or `open`; a context that gives the folder free again.
+
+    Attributes
+    ----------
+    path : Path
+    content : RunContent
+        As far as it has come.
+    """
+
+    def __init__(self, path: Path, lock: int, content: RunContent) -> None:
+        self.path = path
+        self.content = content
+        self._lock = lock
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        scene: str,
+        points: Sequence[ScanPoint],
+        facts: Mapping[str, Any],
+        needed_bytes: int = 0,
+    ) -> RunDirectory:
+        """Begin a run.
+
+        Parameters
+        ----------
+        path : Path
+            A folder that is empty or does not exist.
+        scene : str
+            Text of the scene file.
+        points : sequence of ScanPoint
+            The plan, in order.
+        facts : mapping
+            What JSON can hold: versions, seeds, what the plan skips.
+        needed_bytes : int
+            What the run may take on disk; `expected_bytes` estimates it.
+
+        Raises
+        ------
+        ValueError
+            If the folder holds something, the plan is empty or misnumbered, or space is short; nothing
+            is left behind.
+        OSError
+            If it cannot be written.
+        """
+        path = Path(path)
+        if [point.index for point in points] != list(range(len(points))) or not points:
+            indices = [point.index for point in points][:10]
+            raise ValueError(f"points: got indices {indices}; accepted are 0, 1, 2 ... in order")
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ValueError(f"run: {path} holds something; accepted is a new or empty folder")
+        parent = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        free = shutil.disk_usage(parent).free
+        if needed_bytes > free:
+            raise ValueError(
+                f"run: {parent} has {free / 1e6:.0f} MB free, the run may take "
+                f"{needed_bytes / 1e6:.0f} MB"
+            )
+        content = {
+            "format": FORMAT,
+            "facts": dict(facts),
+            "points": [point.as_json() for point in points],
+        }
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        (path / RECORDING).mkdir(parents=True)
+        lock = _lock(path)
+        try:
+            write_whole(path / "scene.yaml", scene.encode())
+            write_bag_metadata(path / RECORDING, [])
+            write_whole(path / "results.csv", as_csv([]).encode())
+            write_whole(path / "run.json", text.encode())  # last: with it the run exists
+            sync_folder(path)
+            sync_folder(path.parent)
+            return cls(path, lock, read_run(path))
+        except BaseException:
+            os.close(lock)
+            raise
+
+    @classmethod
+    def open(cls, path: Path) -> RunDirectory:
+        """Go on with a run, after whatever ended it.
+
+        Removes what was not finished and makes ``metadata.yaml`` and ``results.csv`` anew from the
+        finished files; damaged files are left as they are and named in ``content.problems``.
+
+        Raises
+        ------
+        ValueError
+            If it is no run, or another process is recording it.
+        """
+        path = Path(path)
+        lock = _lock(path)
+        try:
+            run = cls(path, lock, read_run(path))
+            shutil.rmtree(path / HIDDEN, ignore_errors=True)
+            for part in [*path.glob("*.part"), *(path / RECORDING).glob("*.part")]:
+                part.unlink()
+            run._write_summaries()
+            return run
+        except BaseException:
+            os.close(lock)
+            raise
+
+    def __enter__(self) -> RunDirectory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the folder free."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def begin_point(self, index: int) -> PointRecording:
+        """Begin the next attempt at a point of the plan."""
+        if not 0 <= index < len(self.content.points):
+            last = len(self.content.points) - 1
+            raise ValueError(f"index: got {index!r}; accepted is 0 to {last}")
+        # damaged files keep their names: their attempt is not given twice
+        taken = list((self.path / RECORDING).glob(f"point-{index:05d}-*.mcap"))
+        attempt = 1 + max((int(path.stem.rsplit("-", 1)[1]) for path in taken), default=-1)
+        return PointRecording(self, index, attempt)
+
+    def begin_reference(self, name: str) -> ReferenceRecording:
+        """Begin a recording that belongs to no point, such as ``air-before``."""
+        if not _REFERENCE.fullmatch(name):
+            raise ValueError(f"name: got {name!r}; accepted are a to z, 0 to 9, - and _")
+        number = len(list((self.path / RECORDING).glob("reference-*.mcap")))
+        return ReferenceRecording(self, f"reference-{number:02d}-{name}")
+
+    def _add(self, file: FileContent, result: PointResult | None) -> None:
+        self.content = self.content.with_file(file, result)
+        self._write_summaries()
+
+    def _write_summaries(self) -> None:
+        """What follows from the finished files; lost or old, it is made again by `open`."""
+        write_bag_metadata(self.path / RECORDING, self.content.files)
+        write_whole(self.path / "results.csv", as_csv(self.content.latest).encode())
+
+
+class ReferenceRecording:
+    """Receives the messages of one reference; a context that abandons what was not finished."""
+
+    def __init__(self, run: RunDirectory, stem: str) -> None:
+        self._run = run
+        recording = run.path / RECORDING
+        self._writer = PointFileWriter(run.path / HIDDEN, recording / f"{stem}.mcap")
+
+    def __enter__(self) -> ReferenceRecording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.abandon()
+
+    def write(
+        self,
+        topic: str,
+        type_name: str,
+        time_ns: int,
+        cdr: bytes | memoryview,
+        latched: bool = False,
+    ) -> None:
+        """Append one message; see `PointFileWriter.write`."""
+        self._writer.write(topic, type_name, time_ns, cdr, latched)
+
+    def finish(self) -> None:
+        """Keep it, durably."""
+        self._run._add(self._writer.finish(), None)
+
+
+class PointRecording:
+    """Receives the messages of one attempt at a point; a context that abandons what was not finished.
+
+    Attributes
+    ----------
+    index, attempt : int
+    """
+
+    def __init__(self, run: RunDirectory, index: int, attempt: int) -> None:
+        self.index = index
+        self.attempt = attempt
+        self._run = run
+        target = run.path / RECORDING / f"point-{index:05d}-{attempt:02d}.mcap"
+        self._writer = PointFileWriter(run.path / HIDDEN, target)
+
+    def __enter__(self) -> PointRecording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.abandon()
+
+    def write(
+        self,
+        topic: str,
+        type_name: str,
+        time_ns: int,
+        cdr: bytes | memoryview,
+        latched: bool = False,
+    ) -> None:
+        """Append one message; see `PointFileWriter.write`."""
+        self._writer.write(topic, type_name, time_ns, cdr, latched)
+
+    def finish(self, result: PointResult) -> None:
+        """Keep the point with its result, durably: after this no interruption loses it.
+
+        Raises
+        ------
+        ValueError
+            If the result is of another point or attempt.
+        """
+        if (result.index, result.attempt) != (self.index, self.attempt):
+            got = (result.index, result.attempt)
+            raise ValueError(
+                f"result: got point and attempt {got}; accepted is {(self.index, self.attempt)}"
+            )
+        cdr = message_types().serialize_cdr(to_message(result), TYPE)
+        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr)
+        self._run._add(self._writer.finish(), result)
+
+
+def expected_bytes(points: int, blocks: int, samples_per_block: int, lines: int) -> int:
+    """What a run may take on disk, generously [bytes].
+
+    Two channels of floating point samples per block, an FRF of so many lines after each of them, and
+    a megabyte a point for poses and wrenches.
+    """
+    block = 2 * 8 * samples_per_block + 16 * 8 * lines + 10_000
+    return points * (blocks * block + 1_000_000)
+
+
+def _lock(path: Path) -> int:
+    """Descriptor that holds the folder until it is closed, or its process ends."""
+    try:
+        descriptor = os.open(path / RECORDING, os.O_RDONLY)
+    except OSError as error:
+        raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise ValueError(f"run: {path} is being recorded by another process") from None
+    return descriptor

@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan's scene: what is on the table and what is wanted from it.
+
+The same file may hold ``regions``, which the simulated bench reads (`tactile_resonance.simulation.scene`)
+and a scan does not need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
+from tactile_resonance.scan.patterns import read_positions
+from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
+from tactile_resonance.simulation.fields import (
+    known_keys,
+    number,
+    read_dataclass,
+    read_yaml,
+    require,
+    section,
+)
+from tactile_resonance.simulation.scene import read_scan_points
+from tactile_resonance.tissue.classify import TissueClass
+from tactile_resonance.tissue.references import parse_classes, read_classes
+
+E = TypeVar("E", bound=Enum)
+
+# Of the simulated bench: what lies on its table.
+BENCH_KEYS = {"regions", "buried"}
+_KEYS = {
+    *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions", "scan_points"),
+    *("outputs", "precision", "blocks", "tissue_classes", "on_failure", "time_limits"),
+    *BENCH_KEYS,
+}
+
+
+class Hold(str, Enum):
+    """What contact control keeps while it is measured."""
+
+    FORCE = "force"
+    INDENTATION = "indentation"
+
+
+class Output(str, Enum):
+    """What a scan can bring home."""
+
+    POLES = "poles"
+    FRF = "frf"  # over the sensor's whole range, not only the mode's band
+    DISTORTION = "distortion"
+    RELAXATION = "relaxation"
+    MAP = "map"
+
+
+class OnFailure(str, Enum):
+    """What a scan does after a point that failed."""
+
+    CONTINUE = "continue"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class SensorUse:
+    """The sensor and how it is used.
+
+    Attributes
+    ----------
+    name : str
+        Of ``config/sensors``.
+    band_low_hz, band_high_hz : float
+        Around the mode that is identified.
+    level_v : float
+        Drive [V rms], if the sensor's whole range were excited: the amplitude of each line follows from
+        it, however few are.
+    heading_rad : float
+        Direction of the beam from clamp to tip, seen from above, from the x axis [rad].
+    """
+
+    name: str = "bimorph"
+    band_low_hz: float = 200.0
+    band_high_hz: float = 300.0
+    level_v: float = 1.0
+    heading_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.band_low_hz > 0, "band_low_hz", self.band_low_hz, "a number above 0")
+        good = self.band_high_hz > self.band_low_hz
+        require(
+            good, "band_high_hz", self.band_high_hz, f"above band_low_hz = {self.band_low_hz:g}"
+        )
+        require(self.level_v > 0, "level_v", self.level_v, "a number above 0")
+
+
+@dataclass(frozen=True)
+class TimeLimits:
+    """Longest durations [s]; a point that takes longer fails, a scan that does ends."""
+
+    point_s: float = 60.0
+    scan_s: float = 3600.0
+
+    def __post_init__(self) -> None:
+        for name in ("point_s", "scan_s"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class ScanScene:
+    """What a scan is to do.
+
+    Attributes
+    ----------
+    name : str
+    frame_id : str
+        Frame of positions and surface.
+    force_n : float
+        Contact force [N].
+    hold : Hold
+    sensor : SensorUse
+    surface : Surface or TouchRequest
+    positions_m : (n, 3) float
+        In order; z is NaN where the surface decides it [m].
+    outputs : tuple of Output
+    precision : Precise, Separate or None
+        When a point's blocks are enough; None: after the most blocks.
+    blocks : BlockLimits
+    tissue_classes : tuple of TissueClass
+        What points are told to be; empty: no tissue is called.
+    on_failure : OnFailure
+    time_limits : TimeLimits
+    """
+
+    name: str
+    force_n: float
+    positions_m: npt.NDArray[np.float64]
+    frame_id: str = "table"
+    hold: Hold = Hold.FORCE
+    sensor: SensorUse = field(default_factory=SensorUse)
+    surface: Surface | TouchRequest = field(default_factory=Plane)
+    outputs: tuple[Output, ...] = (Output.POLES, Output.MAP)
+    precision: Precise | Separate | None = None
+    blocks: BlockLimits = field(default_factory=BlockLimits)
+    tissue_classes: tuple[TissueClass, ...] = ()
+    on_failure: OnFailure = OnFailure.CONTINUE
+    time_limits: TimeLimits = field(default_factory=TimeLimits)
+
+
+def read_scan_scene(path: Path) -> ScanScene:
+    """Read a scene file; everything a scan needs has a default but the positions and the force.
+
+    Raises
+    ------
+    ValueError
+        One line that names the field, its value and what is accepted.
+    """
+    path = Path(path)
+    content, where = read_yaml(path), path.name
+    for key, value in content.items():
+        require(key in _KEYS, f"{where}: {key}", value, f"one of {sorted(_KEYS)}")
+    force_n = number(content.get("force_n"), f"{where}: force_n")
+    require(force_n > 0, f"{where}: force_n", force_n, "a number above 0")
+    frame_id = content.get("frame_id", "table")
+    good = isinstance(frame_id, str) and bool(frame_id)
+    require(good, f"{where}: frame_id", frame_id, "the name of a frame")
+    classes = _read_classes(content, path)
+    outputs = _read_outputs(content, where)
+    surface: Surface | TouchRequest = Plane()
+    if "surface" in content:
+        surface = read_surface(section(content, "surface", where), path.parent, f"{where}: surface")
+    return ScanScene(
+        name=str(content.get("name", path.stem)),
+        force_n=force_n,
+        positions_m=_read_positions(content, where),
+        frame_id=frame_id,
+        hold=_choice(content, "hold", Hold.FORCE, where),
+        sensor=_part(SensorUse, content, "sensor", where),
+        surface=surface,
+        outputs=outputs,
+        precision=_read_precision(content, classes, where),
+        blocks=_part(BlockLimits, content, "blocks", where),
+        tissue_classes=classes,
+        on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),
+        time_limits=_part(TimeLimits, content, "time_limits", where),
+    )
+
+
+def _read_positions(content: Mapping[str, Any], where: str) -> npt.NDArray[np.float64]:
+    """From ``positions``, or from ``scan_points`` as the simulated bench reads them."""
+    given = [key for key in ("positions", "scan_points") if key in content]
+    require(len(given) == 1, f"{where}: positions", given, "exactly one of positions, scan_points")
+    fields = section(content, given[0], where)
+    if given == ["positions"]:
+        return read_positions(fields, f"{where}: positions")
+    points = read_scan_points(fields, where)
+    positions = np.full((len(points), 3), np.nan)
+    positions[:, : len(points[0])] = points
+    return positions
+
+
+def _read_outputs(content: Mapping[str, Any], where: str) -> tuple[Output, ...]:
+    names = content.get("outputs", ["poles", "map"])
+    accepted = [output.value for output in Output]
+    good = isinstance(names, list) and len(names) > 0 and all(n in accepted for n in names)
+    require(good, f"{where}: outputs", names, f"a list out of {', '.join(accepted)}")
+    assert isinstance(names, list)
+    return tuple(output for output in Output if output.value in names)
+
+
+def _read_classes(content: Mapping[str, Any], path: Path) -> tuple[TissueClass, ...]:
+    """Given in place, or the name of a file beside the scene."""
+    given = content.get("tissue_classes")
+    if given is None:
+        return ()
+    if isinstance(given, str):
+        return read_classes(path.parent / given)
+    return parse_classes(given, f"{path.name}: tissue_classes")
+
+
+def _read_precision(
+    content: Mapping[str, Any], classes: tuple[TissueClass, ...], where: str
+) -> Precise | Separate | None:
+    if "precision" not in content:
+        return None
+    fields = section(content, "precision", where)
+    where = f"{where}: precision"
+    try:
+        if "separate" not in fields:
+            known_keys(fields, {"f0_std_hz", "damping_ratio_std"}, where)
+            require(
+                len(fields) > 0, where, dict(fields), "f0_std_hz, damping_ratio_std or separate"
+            )
+            wanted = {key: number(value, f"{where}.{key}") for key, value in fields.items()}
+            return Precise(**wanted)
+        known_keys(fields, {"separate", "probability"}, where)
+        names, by_name = fields["separate"], {c.name: c for c in classes}
+        good = isinstance(names, list) and len(names) == 2 and all(n in by_name for n in names)
+        require(good, f"{where}.separate", names, f"two out of tissue_classes: {sorted(by_name)}")
+        probability = number(fields.get("probability"), f"{where}.probability")
+        return Separate(by_name[names[0]], by_name[names[1]], probability)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
+
+
+def _part(cls: type, content: Mapping[str, Any], key: str, where: str) -> Any:
+    return read_dataclass(cls, section({key: {}, **content}, key, where), f"{where}: {key}")
+
+
+def _choice(content: Mapping[str, Any], key: str, default: E, where: str) -> E:
+    value = content.get(key, default.value)
+    accepted = {item.value: item for item in type(default)}
+    require(value in accepted, f"{where}: {key}", value, f"one of {', '.join(accepted)}")
+    return accepted[value]

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which tissue a pole belongs to, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from tactile_resonance.simulation.fields import require
+
+FloatArray = npt.NDArray[np.float64]
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class TissueClass:
+    """How the poles of one tissue are distributed, from sample to sample.
+
+    Attributes
+    ----------
+    name : str
+    mean : (2,) float
+        f0 [Hz] and damping ratio.
+    spread : (2, 2) float
+        Covariance of (f0, damping ratio) within the class, without the noise of one measurement.
+    degrees_of_freedom : float
+        Of the spread, where it was itself estimated; infinite where it is given.
+    prior : float
+        Relative frequency with which the class is met, above 0.
+    """
+
+    name: str
+    mean: FloatArray
+    spread: FloatArray
+    degrees_of_freedom: float = float("inf")
+    prior: float = 1.0
+
+    def __post_init__(self) -> None:
+        good = bool(self.name) and self.name != UNKNOWN
+        require(good, "name", self.name, f"a name other than {UNKNOWN!r}")
+        good = self.mean.shape == (2,) and bool(np.all(np.isfinite(self.mean)))
+        require(good, "mean", self.mean.tolist(), "f0 [Hz] and damping ratio")
+        good = self.spread.shape == (2, 2) and bool(np.all(np.isfinite(self.spread)))
+        require(good, "spread", self.spread.tolist(), "a finite 2 x 2 matrix")
+        least = float(np.linalg.eigvalsh(self.spread / _unit(self.spread))[0])
+        good = bool(np.allclose(self.spread, self.spread.T)) and least >= -1e-9
+        require(good, "spread", self.spread.tolist(), "a covariance: symmetric, not negative")
+        good = self.degrees_of_freedom > 0
+        require(good, "degrees_of_freedom", self.degrees_of_freedom, "a number above 0")
+        require(0 < self.prior < np.inf, "prior", self.prior, "a number above 0")
+
+
+@dataclass(frozen=True)
+class TissueCall:
+    """What a pole was taken for.
+
+    Attributes
+    ----------
+    name : str
+        Most probable class; `UNKNOWN` where the pole lies outside of all classes, or is not known.
+    probability : float
+        Of that class, given that it is one of the classes; NaN for `UNKNOWN`.
+    probabilities : dict of str to float
+        Of each class, given that it is one of them; empty where the pole is not known.
+    tail_probability : float
+        How often a member of the best fitting class lies as far from it as this pole, or farther; the pole
+        is `UNKNOWN` where this is below the level asked for. NaN where the pole is not known.
+    reason : str
+        Why it is `UNKNOWN`.
+    """
+
+    name: str
+    probability: float
+    probabilities: dict[str, float]
+    tail_probability: float
+    reason: str = ""
+
+
+def class_from_samples(name: str, estimates: npt.ArrayLike, prior: float = 1.0) -> TissueClass:
+    """Class of measured reference points.
+
+    Parameters
+    ----------
+    estimates : (n, 2) float
+        f0 [Hz] and damping ratio of n points of this tissue, n at least 4; their scatter holds the noise
+        of those measurements too, which is on the safe side.
+
+    Notes
+    -----
+    The next member then follows Student's distribution with n - 2 degrees of freedom about the mean and
+    the scale (n^2 - 1) / (n (n - 2)) S, S the sample covariance (Geisser, Predictive Inference, 1993,
+    section 9.1).
+    """
+    x = np.asarray(estimates, float)
+    good = x.ndim == 2 and x.shape[1] == 2 and len(x) >= 4 and bool(np.all(np.isfinite(x)))
+    require(good, "estimates", x.shape, "shape (n, 2) with n at least 4, finite")
+    n = len(x)
+    scale = (n**2 - 1) / (n * (n - 2)) * np.cov(x.T)
+    return TissueClass(name, x.mean(axis=0), scale, n - 2.0, prior)
+
+
+def classify(
+    estimate: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    classes: Sequence[TissueClass],
+    unknown_level: float = 0.01,
+) -> TissueCall:
+    """Bayes' rule over the classes, and a test whether the pole fits any of them.
+
+    Parameters
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio; NaN where unknown.
+    covariance : (2, 2) float
+        Of the estimate.
+    classes : sequence of TissueClass
+    unknown_level : float
+        A pole farther from every class than this fraction of the class's own members is `UNKNOWN`.
+
+    Raises
+    ------
+    ValueError
+        If there is no class, or two share a name.
+    """
+    names = [c.name for c in classes]
+    require(bool(names), "classes", names, "one class or more")
+    require(len(set(names)) == len(names), "classes", names, "names that differ")
+    require(0 < unknown_level < 1, "unknown_level", unknown_level, "between 0 and 1")
+    x, noise = np.asarray(estimate, float), np.asarray(covariance, float)
+    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(noise))):
+        return TissueCall(UNKNOWN, float("nan"), {}, float("nan"), "no pole with a covariance")
+    densities, tails = np.transpose([_density_and_tail(x, noise, c) for c in classes])
+    weights = densities + np.log([c.prior for c in classes])
+    posterior = np.exp(weights - weights.max())
+    posterior /= posterior.sum()
+    probabilities = {name: float(p) for name, p in zip(names, posterior, strict=True)}
+    tail = float(tails.max())
+    if tail < unknown_level:
+        nearest = names[int(np.argmax(tails))]
+        reason = f"farther from {nearest}, the nearest, than all but {tail:.2g} of its members"
+        return TissueCall(UNKNOWN, float("nan"), probabilities, tail, reason)
+    best = int(np.argmax(posterior))
+    return TissueCall(names[best], float(posterior[best]), probabilities, tail)
+
+
+def log_density(estimate: FloatArray, noise: FloatArray, tissue: TissueClass) -> float:
+    """Logarithm of the density of an estimate (2,) with noise (2, 2), if it is of this tissue."""
+    return _density_and_tail(estimate, noise, tissue)[0]
+
+
+def _density_and_tail(
+    estimate: FloatArray, noise: FloatArray, tissue: TissueClass
+) -> tuple[float, float]:
+    """Log density, and probability of lying as far out.
+
+    With an estimated spread the sum of Student's and Gaussian deviations is taken as Student's of the
+    summed scale: exact where either vanishes.
+    """
+    scale = tissue.spread + noise
+    unit = np.sqrt(np.diag(scale))
+    require(bool(np.all(unit > 0)), "covariance", noise.tolist(), "above 0 with the spread added")
+    standard = (estimate - tissue.mean) / unit
+    correlation = scale / np.outer(unit, unit)
+    distance2 = float(standard @ np.linalg.solve(correlation, standard))
+    log_volume = 0.5 * np.linalg.slogdet(correlation)[1] + float(np.sum(np.log(unit)))
+    dof = tissue.degrees_of_freedom
+    if np.isinf(dof):
+        log_shape, tail = -0.5 * distance2, stats.chi2.sf(distance2, 2)
+    else:
+        # two dimensions: the constant of Student's density is that of the Gaussian, 1 / 2 pi
+        log_shape, tail = (
+            -(dof + 2) / 2 * np.log1p(distance2 / dof),
+            stats.f.sf(distance2 / 2, 2, dof),
+        )
+    return float(log_shape - log_volume - np.log(2 * np.pi)), float(tail)
+
+
+def _unit(covariance: FloatArray) -> FloatArray:
+    """Outer product of the standard deviations, 1 where they vanish."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 0))
+    std = np.where(std > 0, std, 1.0)
+    return np.outer(std, std)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small runs for the tests."""
+
+import numpy as np
+
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.scan_point import ScanPoint
+
+POLES = "tactile_resonance/msg/Poles"
+RECORD = "tactile_resonance/msg/Record"
+START_NS = 1_700_000_000_000_000_000
+
+
+def plan(count):
+    return [
+        ScanPoint(i, (0.002 * i, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), f"point {i}")
+        for i in range(count)
+    ]
+
+
+def record_cdr(index, samples=200):
+    """A record whose content tells which point it is of."""
+    types = message_types().types
+    counts = (np.arange(samples, dtype=np.int32) * 7 + index).astype(np.int32)
+    return message_types().serialize_cdr(blank(types, RECORD, actuator_counts=counts), RECORD)
+
+
+def blank(types, name, **values):
+    """Message with every field zero or empty but those given."""
+    kinds = {
+        "string": "",
+        "bool": False,
+        "float64": 0.0,
+    }
+    content = {}
+    for field, (node, detail) in message_types().fielddefs[name][1]:
+        if field in values:
+            content[field] = values[field]
+        elif int(node) == 1:
+            base = detail[0] if isinstance(detail, tuple) else detail
+            content[field] = kinds.get(base, 0)
+        elif int(node) == 2:
+            content[field] = blank(types, detail)
+        else:
+            base = detail[0][1]
+            base = base[0] if isinstance(base, tuple) else base
+            content[field] = np.zeros(0, {"float64": float}.get(base, base))
+    return types[name](**content)
+
+
+def result(index, attempt=0, **values):
+    given = {
+        "label": f"point {index}",
+        "x_m": 0.002 * index,
+        "y_m": 0.0,
+        "z_m": 0.0,
+        "f0_hz": 250.0 + index,
+        "f0_std_hz": 0.01,
+        "damping_ratio": 0.03 + 0.001 * index,
+        "damping_ratio_std": 1e-5,
+        "f0_damping_covariance_hz": 1e-8,
+        "time_ns": START_NS + index * 10**9,
+        "frame_id": "table",
+        "blocks": 3,
+    }
+    return PointResult(index, attempt, **{**given, **values})
+
+
+def record_point(run, index, messages=3, **values):
+    """Record one whole point."""
+    with run.begin_point(index) as recording:
+        for k in range(messages):
+            time_ns = START_NS + index * 10**9 + k * 10**6
+            recording.write("/record", RECORD, time_ns, record_cdr(index))
+        recording.finish(result(index, recording.attempt, **values))

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When it is enough: Wald's test against its theory, precision against what it must do."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tactile_resonance.scan.decision import (
+    BlockLimits,
+    Precise,
+    Separate,
+    Verdict,
+    decide,
+    log_likelihood_ratio,
+)
+from tactile_resonance.tissue.classify import TissueClass
+
+# of one block
+BLOCK = np.array([[0.02**2, 0.2 * 0.02 * 8e-5], [0.2 * 0.02 * 8e-5, 8e-5**2]])
+LIMITS = BlockLimits(least=1, most=200)
+
+
+def point_classes(distance, spread=None):
+    """Two classes `distance` standard deviations of one block apart, in both quantities."""
+    spread = np.zeros((2, 2)) if spread is None else spread
+    direction = np.array([0.02, 3e-5])
+    unit = direction / np.sqrt(direction @ np.linalg.solve(BLOCK, direction))
+    first = np.array([253.8, 0.0336])
+    return (
+        TissueClass("first", first, spread),
+        TissueClass("second", first + distance * unit, spread),
+    )
+
+
+def run(rng, wanted, mean, limits=LIMITS):
+    """Blocks until a decision, as a scan does: poles of all blocks so far."""
+    total = np.zeros(2)
+    factor = np.linalg.cholesky(BLOCK)
+    for blocks in range(1, limits.most + 1):
+        total += mean + factor @ rng.standard_normal(2)
+        decision = decide(total / blocks, BLOCK / blocks, None, blocks, wanted, limits, 0.4)
+        if decision.stop:
+            return decision
+    raise AssertionError("unreachable")
+
+
+# physics.md: d' per block -> blocks of a fixed test, mean of the sequential one, both at 99 %
+PUBLISHED = {0.5: (87, 38.7), 1.0: (22, 10.5), 2.0: (6, 3.2), 4.65: (2, 1.1), 6.0: (1, 1.0)}
+
+
+@pytest.mark.parametrize("distance", PUBLISHED)
+def test_sequential_test_needs_the_blocks_that_were_published(distance):
+    fixed, mean = PUBLISHED[distance]
+    assert int(np.ceil((2 * stats.norm.isf(0.01) / distance) ** 2)) == fixed
+    rng, runs = np.random.default_rng(5), 400
+    wanted = Separate(*point_classes(distance), probability=0.99)
+    decisions = [run(rng, wanted, wanted.first.mean) for _ in range(runs)]
+    blocks = np.array([d.blocks for d in decisions])
+    standard_error = blocks.std() / np.sqrt(runs)
+    # half a unit of the last digit that was published, and the Monte Carlo of both
+    assert blocks.mean() == pytest.approx(mean, abs=5 * standard_error + 0.1)
+    wrong = sum(d.called != "first" for d in decisions)
+    # Wald: at most 1 %; exceeded with probability 1e-4 by chance
+    assert wrong <= stats.binom.isf(1e-4, runs, 0.01)
+    assert all(d.verdict in (Verdict.SEPARATED, Verdict.NEITHER) for d in decisions)
+    assert all(d.blocks_saved == LIMITS.most - d.blocks for d in decisions)
+    assert decisions[0].saved_s == pytest.approx(0.4 * decisions[0].blocks_saved)
+
+
+def test_errors_stay_below_what_is_allowed_with_spread_in_the_classes():
+    rng, runs = np.random.default_rng(6), 500
+    spread = 4 * BLOCK
+    wanted = Separate(*point_classes(9.0, spread), probability=0.95)
+    wrong = 0
+    for i in range(runs):
+        tissue = (wanted.first, wanted.second)[i % 2]
+        sample = rng.multivariate_normal(tissue.mean, spread)
+        decision = run(rng, wanted, sample, BlockLimits(1, 30))
+        wrong += bool(decision.called) and decision.called != tissue.name
+    assert wrong <= stats.binom.isf(1e-4, runs, 0.05)
+
+
+def test_likelihood_ratio_of_all_blocks_is_the_sum_over_blocks():
+    rng = np.random.default_rng(7)
+    wanted = Separate(*point_classes(1.5), probability=0.99)
+    x = rng.multivariate_normal(wanted.first.mean, BLOCK, 6)
+    together = log_likelihood_ratio(x.mean(axis=0), BLOCK / 6, wanted)
+    apart = sum(log_likelihood_ratio(xi, BLOCK, wanted) for xi in x)
+    assert together == pytest.approx(apart, rel=1e-9)
+
+
+def test_what_is_neither_ends_it():
+    wanted = Separate(*point_classes(3.0), probability=0.99)
+    far = wanted.first.mean + [1.0, 0.0]
+    decision = decide(far, BLOCK, None, 3, wanted, BlockLimits(), 0.4)
+    assert decision.verdict is Verdict.NEITHER
+    assert decision.called == ""
+
+
+def precise(blocks, noise_std, floor=0.0, **wanted):
+    noise = np.diag([noise_std**2, (noise_std / 100) ** 2])
+    total = noise + np.diag([floor**2, 0])
+    wanted = Precise(**(wanted or {"f0_std_hz": 0.01}))
+    return decide([250.0, 0.03], noise, total, blocks, wanted, BlockLimits(3, 8), 0.4)
+
+
+def test_stops_at_the_block_where_it_is_precise_enough():
+    # noise of one block 0.02 Hz: 0.01 Hz takes four
+    verdicts = [precise(n, 0.02 / np.sqrt(n)).verdict for n in range(1, 5)]
+    assert verdicts == [Verdict.CONTINUE] * 3 + [Verdict.PRECISE]
+    last = precise(4, 0.01)
+    assert (last.blocks_saved, last.saved_s) == (4, pytest.approx(1.6))
+    assert precise(2, 1e-6).verdict is Verdict.CONTINUE  # fewer than the least
+    assert precise(8, 0.013).verdict is Verdict.MOST_BLOCKS
+    both = precise(4, 0.005, f0_std_hz=0.01, damping_ratio_std=4e-5)
+    assert both.verdict is Verdict.CONTINUE
+    assert "damping ratio 5e-05, 4e-05 asked for" in both.reason
+
+
+def test_gives_up_what_no_block_will_bring():
+    # noise alone would come down, a floor of distortion does not
+    hopeless = precise(3, 0.012, floor=0.02)
+    assert hopeless.verdict is Verdict.HOPELESS
+    assert "expected after 8 blocks" in hopeless.reason
+    assert hopeless.blocks_saved == 5
+    # within reach of the blocks left, and at the margin of what an estimate can tell: go on
+    assert precise(3, 0.016).verdict is Verdict.CONTINUE
+    assert precise(3, 0.02).verdict is Verdict.CONTINUE
+    assert precise(3, 0.1).verdict is Verdict.HOPELESS
+
+
+def test_without_poles_or_precision_it_goes_on_to_the_most_blocks():
+    for wanted in (None, Precise(f0_std_hz=0.01), Separate(*point_classes(3), probability=0.99)):
+        for n, verdict in ((3, Verdict.CONTINUE), (8, Verdict.MOST_BLOCKS)):
+            decision = decide([np.nan] * 2, None, None, n, wanted, BlockLimits(), 0.4)
+            assert decision.verdict is verdict
+            assert decision.blocks_saved == 0

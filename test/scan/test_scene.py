@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scene files: what is read, and what is refused with one line that names field, value and accepted."""
+
+import numpy as np
+import pytest
+import yaml
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.scan.decision import Precise, Separate
+from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.scene import Hold, OnFailure, Output, read_scan_scene
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.scene import read_scene
+from tactile_resonance.tissue.classify import classify
+
+SCENES = sorted(path.name for path in share_path("config/scenes").glob("*.yaml"))
+LEAST = {"force_n": 0.01, "positions": {"list": [[0, 0], [0.01, 0]]}}
+CLASSES = {
+    name: {"f0_hz": f0, "damping_ratio": 0.03, "f0_std_hz": 0.1, "damping_ratio_std": 1e-4}
+    for name, f0 in (("a", 250.0), ("b", 255.0))
+}
+
+
+def read(tmp_path, **content):
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump({**LEAST, **content}))
+    return read_scan_scene(path)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_serves_bench_and_scan(name):
+    path = share_path("config/scenes") / name
+    scene, phantoms = read_scan_scene(path), read_scene(read_tissues(), path)
+    assert scene.force_n == phantoms.force_n
+    points = make_plan(scene).points
+    assert all(phantoms.tissue_at(p.position_m) is not None for p in points)
+    if phantoms.scan_points_m:
+        np.testing.assert_allclose(
+            [p.position_m[:2] for p in points], [p[:2] for p in phantoms.scan_points_m]
+        )
+
+
+def test_classes_of_the_inclusion_are_the_benchs_own():
+    path = share_path("config/scenes/inclusion_scan.yaml")
+    scene, phantoms = read_scan_scene(path), read_scene(read_tissues(), path)
+    bench = SimulatedBench.from_configuration()
+
+    def poles(tissue):
+        modes = bench.coupled(tissue, force_n=scene.force_n).modes
+        mode = min(modes, key=lambda m: abs(m.f0_hz - 250))
+        return np.array([mode.f0_hz, mode.damping_ratio])
+
+    plain, _ = scene.tissue_classes
+    gelatine = read_tissues().gelatine
+    np.testing.assert_allclose(plain.mean, poles(gelatine(10.0)), rtol=1e-4)
+    # the spread is that of 0.33 % w/w more or less
+    step = poles(gelatine(10.33)) - plain.mean
+    np.testing.assert_allclose(np.sqrt(np.diag(plain.spread)), step, rtol=0.1)
+    noise = np.diag([0.01**2, 5e-5**2])
+    called = [
+        classify(poles(phantoms.tissue_at((0.002, y))), noise, scene.tissue_classes).name
+        for y in (0.02, -0.001, 0.001)
+    ]
+    assert called == ["gelatine 10 %", "inclusion", "inclusion"]
+
+
+def test_defaults_and_choices(tmp_path):
+    scene = read(tmp_path)
+    assert (scene.hold, scene.on_failure) == (Hold.FORCE, OnFailure.CONTINUE)
+    assert scene.outputs == (Output.POLES, Output.MAP)
+    assert scene.precision is None
+    assert scene.frame_id == "table"
+    scene = read(
+        tmp_path,
+        hold="indentation",
+        on_failure="stop",
+        outputs=["distortion", "poles"],
+        precision={"f0_std_hz": 0.02},
+        blocks={"least": 2},
+        tissue_classes=CLASSES,
+    )
+    assert (scene.hold, scene.on_failure) == (Hold.INDENTATION, OnFailure.STOP)
+    assert scene.outputs == (Output.POLES, Output.DISTORTION)
+    assert scene.precision == Precise(f0_std_hz=0.02)
+    assert (scene.blocks.least, scene.blocks.most) == (2, 8)
+    scene = read(
+        tmp_path, tissue_classes=CLASSES, precision={"separate": ["a", "b"], "probability": 0.99}
+    )
+    assert isinstance(scene.precision, Separate)
+    assert scene.precision.second is scene.tissue_classes[1]
+
+
+def test_classes_from_a_file_and_from_points(tmp_path):
+    points = [[250.0, 0.03], [250.1, 0.031], [249.8, 0.0305], [250.3, 0.0302]]
+    content = {"tissue_classes": {"measured": {"points": points, "prior": 2.0}}}
+    (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content))
+    (tissue,) = read(tmp_path, tissue_classes="classes.yaml").tissue_classes
+    np.testing.assert_allclose(tissue.mean, np.mean(points, axis=0))
+    assert (tissue.degrees_of_freedom, tissue.prior) == (2.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ({"force": 1}, r"scene.yaml: force: got 1; accepted is one of"),
+        ({"force_n": -1}, "force_n: got -1.0; accepted is a number above 0"),
+        ({"force_n": "1e-2"}, "force_n: got '1e-2'; accepted is a finite number"),
+        ({"hold": "pressure"}, "hold: got 'pressure'; accepted is one of force, indentation"),
+        ({"outputs": ["poles", "sound"]}, "outputs: got .*sound.* a list out of poles"),
+        ({"outputs": []}, "outputs: got"),
+        ({"blocks": {"least": 5, "most": 4}}, "blocks.most: got 4; accepted is at least least = 5"),
+        ({"blocks": {"least": 2.5}}, "blocks.least: got 2.5; accepted is an integer"),
+        ({"blocks": {"fewest": 2}}, "blocks.fewest"),
+        ({"sensor": {"band_low_hz": 300.0, "band_high_hz": 200.0}}, "sensor.band_high_hz: got 200"),
+        ({"time_limits": {"point_s": 0.0}}, "time_limits.point_s: got 0"),
+        ({"precision": {}}, "precision: got {}"),
+        ({"precision": {"f0_std_hz": 0}}, "precision.f0_std_hz: got 0"),
+        ({"precision": {"separate": ["a", "b"], "probability": 0.9}}, r"two out of .*\[\]"),
+        (
+            {"tissue_classes": CLASSES, "precision": {"separate": ["a", "b"], "probability": 0.4}},
+            "precision.probability: got 0.4; accepted is between 0.5 and 1",
+        ),
+        ({"tissue_classes": {"a": {"f0_hz": 250.0}}}, "tissue_classes.a.damping_ratio: got None"),
+        ({"tissue_classes": "none.yaml"}, "none.yaml"),
+        ({"positions": None}, "positions: got None"),
+        ({"scan_points": {"centres_m": [[0, 0]], "offsets_m": [[0, 0]]}}, "exactly one of"),
+        ({"frame_id": 3}, "frame_id: got 3"),
+        ({"surface": {"plane": {"normal": [0, 0, -1]}}}, "surface.plane.normal"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, content, reason):
+    with pytest.raises(ValueError, match=reason) as caught:
+        read(tmp_path, **content)
+    assert "\n" not in str(caught.value) or "none.yaml" in reason

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heights and normals against surfaces with closed forms; a touched surface against its own statistics."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_resonance.scan.mesh import TriangleMesh, read_stl
+from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest, read_surface
+from tactile_resonance.scan.touch import fit_surface
+
+slopes = st.floats(-1.5, 1.5)
+
+
+@given(slopes, slopes, st.floats(-0.1, 0.1))
+def test_plane_is_normal_to_its_normal(slope_x, slope_y, z0):
+    plane = Plane((0.01, -0.02, z0), (-slope_x, -slope_y, 1.0))
+    xy = np.array([[0.01, -0.02], [0.05, 0.0], [0.0, 0.07]])
+    z = plane.height_m(xy)
+    assert z[0] == pytest.approx(z0)
+    np.testing.assert_allclose(
+        z - z0, slope_x * (xy[:, 0] - 0.01) + slope_y * (xy[:, 1] + 0.02), atol=1e-12
+    )
+    points = np.column_stack([xy, z])
+    np.testing.assert_allclose((points - points[0]) @ plane.normal(xy[0]), 0, atol=1e-12)
+    assert plane.normal(xy)[1, 2] > 0
+
+
+def bowl(x, y):
+    """Quadric, exact on a bicubic spline."""
+    return 0.02 + 0.3 * x - 0.1 * y + 4.0 * x**2 + 2.0 * x * y - 3.0 * y**2
+
+
+def test_height_field_reproduces_a_quadric():
+    x, y = np.linspace(-0.03, 0.03, 9), np.linspace(-0.02, 0.02, 7)
+    surface = HeightField(x, y, bowl(*np.meshgrid(x, y, indexing="ij")))
+    rng = np.random.default_rng(1)
+    xy = rng.uniform([-0.03, -0.02], [0.03, 0.02], (50, 2))
+    np.testing.assert_allclose(surface.height_m(xy), bowl(*xy.T), rtol=1e-10)
+    slope = np.stack([0.3 + 8 * xy[:, 0] + 2 * xy[:, 1], -0.1 + 2 * xy[:, 0] - 6 * xy[:, 1]], 1)
+    normal = surface.normal(xy)
+    np.testing.assert_allclose(-normal[:, :2] / normal[:, 2:], slope, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, rtol=1e-12)
+    assert np.isnan(surface.height_m([0.031, 0.0]))
+    assert np.isnan(surface.normal([0.0, 0.021])).all()
+
+
+def cap(radius_m, steps, flip=False):
+    """Triangles of a spherical cap with its pole up, about the origin."""
+    polar, turn = np.linspace(0, 1.0, steps), np.linspace(0, 2 * np.pi, 4 * steps + 1)
+    turn[-1] = 0.0
+
+    def at(i, j):
+        s, c = np.sin(polar[i]), np.cos(polar[i])
+        return radius_m * np.array([s * np.cos(turn[j]), s * np.sin(turn[j]), c])
+
+    triangles = []
+    for i in range(steps - 1):
+        for j in range(4 * steps):
+            triangles.append([at(i, j), at(i + 1, j), at(i + 1, j + 1)])
+            if i:
+                triangles.append([at(i, j), at(i + 1, j + 1), at(i, j + 1)])
+    out = np.array(triangles)
+    return out[:, ::-1] if flip else out
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_mesh_of_a_sphere_converges_to_the_sphere(flip):
+    radius, rng = 0.05, np.random.default_rng(2)
+    xy = rng.uniform(-0.025, 0.025, (60, 2))
+    exact = np.sqrt(radius**2 - np.sum(xy**2, axis=1))
+    outward = np.column_stack([xy, exact]) / radius
+    errors = []
+    for steps in (8, 16, 32):
+        mesh = TriangleMesh.from_triangles(cap(radius, steps, flip))
+        height = np.max(np.abs(mesh.height_m(xy) - exact))
+        angle = np.max(np.arccos(np.clip(np.sum(mesh.normal(xy) * outward, axis=1), -1, 1)))
+        errors.append((height, angle))
+    height, angle = np.array(errors).T
+    assert np.all(height[:-1] / height[1:] > 3)  # second order
+    assert height[-1] < 1e-3 * radius
+    assert angle[-1] < 0.01
+    assert np.isnan(mesh.height_m([0.049, 0.0]))
+
+
+def test_the_topmost_face_counts():
+    low = np.array([[[-1, -1, 0], [1, -1, 0], [0, 2, 0]]], float)
+    mesh = TriangleMesh.from_triangles(np.concatenate([low, low / 4 + [0, 0, 0.5]]))
+    np.testing.assert_allclose(mesh.height_m([[0, 0], [0.6, -0.6], [0, 3]]), [0.5, 0, np.nan])
+
+
+def test_stl_text_and_binary_are_the_same(tmp_path):
+    triangles = cap(0.05, 5).astype(np.float32)
+    binary, text = tmp_path / "b.stl", tmp_path / "t.stl"
+    rows = b"".join(np.zeros(3, "<f4").tobytes() + t.tobytes() + b"\0\0" for t in triangles)
+    binary.write_bytes(b"solid misleading".ljust(80) + struct.pack("<I", len(triangles)) + rows)
+    lines = ["solid cap"]
+    for t in triangles:
+        lines += ["facet normal 0 0 0", "outer loop"]
+        lines += ["vertex " + " ".join(f"{v:.9g}" for v in corner) for corner in t]
+        lines += ["endloop", "endfacet"]
+    text.write_text("\n".join([*lines, "endsolid cap"]))
+    np.testing.assert_array_equal(read_stl(binary), triangles.astype(float))
+    np.testing.assert_array_equal(read_stl(text).astype(np.float32), triangles)
+    surface = read_surface({"mesh": {"file": "b.stl", "unit_m": 0.001}}, tmp_path, "surface")
+    assert surface.height_m([0.0, 0.0]) == pytest.approx(0.05e-3, rel=1e-6)
+    for content, reason in ((b"solid x\nendsolid", "no triangle"), (b"\0" * 90, "no triangle")):
+        binary.write_bytes(content)
+        with pytest.raises(ValueError, match=reason):
+            read_stl(binary)
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_stl(tmp_path / "none.stl")
+
+
+def test_a_mesh_wound_both_ways_is_refused():
+    a = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 1, 0], [1, 1, 0]]], float)
+    with pytest.raises(ValueError, match="one winding for all"):
+        TriangleMesh.from_triangles(a)
+    assert TriangleMesh.from_triangles([a[0], a[1][::-1]]).height_m([0.9, 0.9]) == 0
+
+
+@pytest.mark.parametrize(("form", "contacts"), [("plane", 3), ("plane", 6), ("quadric", 9)])
+def test_touched_surface_covers_the_truth(form, contacts):
+    """Seeded Monte Carlo: heights and slopes lie within the stated covariance as often as stated."""
+    rng, std = np.random.default_rng(3), 2e-5
+    xy = rng.uniform(-0.02, 0.02, (contacts, 2))
+    at = np.array([0.005, -0.012])
+
+    def true(x, y):
+        return bowl(x, y) if form == "quadric" else 0.02 + 0.3 * x - 0.1 * y
+
+    slope = np.array([0.3, -0.1])
+    if form == "quadric":
+        slope += [8 * at[0] + 2 * at[1], 2 * at[0] - 6 * at[1]]
+    height, slopes, inconsistent, runs = [], [], 0, 600
+    for _ in range(runs):
+        z = true(*xy.T) + std * rng.standard_normal(contacts)
+        surface = fit_surface(np.column_stack([xy, z]), std, form)
+        inconsistent += not surface.consistent
+        height.append((surface.height_m(at) - true(*at)) / surface.height_std_m(at))
+        normal = surface.normal(at)
+        error = -normal[:2] / normal[2] - slope
+        slopes.append(error @ np.linalg.solve(surface.slope_covariance(at), error))
+    # mean square 1 within 4 standard deviations of chi-square; two degrees of freedom for the slopes
+    assert np.mean(np.square(height)) == pytest.approx(1, abs=4 * np.sqrt(2 / runs))
+    assert np.mean(slopes) / 2 == pytest.approx(1, abs=4 * np.sqrt(1 / runs))
+    assert inconsistent <= 6  # 0.1 % expected of those with contacts to spare
+
+
+def test_a_bad_contact_is_told_and_widens_the_uncertainty():
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(-0.02, 0.02, (8, 2))
+    z = 0.01 + 0.1 * xy[:, 0] + 1e-5 * rng.standard_normal(8)
+    good = fit_surface(np.column_stack([xy, z]), 1e-5)
+    z[3] += 1e-3
+    bad = fit_surface(np.column_stack([xy, z]), 1e-5)
+    assert good.consistent
+    assert not bad.consistent
+    assert bad.height_std_m([0.0, 0.0]) > 10 * good.height_std_m([0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("contacts", "form", "reason"),
+    [
+        ([[0, 0, 0], [1, 0, 0]], "plane", "n at least 3 for a plane"),
+        ([[0, 0, 0], [1, 1, 0], [2, 2, 0]], "plane", "not on one line"),
+        ([[0, 0, 0]] * 3, "plane", "positions apart"),
+        ([[np.nan, 0, 0]] * 3, "plane", "finite positions"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "sphere", "one of plane, quadric"),
+    ],
+)
+def test_contacts_that_determine_nothing_are_refused(contacts, form, reason):
+    with pytest.raises(ValueError, match=reason):
+        fit_surface(np.array(contacts, float), 1e-5, form)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({}, "exactly one of"),
+        ({"plane": {}, "mesh": {}}, "exactly one of"),
+        ({"plain": {}}, "one of"),
+        ({"plane": {"normal": [1, 0, 0]}}, r"surface.plane.normal: got \(1.0, 0.0, 0.0\)"),
+        ({"plane": {"nomal": [1, 0, 0]}}, "surface.plane.nomal"),
+        ({"mesh": {"file": "x.stl"}}, "surface.mesh.unit_m"),
+        ({"mesh": {"file": "x.stl", "unit_m": 1.0}}, "surface.mesh.file: .*x.stl cannot be read"),
+        ({"height_field": {"x_m": [0, 1], "y_m": [0, 1], "z_m": [[0, 1]]}}, "z_m: .* 2 rows"),
+        ({"height_field": {"x_m": [1, 0], "y_m": [0, 1], "z_m": [[0, 1]] * 2}}, "ascending"),
+        ({"touch": {"points_m": [[0, 0]]}}, "3 positions or more"),
+    ],
+)
+def test_wrong_surfaces_are_refused(fields, reason, tmp_path):
+    with pytest.raises(ValueError, match=reason):
+        read_surface(fields, tmp_path, "surface")
+
+
+def test_a_surface_to_be_touched_is_a_request(tmp_path):
+    fields = {"touch": {"points_m": [[0, 0], [0.01, 0], [0, 0.01]], "form": "plane"}}
+    assert isinstance(read_surface(fields, tmp_path, "s"), TouchRequest)
