@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import replace
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
@@ -14,6 +15,7 @@ from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
+from tactile_resonance.contact.force_history import ForceHistory
 from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import devices, excitation_design
@@ -21,10 +23,11 @@ from tactile_resonance.nodes.conversions import (
     contact_from_message,
     excitation_to_message,
     record_to_message,
+    time_from_message,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, STREAM, run_node
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
@@ -46,9 +49,9 @@ class Cancelled(Exception):
 class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched) and `record`.
 
-    Every record is on disk before it is published. Records carry the tip pose and the force heard
-    last on `tcp_pose` and `wrench`, where the device is no replay. The device is read in a thread
-    of its own, so that its blocking calls never hold up the executor.
+    Every record is on disk before it is published. Records carry the tip pose heard last on
+    `tcp_pose` and the mean of `wrench` over the block, where the device is no replay. The device is
+    read in a thread of its own, so that its blocking calls never hold up the executor.
     """
 
     def __init__(self) -> None:
@@ -65,11 +68,11 @@ class ExcitationNode(ManagedNode):
         self._store: RecordStore | None = None
         self._has_store = False
         self._pose = PoseStamped()
-        self._force_n = float("nan")
+        self._forces = ForceHistory()
         self._busy = threading.Lock()
         self._measurements = 0
         self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.listen(WrenchStamped, "wrench", self._on_wrench, STREAM)
+        self.listen(WrenchStamped, "wrench", self._on_wrench, SERIES)
         server = ActionServer(
             self,
             Measure,
@@ -89,7 +92,7 @@ class ExcitationNode(ManagedNode):
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         # +z is the outward surface normal: what the tissue does to the tip points along it
-        self._force_n = message.wrench.force.z
+        self._forces.add(time_from_message(message.header.stamp), message.wrench.force.z)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
@@ -241,12 +244,16 @@ class ExcitationNode(ManagedNode):
                 frame_id=info.frame_id or self._frame_id,
                 label=excitation.label,
                 simulated=info.simulated,
-                contact=block.contact or self._contact(),
+                contact=block.contact or self._contact(block.time_ns, excitation.period_s),
             ),
         )
 
-    def _contact(self) -> Contact:
-        return contact_from_message(self._pose, self._force_n, float("nan"))
+    def _contact(self, start_ns: int, length_s: float) -> Contact:
+        """Force while the block was taken; where none was heard then, the last one, of unknown accuracy."""
+        force_n, std_n = self._forces.mean(start_ns, start_ns + round(length_s * 1e9))
+        if np.isnan(force_n):
+            force_n = self._forces.newest()[1]
+        return contact_from_message(self._pose, force_n, std_n)
 
 
 def _reason(error: Exception) -> str:

@@ -26,6 +26,14 @@ PARAMETERS = (
     Parameter("band_high_hz", 0.0, "To here [Hz]; 0: all excited lines.", 0.0, 1e7),
     Parameter("transient_order", 2, "Order of the local polynomial for the transient.", 0, 10),
     Parameter("noise_dof", 6, "Degrees of freedom of the noise variance, at least.", 1, 100),
+    Parameter(
+        "bins_low_hz",
+        200.0,
+        "All bins of the record from here go with the FRF, for the joint estimator of poles [Hz].",
+        0.0,
+        1e7,
+    ),
+    Parameter("bins_high_hz", 300.0, "To here [Hz]; 0: none are sent.", 0.0, 1e7),
 )
 
 
@@ -106,11 +114,13 @@ class FrfNode(ManagedNode):
         low_hz, high_hz, order, dof = values(
             self, "band_low_hz", "band_high_hz", "transient_order", "noise_dof"
         )
+        bins_low_hz, bins_high_hz = values(self, "bins_low_hz", "bins_high_hz")
         return MeasurementFrf(
             measurement_id,
             band_hz=(low_hz, high_hz) if high_hz > 0 else None,
             order=order,
             dof=dof,
+            bins_band_hz=(bins_low_hz, bins_high_hz) if bins_high_hz > 0 else None,
         )
 
 

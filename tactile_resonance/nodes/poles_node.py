@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FRF -> poles."""
+"""FRF, and the bins it brings -> poles."""
 
 from __future__ import annotations
 
 from tactile_resonance import msg
-from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_frf
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.nodes.conversions import (
@@ -28,6 +28,13 @@ PARAMETERS = (
         "second-order model.",
         0,
         20,
+    ),
+    Parameter(
+        "method",
+        "auto",
+        "joint: poles and transient from all bins of the band; frf: from the FRF; auto: joint where "
+        "the FRF brings the bins.",
+        choices=POLES_METHODS,
     ),
 )
 
@@ -55,12 +62,11 @@ class PolesNode(ManagedNode):
 
     def _identify(self, frf: FRF) -> Poles:
         """Poles, or the reason why there are none: a reader waits for an answer to every FRF."""
-        low_hz, high_hz, order, terms = values(
-            self, "band_low_hz", "band_high_hz", "order", "residual_terms"
+        low_hz, high_hz, order, terms, method = values(
+            self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )
-        if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
-            return Poles(status=PolesStatus.FAILED, message=frf.message)
-        return identify_poles(frf, (low_hz, high_hz), ModelStructure.with_residual(order, terms))
+        structure = ModelStructure.with_residual(order, terms)
+        return poles_of_frf(frf, (low_hz, high_hz), structure, method)
 
 
 def main() -> None:

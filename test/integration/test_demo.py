@@ -77,14 +77,16 @@ def test_four_concentrations_are_told_apart(domain, tmp_path):
     options = ["--measurement", rows[0]["measurement_id"], "--band", "200", "300"]
     answer = subprocess.run(
         [sys.executable, "-m", "tactile_resonance.cli", "analyze", records, *options]
-        + ["--method", "frf", "--json", tmp_path / "again.json"],
+        + ["--json", tmp_path / "again.json"],
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert answer.returncode == 0, answer.stderr
-    again = json.loads((tmp_path / "again.json").read_text())["poles"][0]
-    # streamed and at once agree to 1e-9 of the response; a millionth of its standard deviation here
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["method"] == rows[0]["method"] == "joint maximum likelihood of poles and transient"
+    again = again["poles"][0]
+    # streamed and at once agree to rounding of the bins; a millionth of the standard deviation here
     assert abs(again["f0_hz"] - float(rows[0]["f0_hz"])) < 1e-6 * float(rows[0]["f0_std_hz"])
 
 

@@ -87,7 +87,7 @@ def session(tmp_path_factory):
         nodes.bring_up(NODES, parameters)
         with ScanSession(nodes.check) as session:
             session.wait_for_nodes(30.0)
-            session.warm_up(GEL_10)
+            session.warm_up(GEL_10, 30.0)
             yield session
 
 
