@@ -164,6 +164,9 @@ def _measure(nodes: NodeProcesses, places: list, options: argparse.Namespace) ->
                         result.poles,
                         true_f0,
                         true_damping,
+                        result.contact.force_n,
+                        result.contact.contact_radius_m,
+                        result.contact.indentation_m,
                     )
                 )
     return points

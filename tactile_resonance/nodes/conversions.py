@@ -17,7 +17,7 @@ import numpy.typing as npt
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 
-from tactile_resonance import msg
+from tactile_resonance import msg, srv
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -25,6 +25,7 @@ from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
+from tactile_resonance.simulation.truth import Truth
 
 GRIDS = {
     Grid.CUSTOM: msg.Excitation.GRID_CUSTOM,
@@ -295,6 +296,29 @@ def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
         message=message.message,
     )
     return poles, origin_from_message(message)
+
+
+def truth_to_response(truth: Truth, response: srv.Truth.Response) -> None:
+    """Fill the answer of the simulated bench."""
+    response.success = True
+    response.feedthrough = truth.feedthrough
+    if truth.tissue is not None:
+        response.tissue = truth.tissue.name
+        response.force_n = truth.force_n
+        response.contact_radius_m = truth.contact_radius_m
+        response.indentation_m = truth.indentation_m
+        response.relaxation_modulus_1s_pa = truth.tissue.relaxation_modulus_1s_pa
+    _fill(response.pole_real_rad_s, truth.poles_rad_s.real, float)
+    _fill(response.pole_imag_rad_s, truth.poles_rad_s.imag, float)
+    _fill(response.residue_real_rad_s, truth.residues_rad_s.real, float)
+    _fill(response.residue_imag_rad_s, truth.residues_rad_s.imag, float)
+    _fill(response.f0_hz, np.array([mode.f0_hz for mode in truth.modes]), float)
+    _fill(response.damping_ratio, np.array([mode.damping_ratio for mode in truth.modes]), float)
+    _fill_complex(response, "response_", truth.response)
+    if truth.contact_stiffness_n_per_m is not None:
+        stiffness = truth.contact_stiffness_n_per_m
+        _fill(response.stiffness_real_n_per_m, stiffness.real, float)
+        _fill(response.stiffness_imag_n_per_m, stiffness.imag, float)
 
 
 def time_message(time_ns: int) -> Time:

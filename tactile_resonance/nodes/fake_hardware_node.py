@@ -22,6 +22,7 @@ from tactile_resonance.nodes.conversions import (
     poles_to_message,
     record_to_message,
     time_from_message,
+    truth_to_response,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
@@ -33,7 +34,8 @@ from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.tissue import Tissue
-from tactile_resonance.srv import Play
+from tactile_resonance.simulation.truth import truth_of
+from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
     Parameter(
@@ -55,7 +57,7 @@ ACKNOWLEDGED_WITHIN_S = 5.0
 
 
 class FakeHardwareNode(ManagedNode):
-    """Serves `bench/play` and `bench/stop`, hands out `bench/block`.
+    """Serves `bench/play`, `bench/stop` and `bench/get_truth`, hands out `bench/block`.
 
     The tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there is tissue: the
     force comes back on `wrench`, and what the simulation knows of the poles on `bench/truth` (latched, all
@@ -81,6 +83,8 @@ class FakeHardwareNode(ManagedNode):
         self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.serve(Play, "bench/play", self._on_play)
         self.serve(Trigger, "bench/stop", self._on_stop)
+        self.serve(Truth, "bench/get_truth", self._on_truth)
+        self._said = ""
 
     def deactivate(self) -> None:
         """Silence the output."""
@@ -149,6 +153,7 @@ class FakeHardwareNode(ManagedNode):
         except ValueError as error:
             response.message = str(error)
             return response
+        self._say_effort(run, excitation)
         self._silence()
         self._stop = threading.Event()
         self._playing = threading.Thread(
@@ -156,6 +161,30 @@ class FakeHardwareNode(ManagedNode):
         )
         self._playing.start()
         response.accepted = True
+        return response
+
+    def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:
+        effort = str(run.effort(excitation))
+        if effort != self._said:
+            self._said = effort
+            self.get_logger().info(effort)
+
+    def _on_truth(self, request: Truth.Request, response: Truth.Response) -> Truth.Response:
+        if not self.active:
+            response.message = f"fake_hardware_node is {self.state_name()}"
+            return response
+        tissue, place = self._tissue, request.position
+        try:
+            if not request.here:
+                tissue = self._scene.tissue_at((place.x, place.y, place.z))
+            coupled = self._bench.coupled(
+                tissue,
+                force_n=request.force_n or self._scene.force_n,
+                hold_time_s=request.hold_time_s or 1.0,
+            )
+            truth_to_response(truth_of(coupled, request.frequency_hz), response)
+        except ValueError as error:
+            response.message = str(error)
         return response
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

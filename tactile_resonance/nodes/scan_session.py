@@ -25,6 +25,7 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.srv import Truth
 
 Progress = Callable[[int, int], None]
 
@@ -44,12 +45,15 @@ class PointResult:
     poles : Poles
     truth : Poles
         All modes of the simulated sensor at that point.
+    contact : Truth.Response
+        What the simulation knows of the contact there.
     """
 
     origin: Origin
     frf: FRF
     poles: Poles
     truth: Poles
+    contact: Truth.Response
 
 
 class ScanSession:
@@ -77,6 +81,7 @@ class ScanSession:
         self._executor.add_node(self._node)
         self._pose = self._node.create_publisher(PoseStamped, "tcp_pose", STREAM)
         self._measure = ActionClient(self._node, Measure, "measure")
+        self._ask_truth = self._node.create_client(Truth, "bench/get_truth")
         subscribe = self._node.create_subscription
         subscribe(msg.FRF, "frf", lambda m: self._keep_final(self._frfs, m), RESULTS)
         subscribe(msg.Poles, "poles", lambda m: self._keep_final(self._poles, m), RESULTS)
@@ -103,7 +108,8 @@ class ScanSession:
             if self._refusal:
                 raise NoAnswer(self._refusal)
             ends = {"excitation": 1, "record": 1, "frf": 2, "poles": 1, "bench/block": 1}
-            return self._measure.server_is_ready() and all(
+            ready = self._measure.server_is_ready() and self._ask_truth.service_is_ready()
+            return ready and all(
                 count[0](topic) >= 1 and count[1](topic) >= readers
                 for topic, readers in ends.items()
             )
@@ -146,6 +152,7 @@ class ScanSession:
         self._progress = progress
         self._place(position_m)
         truth = self._truth
+        contact = self.truth(here=True)
         goal_future = self._measure.send_goal_async(goal, feedback_callback=self._on_feedback)
         handle = self._result(goal_future, timeout_s, "the goal to be taken")
         if not handle.accepted:
@@ -157,7 +164,21 @@ class ScanSession:
         self._wait(lambda: key in self._poles and key in self._frfs, answer_timeout_s, "poles")
         poles, origin = poles_from_message(self._poles.pop(key))
         frf, _ = frf_from_message(self._frfs.pop(key))
-        return PointResult(origin, frf, poles, poles_from_message(truth)[0])
+        return PointResult(origin, frf, poles, poles_from_message(truth)[0], contact)
+
+    def truth(self, timeout_s: float = 10.0, **request: object) -> Truth.Response:
+        """What the simulated bench knows; fields of the request by name.
+
+        Raises
+        ------
+        NoAnswer
+            If the bench refuses, or does not answer in time.
+        """
+        future = self._ask_truth.call_async(Truth.Request(**request))
+        answer = self._result(future, timeout_s, "the bench's truth")
+        if not answer.success:
+            raise NoAnswer(f"truth: {answer.message}")
+        return answer
 
     def _place(self, position_m: tuple[float, float, float]) -> None:
         """Say where the tip is until the bench's truth carries that very pose."""

@@ -22,6 +22,7 @@ COLUMNS = (
     *("phantom", "point", "x_m", "y_m", "force_n", "f0_hz", "f0_std_hz", "f0_true_hz"),
     *("damping_ratio", "damping_ratio_std", "damping_ratio_true", "pole_real_rad_s"),
     *("pole_imag_rad_s", "cost", "expected_cost", "status", "measurement_id", "method"),
+    *("force_true_n", "contact_radius_true_m", "indentation_true_m"),
 )
 
 
@@ -39,7 +40,9 @@ class MeasuredPoint:
     poles : Poles
         With exactly one mode, where the status says so.
     true_f0_hz, true_damping_ratio : float
-        NaN where there is no truth.
+        NaN where there is no truth, as the three after them.
+    true_force_n, true_contact_radius_m, true_indentation_m : float
+        0 in air.
     """
 
     phantom: str
@@ -49,6 +52,9 @@ class MeasuredPoint:
     poles: Poles
     true_f0_hz: float
     true_damping_ratio: float
+    true_force_n: float = np.nan
+    true_contact_radius_m: float = np.nan
+    true_indentation_m: float = np.nan
 
     @property
     def estimate(self) -> np.ndarray:
@@ -106,6 +112,10 @@ def as_csv(points: Sequence[MeasuredPoint]) -> str:
         writer.writerow(
             [p.phantom, p.point, *(repr(float(x)) for x in numbers)]
             + [p.poles.status.value, p.origin.measurement_id, p.poles.method]
+            + [
+                repr(float(x))
+                for x in (p.true_force_n, p.true_contact_radius_m, p.true_indentation_m)
+            ]
         )
     return text.getvalue()
 

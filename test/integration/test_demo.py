@@ -55,6 +55,14 @@ def test_four_concentrations_are_told_apart(domain, tmp_path):
         # each concentration above the one before by far more than the uncertainty
         means = values.reshape(4, 2).mean(axis=1)
         assert np.all(np.diff(means) > 20 * stds.max())
+    # the stiffer, the less it gives way under 1 cN: Hertz, 4/3 E* sqrt(R) depth^(3/2)
+    force, depth, radius = (
+        np.array([float(row[name]) for row in rows])
+        for name in ("force_true_n", "indentation_true_m", "contact_radius_true_m")
+    )
+    modulus = np.repeat([18.3e3, 26.5e3, 36.5e3, 48.5e3], 2) / (1 - 0.49**2)
+    np.testing.assert_allclose(4 / 3 * modulus * np.sqrt(2.5e-3) * depth**1.5, force, rtol=1e-9)
+    np.testing.assert_allclose(radius**2, 2.5e-3 * depth, rtol=1e-9)
     content = read_store(tmp_path / "run" / "records")
     assert content.problems == ()
     points = content.measurements[-8:]  # after those that warmed up

@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 import rclpy
+from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
 from tactile_resonance.action import Measure
 
@@ -20,6 +21,8 @@ from tactile_resonance.nodes.conversions import (
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_session import NoAnswer, ScanSession
 from tactile_resonance.processes import NodeProcesses, free_domain_id
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.library import read_tissues
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 GEL_10 = (0.0, 0.0, 0.0)
@@ -164,6 +167,47 @@ def test_tissue_follows_the_tip_and_noise_repeats(session):
     assert second.f0_hz[0] - first.f0_hz[0] > 8
     assert second.damping_ratio[0] - first.damping_ratio[0] > 0.008
     np.testing.assert_array_equal(again.poles_rad_s, first.poles_rad_s)
+
+
+def test_the_bench_tells_its_truth_on_request(session):
+    """Where the tip is, or anywhere; equal to the same question asked in process."""
+    bench, library = SimulatedBench.from_configuration(), read_tissues()
+    session.measure(GEL_16, Measure.Goal(periods=3), quiet)
+    frequency = [100.0, 250.0]
+    for request, name in (
+        ({"here": True}, "gel16"),
+        ({"position": Point(x=0.06)}, "gel12"),
+        ({"position": Point(x=0.06), "force_n": 0.02, "hold_time_s": 3.0}, "gel12"),
+    ):
+        answer = session.truth(frequency_hz=frequency, **request)
+        coupled = bench.coupled(
+            library[name],
+            force_n=request.get("force_n"),
+            hold_time_s=request.get("hold_time_s", 1.0),
+        )
+        assert answer.tissue == name
+        assert answer.contact_radius_m == coupled.contact.contact_radius_m
+        assert answer.indentation_m == coupled.contact.indentation_m
+        assert answer.force_n == request.get("force_n", 0.01)
+        assert list(answer.f0_hz) == [mode.f0_hz for mode in coupled.modes]
+        np.testing.assert_array_equal(
+            np.array(answer.response_real) + 1j * np.array(answer.response_imag),
+            coupled.frequency_response(frequency),
+        )
+        # poles and residues make the same response
+        s = 2j * np.pi * np.array(frequency)[:, None]
+        poles = np.array(answer.pole_real_rad_s) + 1j * np.array(answer.pole_imag_rad_s)
+        residues = np.array(answer.residue_real_rad_s) + 1j * np.array(answer.residue_imag_rad_s)
+        summed = answer.feedthrough + (residues / (s - poles)).sum(axis=1)
+        np.testing.assert_allclose(summed, coupled.frequency_response(frequency), rtol=1e-9)
+        stiffness = np.array(answer.stiffness_real_n_per_m)
+        np.testing.assert_allclose(
+            stiffness, coupled.contact.dynamic_stiffness(s[:, 0]).real, rtol=1e-12
+        )
+    air = session.truth(position=Point(x=1.0))
+    assert (air.tissue, air.contact_radius_m, len(air.stiffness_real_n_per_m)) == ("", 0.0, 0)
+    with pytest.raises(NoAnswer, match="force_n: got -1"):
+        session.truth(position=Point(), force_n=-1.0)
 
 
 def test_level_above_the_sensors_limit_is_refused(session):
