@@ -11,7 +11,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
@@ -25,6 +24,7 @@ from tactile_resonance.nodes.conversions import (
     record_to_message,
     time_from_message,
 )
+from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, STREAM, run_node
@@ -96,29 +96,7 @@ class ExcitationNode(ManagedNode):
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
-        outcome: list[Measure.Result | Exception] = []
-        finished: Future = Future()
-
-        # A future set from another thread may never wake its coroutine; a guard condition wakes the
-        # executor, which sets it here.
-        def wake() -> None:
-            if outcome and not finished.done():
-                finished.set_result(outcome[0])
-
-        guard = self.create_guard_condition(wake)
-
-        def work() -> None:
-            try:
-                outcome.append(self._measure(goal))
-            except Exception as error:
-                outcome.append(error)
-            guard.trigger()
-
-        threading.Thread(target=work, name="measure", daemon=True).start()
-        result = await finished
-        self.destroy_guard_condition(guard)
-        if isinstance(result, Exception):
-            raise result
+        result = await in_thread(self, lambda: self._measure(goal), "measure")
         # in this thread and at once: a goal that is over may expire before its result is taken
         end = {Measure.Result.DONE: goal.succeed, Measure.Result.CANCELLED: goal.canceled}
         end.get(result.outcome, goal.abort)()

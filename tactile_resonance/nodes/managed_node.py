@@ -67,16 +67,22 @@ class ManagedNode(LifecycleNode):
         return publisher
 
     def listen(
-        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        *,
+        raw: bool = False,
     ) -> None:
-        """Subscription until the node is cleaned up; heard while it is active."""
+        """Subscription until the node is cleaned up; heard while it is active, serialised if `raw`."""
 
         def heard(message: Any) -> None:
             if self.active:
                 self.health.saw(topic)
                 callback(message)
 
-        subscription = self.create_subscription(kind, topic, heard, qos)
+        subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)
         self.resources.callback(self.destroy_subscription, subscription)
 
     def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robot and sensor of a scan, through the actions of contact_node and excitation_node."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from tactile_resonance import msg
+from tactile_resonance.action import MakeContact, Measure
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
+from tactile_resonance.nodes.excitation_design import GRIDS
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.scan_recorder import ScanRecorder
+from tactile_resonance.record import Contact
+from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.runner import (
+    Check,
+    Interrupted,
+    Measured,
+    PointFailed,
+    Recording,
+    ScanEnded,
+)
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import Hold
+
+POLL_S = 0.005
+# A node that was started anew needs so long at most until it takes goals again.
+NODE_BACK_WITHIN_S = 60.0
+RESULTS_WITHIN_S = 10.0
+RETRACT_WITHIN_S = 15.0
+PLACE_FOR_S = 0.2
+
+
+class NodeHands:
+    """`scan.runner.Hands` for a scan's own thread; the executor's thread spins meanwhile.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    recorder : ScanRecorder
+    table_in_base : Pose
+        Frame of the scan's points in the robot's base.
+    base_frame : str
+        Name of that base.
+    with_robot : bool
+        False: nobody moves the tip; it is taken to be where the plan says, and its pose is published.
+    """
+
+    def __init__(
+        self,
+        node: ManagedNode,
+        recorder: ScanRecorder,
+        table_in_base: Pose,
+        base_frame: str,
+        with_robot: bool,
+    ) -> None:
+        self._recorder = recorder
+        self._table = table_in_base
+        self._base_frame = base_frame
+        self._measure = ActionClient(node, Measure, "measure")
+        node.resources.callback(self._measure.destroy)
+        self._contact: ActionClient | None = None
+        self._touching = False
+        if with_robot:
+            self._contact = ActionClient(node, MakeContact, "make_contact")
+            node.resources.callback(self._contact.destroy)
+            self._retract = node.create_client(Trigger, "retract")
+            node.resources.callback(node.destroy_client, self._retract)
+        else:
+            self._pose = node.publish_on(PoseStamped, "tcp_pose", STREAM)
+
+    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+        """Bring the tip there and press until the force is held."""
+        pose = self._pose_of(point)
+        if self._contact is None:
+            self._place(pose)
+            return
+        goal = MakeContact.Goal(pose=pose, force_n=force_n)
+        goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
+        self._touching = True
+        handle = self._send(self._contact, goal, "make_contact", check)
+        result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
+        if not result.reached:
+            raise PointFailed(f"contact: {result.cause}: {result.message}")
+
+    def measure(
+        self,
+        design: MeasurementDesign,
+        label: str,
+        seed: int,
+        enough: Callable[[Poles, int], bool],
+        recording: Recording,
+        check: Check,
+    ) -> Measured:
+        """Measure until it is enough or the design's end; all messages go into the recording."""
+        goal = Measure.Goal(
+            label=label,
+            grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
+            level_v=design.level_v,
+            f_min_hz=design.f_min_hz,
+            f_max_hz=design.f_max_hz,
+            periods=design.periods,
+            realisations=design.realisations,
+            seed=seed,
+        )
+        self._recorder.record_into(recording)
+        try:
+            handle = self._send(self._measure, goal, "measure", check)
+            seen: list[msg.Poles] = []
+            stopping = [False]
+
+            def each_poll() -> None:
+                for message in self._new_poles():
+                    seen.append(message)
+                    if enough(poles_from_message(message)[0], len(seen)) and not stopping[0]:
+                        stopping[0] = True
+                        handle.cancel_goal_async()
+                self._check_contact()
+
+            result = self._follow(self._measure, handle, "excitation_node", check, each_poll)
+            if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
+                raise PointFailed(f"measurement: {result.message}")
+            self._wait_for_results(result, check)
+            seen += self._new_poles()
+        finally:
+            self._recorder.record_into(None)
+        mine = [m for m in seen if m.measurement_id == result.measurement_id]
+        if not mine:
+            raise PointFailed("measurement: it ended before its first block")
+        poles, origin = poles_from_message(mine[-1])
+        return Measured(
+            poles, origin.contact, result.blocks, result.measurement_id, origin.simulated
+        )
+
+    def retract(self) -> None:
+        """Draw the tip back and wait until it is free."""
+        if self._contact is None or not self._touching:
+            return
+        deadline = time.monotonic() + RETRACT_WITHIN_S
+        asked_s = float("-inf")
+        while time.monotonic() < deadline:
+            state = self._recorder.contact_state
+            since_s = time.monotonic() - asked_s
+            if state is not None and state.state == state.STATE_IDLE and since_s < float("inf"):
+                self._touching = False
+                return
+            if since_s > 1.0 and self._retract.service_is_ready():
+                self._retract.call_async(Trigger.Request())
+                asked_s = time.monotonic()
+            time.sleep(POLL_S)
+        raise ScanEnded(f"the tip was not drawn back within {RETRACT_WITHIN_S:g} s")
+
+    # parts of these
+
+    def _pose_of(self, point: ScanPoint) -> PoseStamped:
+        """The point on the surface, in the robot's base."""
+        turn = self._table.rotation
+        place = self._table.position_m + turn.apply(point.position_m)
+        x, y, z, w = (turn * turn.from_quat(point.orientation_xyzw)).as_quat().tolist()
+        return pose_to_message(
+            Contact(
+                position_m=tuple(place.tolist()),
+                orientation_xyzw=(x, y, z, w),
+                frame_id=self._base_frame,
+                time_ns=time.time_ns(),
+            )
+        )
+
+    def _place(self, pose: PoseStamped) -> None:
+        """Say where the tip is, often enough for best effort to reach everybody."""
+        end_s = time.monotonic() + PLACE_FOR_S
+        while time.monotonic() < end_s:
+            self._pose.publish(pose)
+            time.sleep(PLACE_FOR_S / 10)
+
+    def _check_contact(self) -> None:
+        state = self._recorder.contact_state
+        if self._touching and state is not None and state.state != state.STATE_HOLD:
+            raise PointFailed(f"contact: {state.cause}: {state.message}")
+
+    def _new_poles(self) -> list[msg.Poles]:
+        messages = []
+        while True:
+            try:
+                messages.append(self._recorder.poles.get_nowait())
+            except queue.Empty:
+                return messages
+
+    def _wait_for_results(self, result: Measure.Result, check: Check) -> None:
+        """Until every block's record, FRF and poles are in the recording."""
+        deadline = time.monotonic() + RESULTS_WITHIN_S
+        while True:
+            counts = self._recorder.counts(result.measurement_id)
+            if all(count >= result.blocks for count in counts):
+                return
+            if time.monotonic() > deadline:
+                raise PointFailed(
+                    f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
+                    "came"
+                )
+            check()
+            time.sleep(POLL_S)
+
+    def _send(
+        self, client: ActionClient, goal: Any, name: str, check: Check
+    ) -> ClientGoalHandle:
+        """Goal that was accepted; waits for a node that is being brought back."""
+        deadline = time.monotonic() + NODE_BACK_WITHIN_S
+        while time.monotonic() < deadline:
+            check()
+            if client.server_is_ready():
+                future = client.send_goal_async(goal)
+                if self._done(future, 2.0) and future.result().accepted:
+                    return future.result()
+            time.sleep(0.05)
+        raise ScanEnded(f"{name}: no node takes the goal for {NODE_BACK_WITHIN_S:g} s")
+
+    def _follow(
+        self,
+        client: ActionClient,
+        handle: ClientGoalHandle,
+        node: str,
+        check: Check,
+        each_poll: Callable[[], None],
+    ) -> Any:
+        """Result of a goal; one that is left for whatever reason is cancelled and waited for."""
+        future = handle.get_result_async()
+        try:
+            while not future.done():
+                if not client.server_is_ready():
+                    raise PointFailed(f"{node} went away")
+                check()
+                each_poll()
+                time.sleep(POLL_S)
+        except (PointFailed, Interrupted):
+            if client.server_is_ready():
+                handle.cancel_goal_async()
+                self._done(future, 5.0)
+            raise
+        return future.result().result
+
+    @staticmethod
+    def _done(future: Future, timeout_s: float) -> bool:
+        deadline = time.monotonic() + timeout_s
+        while not future.done() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        return future.done()
+
+
+def pose_of(values: list[float], name: str) -> Pose:
+    """Pose of a parameter of six numbers."""
+    vector = np.array(values, dtype=float)
+    if vector.shape != (6,) or not np.all(np.isfinite(vector)):
+        raise ValueError(f"{name}: {list(values)}, expected 6 numbers")
+    return Pose.from_vector(vector)

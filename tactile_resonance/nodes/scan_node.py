@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans: from a scene to a run directory with every point in it."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from scipy.spatial.transform import Rotation
+from std_srvs.srv import Trigger
+
+from tactile_resonance.action import Scan
+from tactile_resonance.configuration import PACKAGE_NAME, share_path
+from tactile_resonance.nodes.goal_thread import in_thread
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.running import run_node
+from tactile_resonance.nodes.scan_hands import NodeHands, pose_of
+from tactile_resonance.nodes.scan_recorder import ScanRecorder
+from tactile_resonance.scan.plan import Plan, make_plan
+from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.runner import Controls, Progress, Request, ScanRunner, Summary
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import ScanScene, read_scan_scene
+
+PARAMETERS = (
+    Parameter(
+        "contact",
+        "robot",
+        "Who brings the tip to the tissue: contact_node, or nobody (the tip is taken to be where the plan "
+        "says, and its pose is published).",
+        choices=("robot", "none"),
+        read_only=True,
+    ),
+    Parameter(
+        "table_in_base",
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
+        read_only=True,
+    ),
+    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    Parameter(
+        "run_folder",
+        "",
+        "Folder of the runs that name none; empty: tactile_resonance/runs in $ROS_HOME (~/.ros where "
+        "that is not set).",
+        read_only=True,
+    ),
+    Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
+)
+
+RESULT_TIMEOUT_S = 900
+FEEDBACK_EVERY_S = 0.2
+
+
+class ScanNode(ManagedNode):
+    """Action `scan`; services `scan/pause`, `scan/resume`, `scan/skip_point`, `scan/repeat_point`."""
+
+    def __init__(self) -> None:
+        super().__init__("scan_node", PARAMETERS)
+
+    def configure(self) -> None:
+        """Listen to everything that a run records."""
+        contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
+        self._recorder = ScanRecorder(self)
+        self._hands = NodeHands(
+            self, self._recorder, pose_of(table, "table_in_base"), base_frame, contact == "robot"
+        )
+        self._controls: Controls | None = None
+        self._busy = threading.Lock()
+        self._progress: Progress | None = None
+        for name, ask in {
+            "scan/pause": lambda c: c.paused.set(),
+            "scan/resume": lambda c: c.paused.clear(),
+            "scan/skip_point": lambda c: c.ask(Request.SKIP),
+            "scan/repeat_point": lambda c: c.ask(Request.REPEAT),
+        }.items():
+            self.serve(Trigger, name, self._control(ask))
+        server = ActionServer(
+            self,
+            Scan,
+            "scan",
+            self._on_goal,
+            goal_callback=lambda _: GoalResponse.ACCEPT if self.active else GoalResponse.REJECT,
+            cancel_callback=self._on_cancel,
+            result_timeout=RESULT_TIMEOUT_S,
+        )
+        self.resources.callback(server.destroy)
+
+    def deactivate(self) -> None:
+        """End the scan after retracting; its points stay finished."""
+        if self._controls is not None:
+            self._controls.ask(Request.CANCEL)
+
+    def details(self) -> dict[str, str]:
+        """The scan under way."""
+        progress = getattr(self, "_progress", None)
+        if progress is None:
+            return {}
+        return {"phase": progress.phase, "points": f"{progress.finished} of {progress.points}"}
+
+    def _control(self, ask: Any) -> Any:
+        def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            controls = self._controls
+            if controls is None:
+                response.message = "no scan is running"
+                return response
+            ask(controls)
+            response.success = True
+            return response
+
+        return serve
+
+    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
+        if self._controls is not None:
+            self._controls.ask(Request.CANCEL)
+        return CancelResponse.ACCEPT
+
+    async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
+        result = await in_thread(self, lambda: self._scan(goal), "scan")
+        if result.outcome == Scan.Result.COMPLETE:
+            goal.succeed()
+        elif goal.is_cancel_requested:
+            goal.canceled()
+        else:
+            goal.abort()
+        return result
+
+    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
+        result = Scan.Result(outcome=Scan.Result.REFUSED)
+        if not self._busy.acquire(blocking=False):
+            result.message = "a scan is running, cancel it or wait for its result"
+            return result
+        try:
+            scene, plan, run, seed = self._prepare(goal.request)
+        except (ValueError, OSError) as error:
+            self._busy.release()
+            result.message = str(error)
+            self.health.error(f"refused: {error}")
+            return result
+        self._controls = Controls()
+        result.run_directory, result.points = str(run.path), len(plan.points)
+        self.get_logger().info(f"run goes to {run.path}")
+        try:
+            with run:
+                runner = ScanRunner(
+                    scene, plan, run, self._hands, self._controls, self._tell_of(goal), seed
+                )
+                _fill(result, runner.run())
+        finally:
+            self._controls = self._progress = None
+            self._busy.release()
+        return result
+
+    def _prepare(self, request: Scan.Goal) -> tuple[ScanScene, Plan, RunDirectory, int]:
+        """Scene, plan and the open run of a goal; ValueError where it is refused."""
+        if request.resume:
+            run = RunDirectory.open(Path(request.run_directory).expanduser())
+            try:
+                scene = read_scan_scene(run.path / "scene.yaml")
+                points = run.content.points
+                plan = replace(make_plan(_with_points(scene, points)), points=points)
+                return scene, plan, run, int(run.content.facts["seed"])
+            except BaseException:
+                run.close()
+                raise
+        if not request.scene:
+            raise ValueError("scene: empty, expected a scene file")
+        path = Path(request.scene).expanduser()
+        path = path if path.is_absolute() else share_path(request.scene)
+        scene = read_scan_scene(path)
+        plan = make_plan(scene)
+        if request.poses.poses:
+            plan = replace(plan, points=_points_of(request.poses, scene))
+        (seed,) = values(self, "seed")
+        seed = request.seed or seed
+        design = plan.measurement
+        run = RunDirectory.create(
+            self._run_path(request.run_directory),
+            path.read_text(encoding="utf-8"),
+            plan.points,
+            self._facts(scene, plan, seed),
+            expected_bytes(
+                len(plan.points),
+                design.periods * design.realisations,
+                round(50e3 * design.block_s),
+                design.lines,
+            ),
+        )
+        return scene, plan, run, seed
+
+    def _run_path(self, given: str) -> Path:
+        if given:
+            return Path(given).expanduser().absolute()
+        (folder,) = values(self, "run_folder")
+        if folder:
+            parent = Path(folder).expanduser().absolute()
+        else:
+            home = os.environ.get("ROS_HOME")
+            parent = (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "runs"
+        stamp, number = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()), 1
+        while (path := parent / (stamp if number == 1 else f"{stamp}-{number}")).exists():
+            number += 1
+        return path
+
+    def _facts(self, scene: ScanScene, plan: Plan, seed: int) -> dict[str, Any]:
+        """What a reader of the run should know beside its plan."""
+        parameters = {name: p.value for name, p in self.get_parameters_by_prefix("").items()}
+        return {
+            "name": scene.name,
+            "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "seed": seed,
+            "versions": {name: _version(name) for name in (PACKAGE_NAME, "numpy", "scipy", "rosbags")},
+            "parameters": {
+                name: list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else value
+                for name, value in parameters.items()
+            },
+            "skipped": [
+                {"what": s.what, "why": s.why, "saved_s": s.saved_s} for s in plan.skipped
+            ],
+            "shortest_s": plan.shortest_s,
+            "longest_s": plan.longest_s,
+        }
+
+    def _tell_of(self, goal: ServerGoalHandle) -> Any:
+        last = [("", -math.inf)]
+
+        def tell(progress: Progress) -> None:
+            self._progress = progress
+            now_s = time.monotonic()
+            if progress.phase == last[0][0] and now_s - last[0][1] < FEEDBACK_EVERY_S:
+                return
+            last[0] = (progress.phase, now_s)
+            goal.publish_feedback(_feedback(progress))
+
+        return tell
+
+
+def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
+    frame = poses.header.frame_id
+    if frame != scene.frame_id:
+        raise ValueError(f"poses: in frame {frame!r}, accepted is the scene's {scene.frame_id!r}")
+    points = []
+    for index, pose in enumerate(poses.poses):
+        place, turn = pose.position, pose.orientation
+        quaternion = (turn.x, turn.y, turn.z, turn.w)
+        if not 0.99 < math.hypot(*quaternion) < 1.01:
+            raise ValueError(f"poses[{index}]: orientation {quaternion}, expected a unit quaternion")
+        normal = Rotation.from_quat(quaternion).apply([0.0, 0.0, 1.0])
+        points.append(
+            ScanPoint(
+                index,
+                (place.x, place.y, place.z),
+                tuple(normal.tolist()),
+                quaternion,
+                f"{scene.name}, point {index + 1}",
+            )
+        )
+    return tuple(points)
+
+
+def _with_points(scene: ScanScene, points: tuple[ScanPoint, ...]) -> ScanScene:
+    """The scene with the places of a run's plan, which may have been given as poses."""
+    return replace(scene, positions_m=np.array([point.position_m for point in points]))
+
+
+def _feedback(progress: Progress) -> Scan.Feedback:
+    feedback = Scan.Feedback(
+        point=progress.point.index if progress.point else progress.finished,
+        finished=progress.finished,
+        points=progress.points,
+        phase=progress.phase,
+        blocks=progress.blocks,
+        time_left_s=float(progress.time_left_s),
+    )
+    nan = math.nan
+    feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
+    poles = progress.poles
+    if poles is not None and poles.f0_hz.size:
+        feedback.f0_hz, feedback.damping_ratio = float(poles.f0_hz[0]), float(poles.damping_ratio[0])
+        covariance = poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        if covariance is not None:
+            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(np.diag(covariance[0])).tolist()
+    return feedback
+
+
+def _fill(result: Scan.Result, summary: Summary) -> None:
+    result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
+    for name in ("message", "done", "failed", "skipped", "blocks", "blocks_saved", "saved_s"):
+        setattr(result, name, getattr(summary, name))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def main() -> None:
+    """Console script."""
+    run_node(ScanNode)
+
+
+if __name__ == "__main__":
+    main()

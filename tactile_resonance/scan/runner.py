@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The life of a scan: point by point contact, measure until it is enough, retract, keep the result.
+
+What moves and measures is behind `Hands`; the same loop serves nodes and tests in virtual time.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.record import Contact
+from tactile_resonance.scan.decision import Decision, decide
+from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.plan import Plan
+from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording, RunDirectory
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import Hold, OnFailure, ScanScene
+from tactile_resonance.tissue.classify import classify
+
+PAUSE_POLL_S = 0.05
+Recording = PointRecording | ReferenceRecording
+
+
+class PointFailed(Exception):
+    """A point gave no result; the message says why. The scan may go on with the next."""
+
+
+class ScanEnded(Exception):
+    """The scan cannot or shall not go on; the message says why."""
+
+
+class Interrupted(Exception):
+    """The point was left because somebody asked for it."""
+
+
+class Request(Enum):
+    """What somebody may ask of a running scan."""
+
+    SKIP = "skip"
+    REPEAT = "repeat"
+    CANCEL = "cancel"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a measurement gave.
+
+    Attributes
+    ----------
+    poles : Poles
+        Of all blocks.
+    contact : Contact
+        While it was measured.
+    blocks : int
+    measurement_id : int
+    simulated : bool
+    """
+
+    poles: Poles
+    contact: Contact
+    blocks: int
+    measurement_id: int
+    simulated: bool
+
+
+class Hands(Protocol):
+    """Robot and sensor, as a scan uses them. All raise `PointFailed`, or `ScanEnded` where no other
+    point would fare better; while they wait they call `check`, which may raise `Interrupted`.
+    """
+
+    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+        """Bring the tip there and press until the force is held."""
+        ...
+
+    def measure(
+        self,
+        design: MeasurementDesign,
+        label: str,
+        seed: int,
+        enough: Callable[[Poles, int], bool],
+        recording: Recording,
+        check: Check,
+    ) -> Measured:
+        """Measure; every message of it goes into the recording.
+
+        After each block `enough` is asked with the poles of all blocks so far and their number.
+        """
+        ...
+
+    def retract(self) -> None:
+        """Draw the tip back; harmless where it is free."""
+        ...
+
+
+Check = Callable[[], None]
+
+
+class Controls:
+    """What is asked of a running scan, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._request: Request | None = None
+        self.paused = threading.Event()
+        self.cancelled = threading.Event()
+
+    def ask(self, request: Request) -> None:
+        """Skip or repeat the point under way (between two: the next, the last), or end the scan."""
+        if request is Request.CANCEL:
+            self.cancelled.set()
+        else:
+            with self._lock:
+                self._request = request
+
+    def take(self) -> Request | None:
+        """Request that waits, once."""
+        with self._lock:
+            request, self._request = self._request, None
+        return request
+
+    def check(self) -> None:
+        """Raise `Interrupted` where the point under way shall be left."""
+        if self.cancelled.is_set() or self._request is not None:
+            raise Interrupted
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a scan is.
+
+    Attributes
+    ----------
+    point : ScanPoint or None
+        Under way; None before the first and after the last.
+    phase : str
+        For people: reference, contact, measure, retract, paused.
+    finished, points : int
+    blocks : int
+        At this point so far.
+    poles : Poles or None
+        At this point so far.
+    time_left_s : float
+        Estimated from the points so far, or the plan.
+    """
+
+    point: ScanPoint | None
+    phase: str
+    finished: int
+    points: int
+    blocks: int = 0
+    poles: Poles | None = None
+    time_left_s: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a scan ended.
+
+    Attributes
+    ----------
+    complete : bool
+        Every point of the plan is finished.
+    message : str
+    done, failed, skipped : int
+        Points by their latest outcome.
+    blocks, blocks_saved : int
+    saved_s : float
+        Measuring time saved by ending points early.
+    """
+
+    complete: bool
+    message: str
+    done: int
+    failed: int
+    skipped: int
+    blocks: int
+    blocks_saved: int
+    saved_s: float
+
+
+class ScanRunner:
+    """Runs what is left of a run.
+
+    Parameters
+    ----------
+    scene : ScanScene
+    plan : Plan
+    run : RunDirectory
+    hands : Hands
+    controls : Controls
+    tell : callable
+        Receives `Progress`.
+    seed : int
+        Of the first point's phases; each point has its own.
+    """
+
+    def __init__(
+        self,
+        scene: ScanScene,
+        plan: Plan,
+        run: RunDirectory,
+        hands: Hands,
+        controls: Controls,
+        tell: Callable[[Progress], None],
+        seed: int = 1,
+    ) -> None:
+        self._scene, self._plan, self._run = scene, plan, run
+        self._hands, self._controls, self._tell = hands, controls, tell
+        self._seed = seed
+        self._durations_s: list[float] = []
+
+    def run(self) -> Summary:
+        """Finish every point that is not; the references of free air are taken before and after."""
+        begun_s = time.monotonic()
+        message = ""
+        try:
+            self._reference("air-before")
+            while (point := self._next()) is not None:
+                spent_s = time.monotonic() - begun_s
+                if spent_s > self._scene.time_limits.scan_s:
+                    raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
+                self._point(point)
+            self._reference("air-after")
+        except ScanEnded as error:
+            message = str(error)
+        except Interrupted:
+            message = "cancelled"
+        finally:
+            self._hands.retract()
+        return self._summary(message)
+
+    def _next(self) -> ScanPoint | None:
+        """The point to touch next; waits while the scan is paused."""
+        while self._controls.paused.is_set() and not self._controls.cancelled.is_set():
+            self._say(None, "paused")
+            time.sleep(PAUSE_POLL_S)
+        if self._controls.cancelled.is_set():
+            raise Interrupted
+        point = self._run.content.next_point
+        request = self._controls.take()
+        if request is Request.REPEAT and self._run.content.results:
+            latest = max(self._run.content.results, key=lambda result: result.time_ns)
+            return self._run.content.points[latest.index]
+        if request is Request.SKIP and point is not None:
+            with self._run.begin_point(point.index) as recording:
+                self._keep(recording, point, Outcome.SKIPPED, "skipped on request", 0.0)
+            return self._next()
+        return point
+
+    def _point(self, point: ScanPoint) -> None:
+        """One attempt at a point, finished with a result whatever happens, unless it shall be repeated."""
+        scene, begun_s = self._scene, time.monotonic()
+        decisions: list[Decision] = []
+
+        def enough(poles: Poles, blocks: int) -> bool:
+            decisions.append(self._decide(poles, blocks))
+            self._say(point, "measure", blocks, poles)
+            return decisions[-1].stop
+
+        def check() -> None:
+            self._controls.check()
+            if time.monotonic() - begun_s > scene.time_limits.point_s:
+                raise PointFailed(f"time_limits.point_s: {scene.time_limits.point_s:g} s are over")
+
+        with self._run.begin_point(point.index) as recording:
+            measured, outcome, reason = None, Outcome.DONE, ""
+            try:
+                self._say(point, "contact")
+                self._hands.touch(point, scene.force_n, scene.hold, check)
+                self._say(point, "measure")
+                measured = self._hands.measure(
+                    self._plan.measurement,
+                    point.label,
+                    self._seed + point.index,
+                    enough,
+                    recording,
+                    check,
+                )
+                if not measured.poles.f0_hz.size:
+                    raise PointFailed(
+                        f"{measured.poles.status.value}: {measured.poles.message}".strip(": ")
+                    )
+            except PointFailed as error:
+                outcome, reason = Outcome.FAILED, str(error)
+            except Interrupted:
+                request = self._controls.take()
+                if request is not Request.SKIP:  # cancelled or to be repeated: nothing is kept of it
+                    self._hands.retract()
+                    return
+                outcome, reason = Outcome.SKIPPED, "skipped on request"
+            self._say(point, "retract")
+            self._hands.retract()
+            duration_s = time.monotonic() - begun_s
+            decision = decisions[-1] if decisions else None
+            self._keep(recording, point, outcome, reason, duration_s, measured, decision)
+        self._durations_s.append(duration_s)
+        if outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
+            raise ScanEnded(f"point {point.index + 1} failed and on_failure is stop: {reason}")
+
+    def _decide(self, poles: Poles, blocks: int) -> Decision:
+        known = poles.f0_hz.size > 0
+        estimate = [poles.f0_hz[0], poles.damping_ratio[0]] if known else [np.nan, np.nan]
+        noise, total = (
+            c[0] if known and c is not None else None
+            for c in (poles.covariance, poles.total_covariance)
+        )
+        block_s = self._plan.measurement.block_s
+        wanted, limits = self._scene.precision, self._scene.blocks
+        return decide(estimate, noise, total, blocks, wanted, limits, block_s)
+
+    def _keep(
+        self,
+        recording: PointRecording,
+        point: ScanPoint,
+        outcome: Outcome,
+        reason: str,
+        duration_s: float,
+        measured: Measured | None = None,
+        decision: Decision | None = None,
+    ) -> None:
+        """Write the result behind the messages and make the point durable."""
+        x, y, z = point.position_m
+        normal_x, normal_y, normal_z = point.normal
+        result = PointResult(
+            index=point.index,
+            attempt=recording.attempt,
+            label=point.label,
+            outcome=outcome,
+            reason=reason,
+            **{"x_m": x, "y_m": y, "z_m": z},
+            **{"normal_x": normal_x, "normal_y": normal_y, "normal_z": normal_z},
+            duration_s=duration_s,
+            time_ns=time.time_ns(),
+            frame_id=self._scene.frame_id,
+        )
+        if measured is not None:
+            result = replace(
+                result,
+                force_n=measured.contact.force_n,
+                force_std_n=measured.contact.force_std_n,
+                poles_status=measured.poles.status.value,
+                cost=measured.poles.cost,
+                expected_cost=measured.poles.expected_cost,
+                blocks=measured.blocks,
+                measurement_id=measured.measurement_id,
+                simulated=measured.simulated,
+            )
+            if measured.poles.f0_hz.size:
+                result = self._with_poles(result, measured.poles)
+        if decision is not None:
+            result = replace(
+                result,
+                verdict=decision.verdict.value,
+                blocks_saved=decision.blocks_saved,
+                saved_s=decision.saved_s,
+            )
+        recording.finish(result)
+
+    def _with_poles(self, result: PointResult, poles: Poles) -> PointResult:
+        pole = poles.poles_rad_s[0]
+        covariance = poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        spread = np.full((2, 2), np.nan) if covariance is None else covariance[0]
+        result = replace(
+            result,
+            f0_hz=float(poles.f0_hz[0]),
+            damping_ratio=float(poles.damping_ratio[0]),
+            f0_std_hz=float(np.sqrt(spread[0, 0])),
+            damping_ratio_std=float(np.sqrt(spread[1, 1])),
+            f0_damping_covariance_hz=float(spread[0, 1]),
+            pole_real_rad_s=float(pole.real),
+            pole_imag_rad_s=float(pole.imag),
+        )
+        if self._scene.tissue_classes and covariance is not None:
+            call = classify(result.estimate, spread, self._scene.tissue_classes)
+            result = replace(result, tissue_class=call.name, tissue_probability=call.probability)
+        return result
+
+    def _reference(self, name: str) -> None:
+        """Measure in free air: the sensor's health and drift; one that fails does not end the scan."""
+        if any(f"-{name}." in file.name for file in self._run.content.files):
+            return
+        self._say(None, "reference")
+
+        def all_blocks(poles: Poles, blocks: int) -> bool:
+            return False
+
+        with self._run.begin_reference(name) as recording:
+            try:
+                self._hands.measure(
+                    replace(self._plan.measurement, periods=self._scene.blocks.least),
+                    "air",
+                    self._seed,
+                    all_blocks,
+                    recording,
+                    self._controls.check,
+                )
+            except PointFailed:
+                return
+            recording.finish()
+
+    def _say(
+        self, point: ScanPoint | None, phase: str, blocks: int = 0, poles: Poles | None = None
+    ) -> None:
+        points, finished = len(self._plan.points), len(self._run.content.latest)
+        each_s = self._plan.longest_s / points
+        if self._durations_s:
+            each_s = sum(self._durations_s) / len(self._durations_s)
+        left_s = each_s * (points - finished)
+        self._tell(Progress(point, phase, finished, points, blocks, poles, left_s))
+
+    def _summary(self, message: str) -> Summary:
+        latest = self._run.content.latest
+        count = {o: sum(result.outcome is o for result in latest) for o in Outcome}
+        complete = self._run.content.next_point is None
+        return Summary(
+            complete=complete,
+            message=message or ("complete" if complete else "ended early"),
+            done=count[Outcome.DONE],
+            failed=count[Outcome.FAILED],
+            skipped=count[Outcome.SKIPPED],
+            blocks=sum(result.blocks for result in latest),
+            blocks_saved=sum(result.blocks_saved for result in latest),
+            saved_s=float(np.nansum([result.saved_s for result in latest])),
+        )
