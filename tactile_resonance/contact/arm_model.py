@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the arm will still do of what it was told: the commands under way along one axis."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+
+class ArmModel:
+    """Acceleration limit, dead time and lag of the arm along the normal, one period at a time.
+
+    The law needs from it the way that is still to come; the estimator the acceleration, whose
+    force on a tool-mounted cell is not one of contact.
+
+    Attributes
+    ----------
+    speed_m_s, acceleration_m_s2 : float
+        Of the tip, as far as the model knows.
+    """
+
+    def __init__(self, *, dead_time_s: float, lag_s: float, period_s: float) -> None:
+        self._period_s, self._lag_s = period_s, lag_s
+        self._line: deque[float] = deque([0.0] * max(1, round(dead_time_s / period_s)))
+        self._keep = math.exp(-period_s / lag_s) if lag_s > 0 else 0.0
+        self._set_speed = 0.0
+        self.speed_m_s = 0.0
+        self.acceleration_m_s2 = 0.0
+
+    def step(self, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Advance one period, told to go at a speed under an acceleration limit."""
+        most = acceleration_m_s2 * self._period_s
+        self._set_speed += min(most, max(-most, speed_m_s - self._set_speed))
+        self._line.append(self._set_speed)
+        delayed = self._line.popleft()
+        before = self.speed_m_s
+        self.speed_m_s = delayed + self._keep * (before - delayed)
+        self.acceleration_m_s2 = (self.speed_m_s - before) / self._period_s
+
+    @property
+    def pending_m(self) -> float:
+        """Way that the arm goes on if its set speed became zero now [m]."""
+        return sum(self._line) * self._period_s + self.speed_m_s * self._lag_s

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The safety envelope: what is measured must keep the limits, and so must what is commanded.
+
+It knows nothing of the law or the state machine: it judges data and bounds velocities, and what it
+says wins. It is software on an ordinary computer, not a certified safety function.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.force_watch import ForceWatch
+from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.result import Breach, Cause
+from tactile_resonance.contact.samples import ArmSample
+
+FloatArray = NDArray[np.float64]
+
+WALL_TIME_S = 0.1
+"""Towards a wall of the workspace the tip goes no faster than this brings it there [s]."""
+
+REACTION_S, BRAKING_M_S2 = 0.03, 0.2
+"""The arm answers this late [s] and is trusted to slow down this hard [m/s2] before it is near."""
+
+SPEED_MARGIN = 1.5
+"""A measured speed may exceed a limit by this factor: vibration and noise of the encoders."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the tip is with respect to the surface.
+
+    Attributes
+    ----------
+    normal : (3,) array
+        Out of the tissue, in the base.
+    height_m : float
+        Above the expected first touch, along the normal [m].
+    depth_m : float or None
+        Past the first touch [m]; None where not in contact.
+    misalignment_rad : float
+        Between the tip's orientation and its goal's.
+    """
+
+    normal: FloatArray
+    height_m: float
+    depth_m: float | None
+    misalignment_rad: float
+
+
+class Envelope:
+    """Limits, applied."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+
+    def judge_arm(self, now_ns: int, arm: ArmSample | None) -> Breach | None:
+        """Whether the arm's data are fresh and good and it is where it may be."""
+        limits = self.limits
+        if arm is None:
+            return Breach(Cause.ARM_STALE, "no state of the arm has come")
+        age = (now_ns - arm.time_ns) * 1e-9
+        if age > limits.arm_age_s:
+            text = (
+                f"state of the arm is {1e3 * age:.0f} ms old, limit {1e3 * limits.arm_age_s:g} ms"
+            )
+            return Breach(Cause.ARM_STALE, text)
+        if not arm.moving_allowed:
+            return Breach(Cause.ARM_STOPPED, f"the arm may not move: {arm.message}")
+        place = arm.tip.position_m
+        if not np.isfinite(np.concatenate([place, arm.tip.rotation_rad, arm.tip_velocity])).all():
+            return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is no number")
+        box = limits.workspace
+        for axis, x, low, high in zip("xyz", place, box.low_m, box.high_m, strict=True):
+            if not low <= x <= high:
+                text = f"tip at {axis} = {x:.4f} m, workspace {low:g} to {high:g} m"
+                return Breach(Cause.WORKSPACE, text)
+        # +z of the tip against the vertical: Rodrigues' formula for the one element needed
+        rx, ry, rz = (float(value) for value in arm.tip.rotation_rad)
+        angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+        share = (rz / angle) ** 2 if angle > 0 else 1.0
+        upright = math.cos(angle) + (1 - math.cos(angle)) * share
+        if upright < math.cos(limits.tilt_rad):
+            tilt = math.acos(max(-1.0, upright))
+            return Breach(
+                Cause.TILT, f"tip tilted by {tilt:.3f} rad, limit {limits.tilt_rad:g} rad"
+            )
+        return None
+
+    def judge_motion(self, arm: ArmSample, place: Place) -> Breach | None:
+        """Speed, alignment and depth near the surface and in it."""
+        limits = self.limits
+        if place.depth_m is not None and place.depth_m > limits.depth_m:
+            text = f"{1e3 * place.depth_m:.2f} mm past the first touch, limit {1e3 * limits.depth_m:g} mm"
+            return Breach(Cause.DEPTH, text)
+        if place.height_m < limits.near_m:
+            inwards = -float(place.normal @ arm.tip_velocity[:3])
+            if inwards > SPEED_MARGIN * limits.near_speed_m_s:
+                text = f"{1e3 * inwards:.1f} mm/s towards the surface near it"
+                return Breach(Cause.SPEED, f"{text}, limit {1e3 * limits.near_speed_m_s:g} mm/s")
+            if place.misalignment_rad > limits.misalignment_rad:
+                text = f"tip {place.misalignment_rad:.3f} rad off its orientation near the surface"
+                return Breach(Cause.MISALIGNED, f"{text}, limit {limits.misalignment_rad:g} rad")
+        return None
+
+    def judge_force(self, now_ns: int, watch: ForceWatch) -> Breach | None:
+        """Age, size, direction and rate of the force; only after a tare."""
+        limits = self.limits
+        stale = self.judge_force_age(now_ns, watch)
+        if stale is not None:
+            return stale
+        x, y, z = (float(value) for value in watch.force_n)
+        if z > limits.abort_force_n:
+            text = f"{1e3 * z:.1f} mN on the tip, limit {1e3 * limits.abort_force_n:g} mN"
+            return Breach(Cause.FORCE_ABORT, text)
+        if z < -limits.pull_force_n:
+            text = f"{1e3 * z:.1f} mN against the pressing direction"
+            return Breach(Cause.FORCE_PULL, f"{text}, limit {1e3 * limits.pull_force_n:g} mN")
+        lateral = math.hypot(x, y)
+        if lateral > limits.lateral_force_n:
+            text = f"{1e3 * lateral:.1f} mN along the surface"
+            return Breach(Cause.FORCE_LATERAL, f"{text}, limit {1e3 * limits.lateral_force_n:g} mN")
+        rate = watch.rate_n_per_s()
+        if rate is not None and abs(rate) > limits.force_rate_n_per_s:
+            text = f"force changes by {rate:.2f} N/s, limit {limits.force_rate_n_per_s:g} N/s"
+            return Breach(Cause.FORCE_RATE, text)
+        return None
+
+    def judge_force_age(self, now_ns: int, watch: ForceWatch) -> Breach | None:
+        """Whether forces still come."""
+        age, limit = watch.age_s(now_ns), self.limits.force_age_s
+        if age > limit:
+            text = (
+                "no force has come"
+                if age == math.inf
+                else f"newest force is {1e3 * age:.0f} ms old"
+            )
+            return Breach(Cause.FORCE_STALE, f"{text}, limit {1e3 * limit:g} ms")
+        return None
+
+    def bound(self, twist: FloatArray, position_m: FloatArray, place: Place) -> FloatArray:
+        """Return the twist (6,) [m/s, rad/s] with every part that breaks a limit taken back.
+
+        What is not a number stops the tip. Speeds shrink, they do not turn round; in contact the
+        parts along the surface and into it shrink apart.
+        """
+        limits = self.limits
+        if not np.isfinite(twist).all():
+            return np.zeros(6)
+        velocity, angular = twist[:3].copy(), twist[3:].copy()
+        normal = place.normal
+        across = float(normal @ velocity)
+        if place.depth_m is not None:
+            along = velocity - across * normal
+            along *= _shrink(along, limits.lateral_speed_m_s)
+            if across < 0:
+                across = max(across, -limits.contact_speed_m_s)
+                if place.depth_m >= limits.depth_m:
+                    across = 0.0
+            velocity = along + across * normal
+        across = float(normal @ velocity)
+        if across < 0:
+            # further up just so fast that it can slow down before it is near
+            room = max(0.0, place.height_m - limits.near_m + REACTION_S * across)
+            most = math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room)
+            velocity *= _shrink(velocity, most)
+        velocity *= _shrink(velocity, limits.free_speed_m_s)
+        # the whole velocity shrinks before a wall, so that no other limit is broken by it
+        box = limits.workspace
+        for axis in range(3):
+            speed = velocity[axis]
+            wall = box.high_m[axis] if speed > 0 else box.low_m[axis]
+            room = max(0.0, (wall - position_m[axis]) * math.copysign(1, speed)) / WALL_TIME_S
+            if abs(speed) > room:
+                velocity *= room / abs(speed)
+        angular *= _shrink(angular, limits.angular_speed_rad_s)
+        return np.concatenate([velocity, angular])
+
+
+def _shrink(vector: FloatArray, most: float) -> float:
+    """Factor that brings a vector down to a length, 1 where it is within."""
+    length = math.sqrt(float(vector @ vector))
+    return 1.0 if length <= most else most / length

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Force, stiffness and place of the surface from force and height: an extended Kalman filter.
+
+The state is (height of the first touch, ln C, d ln C / dt) of a ball by Hertz (`hertz`): C falls as
+the tissue relaxes. What the model lacks (layers, friction, the beam's swing) goes into the random
+walks of C and of its rate, so that the estimated force follows the measured one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact import hertz
+
+FloatArray = NDArray[np.float64]
+
+RATE_MEAN_PER_S, RATE_STD_PER_S = -0.4, 0.5
+"""d ln C / dt at first touch: brain and liver lose 0.2 to 1.2 of their stiffness per second."""
+
+LN_C_MEAN, LN_C_STD = math.log(800.0), 1.5
+"""ln of C [N/m^1.5] before the touch: 2 to 40 kPa under balls of 1.5 to 3 mm give 140 to 3800."""
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """What is known of the contact.
+
+    Attributes
+    ----------
+    force_n, force_std_n : float
+        Force now, and its standard deviation from noise [N].
+    stiffness_n_per_m : float
+        Slope of force over depth, the beam included [N/m].
+    depth_m, depth_std_m : float
+        Past the first touch [m].
+    surface_m : float
+        Height of the tip at first touch, on the scale of the heights given [m].
+    """
+
+    force_n: float
+    force_std_n: float
+    stiffness_n_per_m: float
+    depth_m: float
+    depth_std_m: float
+    surface_m: float
+
+
+class TouchDetector:
+    """Tells a touch from noise: means over short and long windows against their deviation.
+
+    Short windows see stiff tissue at once, long ones soft tissue at a fraction of the noise.
+    """
+
+    WINDOWS = (4, 12, 36)
+    THRESHOLD = 5.0  # standard deviations: some 1e-7 false alarms per window
+
+    def __init__(self, noise_n: float, tare_std_n: float) -> None:
+        self._limits = [
+            (n, self.THRESHOLD * math.sqrt(noise_n**2 / n + tare_std_n**2)) for n in self.WINDOWS
+        ]
+        self._recent: deque[float] = deque(maxlen=self.WINDOWS[-1])
+
+    def add(self, force_n: float) -> bool:
+        """Take one more force; return whether there is contact."""
+        self._recent.append(force_n)
+        values = list(self._recent)
+        return any(len(values) >= n and sum(values[-n:]) / n > limit for n, limit in self._limits)
+
+
+class ContactFilter:
+    """The extended Kalman filter, from the touch on.
+
+    Parameters
+    ----------
+    heights_m, forces_n : sequences of float
+        The last samples, oldest first, the touch among them.
+    noise_n : float
+        Standard deviation of one force [N].
+    beam_n_per_m : float
+        Stiffness of the beam in series [N/m]; `hertz.RIGID` without.
+    vibration_m : float
+        Unseen vibration of the tip [m] rms: at stiff tissue it adds to the noise.
+    walk_per_sqrt_s : float
+        Random walk of ln C [1/sqrt(s)]; that of its rate is five times as large per second.
+    """
+
+    def __init__(
+        self,
+        heights_m: Sequence[float],
+        forces_n: Sequence[float],
+        *,
+        noise_n: float,
+        beam_n_per_m: float = hertz.RIGID,
+        vibration_m: float = 3e-6,
+        walk_per_sqrt_s: float = 0.05,
+    ) -> None:
+        self._noise_n, self._vibration_m = noise_n, vibration_m
+        self._beam, self._walk = beam_n_per_m, walk_per_sqrt_s
+        mean, covariance = touch_posterior(
+            np.asarray(heights_m, float), np.asarray(forces_n, float), noise_n, beam_n_per_m
+        )
+        self._x = [mean[0], mean[1], RATE_MEAN_PER_S]
+        self._p = np.zeros((3, 3))
+        self._p[:2, :2] = covariance
+        self._p[2, 2] = RATE_STD_PER_S**2
+
+    @property
+    def c(self) -> float:
+        """C [N/m^1.5]."""
+        return math.exp(self._x[1])
+
+    @property
+    def c_rate_per_s(self) -> float:
+        """Relative change of C [1/s]."""
+        return self._x[2]
+
+    def predict(self, dt_s: float) -> None:
+        """Let time pass."""
+        # the rate dies out as relaxation does
+        keep = math.exp(-dt_s)
+        self._x[1] += self._x[2] * dt_s
+        self._x[2] *= keep
+        f = np.array([[1, 0, 0], [0, 1, dt_s], [0, 0, keep]])
+        self._p = f @ self._p @ f.T
+        walk = self._walk**2 * dt_s
+        self._p[1, 1] += walk
+        self._p[2, 2] += 25 * walk
+
+    def update(self, height_m: float, force_n: float) -> float:
+        """Take one force measured at a height of the tip; return its innovation in deviations."""
+        depth = self._x[0] - height_m
+        expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
+        h = np.array([slope, per_ln_c, 0.0])
+        ph = self._p @ h
+        noise = self._noise_n**2 + (slope * self._vibration_m) ** 2
+        spread = float(h @ ph) + noise
+        gain = ph / spread
+        error = force_n - expected
+        # a step of ln C beyond 1 is beyond what the linearisation stands for
+        scale = min(1.0, 1.0 / max(1e-12, abs(gain[1] * error)))
+        for n in range(3):
+            self._x[n] += float(gain[n]) * error * scale
+        self._p = self._p - np.outer(gain, ph)
+        return error / math.sqrt(spread)
+
+    def estimate(self, height_m: float) -> ContactEstimate:
+        """Return what holds at a height of the tip."""
+        depth = self._x[0] - height_m
+        expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
+        return ContactEstimate(
+            force_n=expected,
+            force_std_n=self.force_std(slope, per_ln_c),
+            stiffness_n_per_m=slope,
+            depth_m=depth,
+            depth_std_m=math.sqrt(max(0.0, float(self._p[0, 0]))),
+            surface_m=self._x[0],
+        )
+
+    def height_for(self, force_n: float) -> tuple[float, float, float]:
+        """Return the height of the tip for a force [m], the stiffness there, the force's deviation."""
+        depth = hertz.depth(force_n, self.c, self._beam)
+        _, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
+        return self._x[0] - depth, slope, self.force_std(slope, per_ln_c)
+
+    def force_std(self, slope: float, per_ln_c: float) -> float:
+        """Return the standard deviation of a force with these slopes [N]."""
+        p = self._p
+        variance = slope**2 * p[0, 0] + per_ln_c**2 * p[1, 1] + 2 * slope * per_ln_c * p[0, 1]
+        return math.sqrt(max(0.0, float(variance)))
+
+
+def touch_posterior(
+    heights_m: FloatArray,
+    forces_n: FloatArray,
+    noise_n: float,
+    beam_n_per_m: float = hertz.RIGID,
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (2,) and covariance (2, 2) of (height of touch, ln C) from few samples.
+
+    On a grid: the touch anywhere in the window, C by its prior; no linearisation, since at first
+    touch none holds.
+
+    Parameters
+    ----------
+    heights_m, forces_n : (n,) arrays
+        Oldest first; the tip has come down.
+    noise_n : float
+    beam_n_per_m : float
+    """
+    highest, lowest = float(heights_m.max()), float(heights_m.min())
+    span = max(highest - lowest, 1e-6)
+    surface = lowest + span * (np.arange(24) + 0.5) / 24  # (s,)
+    ln_c = LN_C_MEAN + LN_C_STD * np.linspace(-2.5, 2.5, 21)  # (c,)
+    depth = np.maximum(surface[:, None, None] - heights_m, 0)  # (s, 1, n)
+    c = np.exp(ln_c)[:, None]  # (c, 1)
+    root = np.broadcast_to(np.sqrt(depth), (24, 21, heights_m.size)).copy()
+    if beam_n_per_m != hertz.RIGID:
+        for _ in range(4):
+            excess = (c * root + beam_n_per_m) * root**2 - beam_n_per_m * depth
+            root -= excess / ((3 * c * root + 2 * beam_n_per_m) * root + 1e-12)
+    misfit = ((forces_n - c * root**3) ** 2).sum(axis=-1) / noise_n**2  # (s, c)
+    cost = misfit / 2 + ((ln_c - LN_C_MEAN) / LN_C_STD) ** 2 / 2
+    weight = np.exp(-(cost - cost.min()))
+    weight /= weight.sum()
+    mean_s, mean_c = float((weight.sum(1) * surface).sum()), float((weight.sum(0) * ln_c).sum())
+    off_s, off_c = surface - mean_s, ln_c - mean_c
+    mixed = float((weight * np.outer(off_s, off_c)).sum())
+    # the width of a cell is not known away
+    cell_s, cell_c = (span / 24) ** 2 / 12, (LN_C_STD * 0.25) ** 2 / 12
+    covariance = np.array(
+        [
+            [float((weight.sum(1) * off_s**2).sum()) + cell_s, mixed],
+            [mixed, float((weight.sum(0) * off_c**2).sum()) + cell_c],
+        ]
+    )
+    return np.array([mean_s, mean_c]), covariance

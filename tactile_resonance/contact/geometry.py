@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the tip must be to touch a point of a surface, and whether the beam's housing stays clear.
+
+Frame `tip`: origin at the ball's centre, +z the outward surface normal, +x along the surface from
+clamp to tip. The beam itself rises from the ball to its clamp by its tilt.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.fields import require
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TipGeometry:
+    """Ball, beam and housing.
+
+    Attributes
+    ----------
+    ball_radius_m, beam_length_m : float
+        Of the ball; from its centre to the clamp [m].
+    beam_tilt_rad : float
+        By which the clamp lies higher than the ball, seen from the surface [rad].
+    housing_below_m : float
+        How far the housing reaches below the beam at the clamp [m].
+    """
+
+    ball_radius_m: float = 2.5e-3
+    beam_length_m: float = 0.064
+    beam_tilt_rad: float = 0.17
+    housing_below_m: float = 6e-3
+
+    def __post_init__(self) -> None:
+        for name in ("ball_radius_m", "beam_length_m"):
+            value = getattr(self, name)
+            require(0 < value < 1, name, value, "above 0, below 1 m")
+        tilt = self.beam_tilt_rad
+        require(0 <= tilt <= 1, "beam_tilt_rad", tilt, "0 to 1")
+        require(0 <= self.housing_below_m < 1, "housing_below_m", self.housing_below_m, "0 to 1 m")
+
+    def clearance(self, depth_m: float, surface_tilt_rad: float = 0.0) -> float:
+        """Height of the housing above the undisturbed surface when pressed in [m].
+
+        Parameters
+        ----------
+        depth_m : float
+            Depth of the robot past the first touch [m].
+        surface_tilt_rad : float
+            By which the surface may rise towards the clamp, against the normal expected [rad].
+        """
+        rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
+        run = self.beam_length_m * math.cos(self.beam_tilt_rad)
+        return (
+            self.ball_radius_m
+            + rise
+            - self.housing_below_m
+            - depth_m
+            - run * math.tan(surface_tilt_rad)
+        )
+
+
+def touch_pose(
+    point_m: ArrayLike, normal: ArrayLike, towards: ArrayLike, ball_radius_m: float
+) -> Pose:
+    """Return the pose of `tip` in which the ball just touches a point of a surface.
+
+    Parameters
+    ----------
+    point_m : (3,) array
+        On the surface, in the base [m].
+    normal : (3,) array
+        Out of the tissue; any length but 0.
+    towards : (3,) array
+        Direction from clamp to tip; its part along the surface counts.
+    ball_radius_m : float
+
+    Raises
+    ------
+    ValueError
+        If the normal is 0 or no number, or `towards` lies along it.
+    """
+    z, x = np.asarray(normal, dtype=float), np.asarray(towards, dtype=float)
+    length = float(np.linalg.norm(z))
+    require(0 < length < math.inf, "normal", normal, "three numbers, not all 0")
+    z = z / length
+    x = x - (x @ z) * z
+    along = float(np.linalg.norm(x))
+    require(1e-6 < along < math.inf, "towards", towards, "a direction not along the normal")
+    x = x / along
+    turn = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+    place = np.asarray(point_m, dtype=float) + ball_radius_m * z
+    return Pose(place, turn.as_rotvec())
+
+
+def misalignment_rad(pose: Pose, goal: Pose) -> float:
+    """Return the angle between two orientations [rad]."""
+    return float((goal.rotation * pose.rotation.inv()).magnitude())

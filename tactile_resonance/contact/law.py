@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control law: how fast the tip goes, from what is known of the contact.
+
+The estimated model says at which height the force asked for is reached; the rest of the way, less
+what the arm will still do of earlier commands, is gone in a time constant. So the tip slows down
+early on stiff tissue and late on soft, and the dead time does not make it oscillate. While the
+stiffness is uncertain the aim stays below the force by that uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from tactile_resonance.contact import hertz
+from tactile_resonance.contact.estimator import ContactFilter
+from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.simulation.fields import require
+
+SURE_SHARE = 0.02
+"""Uncertainty of the force, as a share of it, for which no caution is needed."""
+
+
+class HoldMode(str, Enum):
+    """What is kept once the force is reached."""
+
+    FORCE = "force"
+    INDENTATION = "indentation"
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What is asked of a contact: force [N] and what is held then."""
+
+    force_n: float
+    hold: HoldMode = HoldMode.FORCE
+
+    def __post_init__(self) -> None:
+        require(1e-3 <= self.force_n < math.inf, "force_n", self.force_n, "1 mN or above")
+
+
+def force_speed(
+    model: ContactFilter,
+    height_m: float,
+    pending_m: float,
+    aim_n: float,
+    parameters: ContactParameters,
+    *,
+    holding: bool,
+) -> float:
+    """Return the speed along the normal, away from the surface positive [m/s], towards a force.
+
+    Parameters
+    ----------
+    model : ContactFilter
+    height_m : float
+        Of the tip now.
+    pending_m : float
+        Way that the arm will still go of earlier commands [m].
+    aim_n : float
+    parameters : ContactParameters
+    holding : bool
+        Whether the force has been reached: then slower, and without caution.
+    """
+    target, slope, std = model.height_for(aim_n)
+    if not holding:
+        target += parameters.caution * max(0.0, std - SURE_SHARE * aim_n) / slope
+    time = parameters.hold_time_constant_s if holding else parameters.time_constant_s
+    # relaxation takes the force away: at constant force u goes as C^(-2/3)
+    creep = 2 / 3 * model.c_rate_per_s * hertz.depth(aim_n, model.c)
+    return (target - height_m - pending_m) / time + creep
+
+
+def place_speed(
+    target_m: float, height_m: float, pending_m: float, parameters: ContactParameters
+) -> float:
+    """Return the speed along the normal that keeps a height [m/s]."""
+    return (target_m - height_m - pending_m) / parameters.hold_time_constant_s

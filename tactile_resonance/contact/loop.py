@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control loop: read both devices, let the controller decide, tell the arm; again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from tactile_resonance.contact.interfaces import Arm, ArmError, ForceError, ForceSource
+from tactile_resonance.contact.machine import ContactController, ContactGoal, State
+from tactile_resonance.contact.result import ContactResult
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
+
+STOP_AGAIN_NS = 50_000_000
+"""A stop that holds is told again after so long."""
+
+
+class Clock(Protocol):
+    """The clock of the samples: the machine's, or virtual time."""
+
+    def now_ns(self) -> int:
+        """Time now [ns]."""
+        ...
+
+    def wait_until(self, time_ns: int) -> None:
+        """Return at a time, or at once where it has passed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What one cycle saw, for those who record or publish it."""
+
+    time_ns: int
+    arm: ArmSample | None
+    wrenches: list[WrenchSample]
+    state: State
+    late_s: float
+
+
+class ContactLoop:
+    """Runs a controller on an arm, a force source and a clock; one thread.
+
+    Parameters
+    ----------
+    listener : callable, optional
+        Called with each `Cycle`; must return at once.
+
+    Attributes
+    ----------
+    cycles, overruns : int
+        Cycles run, and those that began more than one period late.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        force: ForceSource,
+        clock: Clock,
+        controller: ContactController,
+        listener: Callable[[Cycle], None] | None = None,
+    ) -> None:
+        self.controller = controller
+        self.cycles = self.overruns = 0
+        self._arm, self._force, self._clock = arm, force, clock
+        self._listener = listener
+        self._next_ns = clock.now_ns()
+        self._refused: ArmError | None = None  # what a command raised, told in the next cycle
+        self._stopped_ns: int | None = None
+
+    def start(self, goal: ContactGoal) -> None:
+        """Begin a contact; raises ``ValueError`` where the controller refuses it."""
+        self.controller.start(goal, self._clock.now_ns())
+
+    def make(self, goal: ContactGoal) -> ContactResult:
+        """Begin a contact and run until it is reached, or has failed and stands still."""
+        self.start(goal)
+        self.run_while(lambda: self.controller.result is None)
+        result = self.controller.result
+        assert result is not None
+        return result
+
+    def run_while(self, condition: Callable[[], bool], longest_s: float = float("inf")) -> None:
+        """Run while a condition holds, at most for some time."""
+        end_ns = self._clock.now_ns() + 1e9 * longest_s
+        while condition() and self._clock.now_ns() < end_ns:
+            self.cycle()
+
+    def retract(self) -> ContactResult | None:
+        """Draw the tip back and run until it is, or until the arm fails; return the result."""
+        self.controller.retract()
+        self.cycle()
+        self.run_while(lambda: self.controller.state not in (State.IDLE, State.FAULT))
+        return self.controller.result
+
+    def cycle(self) -> None:
+        """Wait for the next period and run it."""
+        period_ns = round(1e9 * self.controller.parameters.period_s)
+        self._clock.wait_until(self._next_ns)
+        now = self._clock.now_ns()
+        late_ns = now - self._next_ns
+        self.cycles += 1
+        if late_ns > period_ns:
+            self.overruns += 1
+            self._next_ns = now  # periods that are lost are not made up for
+        self._next_ns += period_ns
+        fault: ArmError | ForceError | None = self._refused
+        self._refused = None
+        arm, wrenches = None, []
+        try:
+            arm = self._arm.state()
+        except ArmError as error:
+            fault = fault or error
+        try:
+            wrenches = self._force.read()
+        except ForceError as error:
+            fault = fault or error
+        command = self.controller.step(now, arm, wrenches, fault)
+        try:
+            if command is None:
+                self._stopped_ns = None
+            elif command.twist is not None:
+                self._stopped_ns = None
+                self._arm.speed(command.twist, command.acceleration_m_s2)
+            elif self._stopped_ns is None or now - self._stopped_ns > STOP_AGAIN_NS:
+                self._stopped_ns = now
+                self._arm.stop(command.acceleration_m_s2)
+        except ArmError as error:
+            self._refused = error
+            self._stopped_ns = None
+        if self._listener is not None:
+            state = self.controller.state
+            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9))

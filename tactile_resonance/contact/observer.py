@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From wrenches and heights to what is known: bias, touch, the model of the contact, held force."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+from tactile_resonance.contact.arm_model import ArmModel
+from tactile_resonance.contact.estimator import ContactFilter, TouchDetector
+from tactile_resonance.contact.force_watch import ForceWatch
+from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.contact.result import Breach
+from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.contact.tare import Tare
+
+WINDOW_SAMPLES = 60
+"""Forces kept for the first estimate of the contact: 120 ms at 500 Hz."""
+
+LONGEST_GUESS_S = 0.02
+"""So far beyond the newest state of the arm its height is continued [s]."""
+
+
+class Observer:
+    """Takes every force once, at the height at which it was measured.
+
+    Attributes
+    ----------
+    watch : ForceWatch
+    arm_model : ArmModel
+    model : ContactFilter or None
+        From the touch on.
+    tare : Tare or None
+        While one is taken.
+    noise_n, bias_std_n : float
+        Of one force and of the bias, from the last tare [N].
+    """
+
+    def __init__(self, parameters: ContactParameters, stuck_samples: int) -> None:
+        p = self._parameters = parameters
+        self.watch = ForceWatch(stuck_samples)
+        self.arm_model = ArmModel(
+            dead_time_s=p.arm_dead_time_s, lag_s=p.arm_lag_s, period_s=p.period_s
+        )
+        self.model: ContactFilter | None = None
+        self.tare: Tare | None = None
+        self.noise_n = self.bias_std_n = 0.0
+        self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
+        self._accelerations: deque[tuple[int, float]] = deque(maxlen=50)  # middle of period, m/s2
+        self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW_SAMPLES)
+        self._detector: TouchDetector | None = None
+        self._model_ns = 0
+        self._sum_n, self._count = 0.0, 0
+
+    def begin_tare(self) -> None:
+        """Collect forces for the bias from now on."""
+        self.tare = Tare(self._parameters.tare_noise_n)
+
+    def end_tare(self) -> Breach | None:
+        """Take the bias and look for the touch from now on; what is wrong with it is returned."""
+        tare, self.tare = self.tare, None
+        assert tare is not None
+        breach = tare.judge()
+        if breach is None:
+            self.watch.set_bias(tare.bias_n)
+            self.noise_n, self.bias_std_n = tare.noise_n, tare.bias_std_n
+            self.seek_touch()
+        return breach
+
+    def seek_touch(self) -> None:
+        """Forget the contact and look for a touch."""
+        self.model = None
+        self._window.clear()
+        self._detector = TouchDetector(self.noise_n, self.bias_std_n)
+
+    def begin_mean(self) -> None:
+        """Average the force from now on."""
+        self._sum_n, self._count = 0.0, 0
+
+    def mean_force(self) -> tuple[float, float] | None:
+        """Mean force since `begin_mean` and its deviation from noise and tare [N]; None if none."""
+        if self._count == 0:
+            return None
+        std = math.hypot(self.noise_n / math.sqrt(self._count), self.bias_std_n)
+        return self._sum_n / self._count, std
+
+    def take(self, wrenches: Sequence[WrenchSample], arm_ns: int, height_m: float) -> Breach | None:
+        """Take a state of the arm and the forces that came; stop at the first that is bad."""
+        p = self._parameters
+        self._heights.append((arm_ns, height_m))
+        middle = arm_ns - round(0.5e9 * p.period_s)
+        self._accelerations.append((middle, self.arm_model.acceleration_m_s2))
+        for sample in wrenches:
+            inertia = 0.0
+            if (
+                p.carried_kg > 0
+            ):  # a cell on the tool feels the contact less mass times acceleration
+                then = sample.time_ns - round(1e9 * p.cell_lag_s)
+                inertia = -p.carried_kg * _between(self._accelerations, then, 0.0)
+            breach = self.watch.add(sample, inertia)
+            if breach is not None:
+                return breach
+            if self.tare is not None:
+                self.tare.add(sample.force_n)
+                continue
+            height = _between(self._heights, sample.time_ns, self.arm_model.speed_m_s)
+            force = float(self.watch.force_n[2])
+            if self.model is not None:
+                self._update(self.model, sample.time_ns, height, force)
+            elif self._detector is not None:
+                self._window.append((height, force))
+                if self._detector.add(force):
+                    self._touch(sample.time_ns)
+        return None
+
+    def _update(self, model: ContactFilter, time_ns: int, height: float, force: float) -> None:
+        model.predict(max(0.0, (time_ns - self._model_ns) * 1e-9))
+        model.update(height, force)
+        self._model_ns = time_ns
+        self._sum_n += force
+        self._count += 1
+
+    def _touch(self, time_ns: int) -> None:
+        heights, forces = zip(*self._window, strict=True)
+        self.model = ContactFilter(
+            heights,
+            forces,
+            noise_n=self.noise_n,
+            beam_n_per_m=self._parameters.beam_n_per_m,
+            vibration_m=self._parameters.arm_vibration_m,
+        )
+        self._model_ns = time_ns
+
+
+def _between(history: deque[tuple[int, float]], time_ns: int, rate_per_s: float) -> float:
+    """Value at a time, linear between those known; beyond the newest it goes on at a rate."""
+    after: tuple[int, float] | None = None
+    for before in reversed(history):
+        if before[0] > time_ns:
+            after = before
+        elif after is None:
+            late = min(LONGEST_GUESS_S, (time_ns - before[0]) * 1e-9)
+            return before[1] + rate_per_s * late
+        else:
+            share = (time_ns - before[0]) / (after[0] - before[0])
+            return before[1] + share * (after[1] - before[1])
+    return history[0][1]

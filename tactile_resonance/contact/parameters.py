@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a contact is made, and within which limits: read from ``config/contact.yaml``, checked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.simulation.fields import (
+    known_keys,
+    numbers,
+    read_dataclass,
+    read_yaml,
+    require,
+    section,
+)
+
+RANGES: dict[str, tuple[float, float]] = {
+    "approach_speed_m_s": (1e-4, 5e-3),
+    "press_speed_m_s": (1e-4, 5e-3),
+    "travel_speed_m_s": (1e-3, 0.25),
+    "retract_speed_m_s": (1e-3, 0.1),
+    "acceleration_m_s2": (0.05, 2.0),
+    "standoff_m": (5e-4, 0.05),
+    "search_m": (0.0, 0.02),
+    "early_m": (0.0, 0.02),
+    "tare_s": (0.05, 5.0),
+    "tare_noise_n": (1e-5, 1.0),
+    "tolerance": (0.005, 0.5),
+    "settle_s": (0.0, 2.0),
+    "time_constant_s": (0.01, 1.0),
+    "hold_time_constant_s": (0.02, 2.0),
+    "caution": (0.0, 3.0),
+    "beam_stiffness_n_per_m": (0.0, 1e5),
+    "carried_kg": (0.0, 5.0),
+    "cell_lag_s": (0.0, 0.05),
+    "arm_dead_time_s": (0.0, 0.1),
+    "arm_lag_s": (0.0, 0.2),
+    "arm_vibration_m": (0.0, 1e-4),
+    "period_s": (1e-3, 0.02),
+}
+"""Accepted range of each number of `ContactParameters`, ends included."""
+
+
+@dataclass(frozen=True)
+class ContactParameters:
+    """How a contact is made.
+
+    Attributes
+    ----------
+    approach_speed_m_s, press_speed_m_s : float
+        Towards the surface before and after the touch [m/s].
+    travel_speed_m_s, retract_speed_m_s : float
+        To the standoff, and away from the tissue [m/s].
+    acceleration_m_s2 : float
+        Limit of every motion but stops [m/s2].
+    standoff_m : float
+        Height above the expected surface where the approach begins [m].
+    search_m, early_m : float
+        How far below or above its place the surface may be found [m].
+    tare_s, tare_noise_n : float
+        Length of the tare [s]; noise above which it is refused [N rms].
+    tolerance : float
+        Error of the force at which the contact is ready, as a share of the force.
+    settle_s : float
+        How long the force must have been within the tolerance [s].
+    time_constant_s, hold_time_constant_s : float
+        In which the rest of the way is gone, while pressing and while holding [s].
+    caution : float
+        Standard deviations of the estimated force by which pressing stays below the aim.
+    beam_stiffness_n_per_m : float
+        Of the beam between robot and ball [N/m]; 0 where the ball is held rigidly.
+    carried_kg : float
+        Mass beyond a tool-mounted cell, whose inertia it feels [kg]; 0 under the sample, or where
+        the force source removes it.
+    cell_lag_s : float
+        By which the inertia that a tool-mounted cell shows is late on its time stamps [s].
+    arm_dead_time_s, arm_lag_s, arm_vibration_m : float
+        How the arm follows.
+    period_s : float
+        Of the control loop [s].
+    """
+
+    approach_speed_m_s: float = 4e-3
+    press_speed_m_s: float = 5e-3
+    travel_speed_m_s: float = 0.05
+    retract_speed_m_s: float = 0.02
+    acceleration_m_s2: float = 0.5
+    standoff_m: float = 3e-3
+    search_m: float = 2e-3
+    early_m: float = 2e-3
+    tare_s: float = 0.4
+    tare_noise_n: float = 3e-3
+    tolerance: float = 0.05
+    settle_s: float = 0.05
+    time_constant_s: float = 0.03
+    hold_time_constant_s: float = 0.08
+    caution: float = 1.0
+    beam_stiffness_n_per_m: float = 0.0
+    carried_kg: float = 0.0
+    cell_lag_s: float = 0.002
+    arm_dead_time_s: float = 0.004
+    arm_lag_s: float = 0.010
+    arm_vibration_m: float = 3e-6
+    period_s: float = 0.002
+
+    def __post_init__(self) -> None:
+        check_ranges(self, RANGES)
+        low = self.early_m
+        require(self.standoff_m > low, "standoff_m", self.standoff_m, f"above early_m = {low}")
+
+    @property
+    def beam_n_per_m(self) -> float:
+        """Stiffness of the beam [N/m], infinite where there is none."""
+        return self.beam_stiffness_n_per_m or math.inf
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Box for the tip in the base [m], its opposite corners (3,)."""
+
+    low_m: tuple[float, ...] = (-1.0, -1.0, -0.2)
+    high_m: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        low, high = self.low_m, self.high_m
+        good = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
+        require(good, "high_m", high, f"three coordinates above low_m = {low}")
+
+
+LIMIT_RANGES: dict[str, tuple[float, float]] = {
+    "abort_force_n": (1e-3, 10.0),
+    "hard_force_n": (1e-3, 20.0),
+    "pull_force_n": (1e-3, 10.0),
+    "lateral_force_n": (1e-3, 10.0),
+    "force_rate_n_per_s": (0.01, 1000.0),
+    "depth_m": (1e-5, 0.02),
+    "lost_force_n": (0.0, 1.0),
+    "lost_s": (0.01, 10.0),
+    "near_m": (1e-3, 0.1),
+    "near_speed_m_s": (1e-4, 0.02),
+    "contact_speed_m_s": (1e-4, 0.02),
+    "lateral_speed_m_s": (0.0, 0.02),
+    "free_speed_m_s": (1e-3, 0.5),
+    "angular_speed_rad_s": (0.0, 2.0),
+    "tilt_rad": (1e-3, 1.6),
+    "misalignment_rad": (1e-3, 0.5),
+    "force_age_s": (1e-3, 0.5),
+    "arm_age_s": (1e-3, 0.5),
+    "stuck_samples": (3, 1000),
+    "travel_s": (0.1, 600.0),
+    "approach_s": (0.1, 600.0),
+    "press_s": (0.1, 60.0),
+    "hold_s": (0.1, 3600.0),
+    "retract_s": (0.1, 60.0),
+    "stop_deceleration_m_s2": (0.1, 20.0),
+}
+"""Accepted range of each number of `Limits`, ends included."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What must never be exceeded; they win over everything else.
+
+    Attributes
+    ----------
+    abort_force_n, hard_force_n : float
+        Force at which the contact is given up, and force that must never be reached [N].
+    pull_force_n : float
+        Force against the pressing direction at which it is given up [N]: a sensor with its sign
+        flipped, or a tip that sticks.
+    lateral_force_n : float
+        Along the surface [N].
+    force_rate_n_per_s : float
+        Over 10 ms [N/s].
+    depth_m : float
+        Past the first touch [m].
+    lost_force_n, lost_s : float
+        Contact is lost where the mean force of that time is below that force.
+    near_m : float
+        Height above the expected surface below which the tip is near it [m].
+    near_speed_m_s, contact_speed_m_s, lateral_speed_m_s, free_speed_m_s : float
+        Speed near the surface, in contact, along the surface in contact, elsewhere [m/s].
+    angular_speed_rad_s : float
+    tilt_rad : float
+        Between +z of the tip and the vertical [rad].
+    misalignment_rad : float
+        Between the tip and its goal while near the surface [rad].
+    force_age_s, arm_age_s : float
+        Age of the newest data [s].
+    stuck_samples : int
+        So many equal forces in a row are a stuck sensor.
+    travel_s, approach_s, press_s, hold_s, retract_s : float
+        Longest time in a state [s].
+    stop_deceleration_m_s2 : float
+        Of stops [m/s2].
+    workspace : Workspace
+    """
+
+    abort_force_n: float = 0.03
+    hard_force_n: float = 0.05
+    pull_force_n: float = 0.008
+    lateral_force_n: float = 0.015
+    force_rate_n_per_s: float = 1.2
+    depth_m: float = 3e-3
+    lost_force_n: float = 2e-3
+    lost_s: float = 0.05
+    near_m: float = 5e-3
+    near_speed_m_s: float = 5e-3
+    contact_speed_m_s: float = 5e-3
+    lateral_speed_m_s: float = 2e-3
+    free_speed_m_s: float = 0.1
+    angular_speed_rad_s: float = 0.3
+    tilt_rad: float = 0.8
+    misalignment_rad: float = 0.05
+    force_age_s: float = 0.010
+    arm_age_s: float = 0.020
+    stuck_samples: int = 10
+    travel_s: float = 60.0
+    approach_s: float = 10.0
+    press_s: float = 5.0
+    hold_s: float = 120.0
+    retract_s: float = 10.0
+    stop_deceleration_m_s2: float = 1.0
+    workspace: Workspace = Workspace()
+
+    def __post_init__(self) -> None:
+        check_ranges(self, LIMIT_RANGES)
+        least = self.abort_force_n
+        require(self.hard_force_n > least, "hard_force_n", self.hard_force_n, f"above {least}")
+
+    def check(self, parameters: ContactParameters) -> None:
+        """Raise ``ValueError`` where parameters ask for more than the limits allow."""
+        for name, limit in (
+            ("approach_speed_m_s", self.near_speed_m_s),
+            ("press_speed_m_s", self.contact_speed_m_s),
+            ("travel_speed_m_s", self.free_speed_m_s),
+            ("retract_speed_m_s", self.free_speed_m_s),
+        ):
+            value = getattr(parameters, name)
+            require(value <= limit, name, value, f"at most the limit {limit}")
+
+
+def check_ranges(owner: object, ranges: dict[str, tuple[float, float]]) -> None:
+    """Raise ``ValueError`` naming the first number of a dataclass that is out of its range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(owner, name)
+        require(low <= value <= high, name, value, f"{low:g} to {high:g}")
+
+
+def read_contact(path: Path | None = None) -> tuple[ContactParameters, Limits]:
+    """Read both; without a path, from ``config/contact.yaml``.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, or a field is unknown, out of range or beyond the limits.
+    """
+    path = share_path("config/contact.yaml") if path is None else Path(path)
+    content, where = read_yaml(path), path.name
+    known_keys(content, {"contact", "limits"}, where)
+    parameters = read_dataclass(
+        ContactParameters, section(content, "contact", where), f"{where}: contact"
+    )
+    entries = dict(section(content, "limits", where))
+    box = entries.pop("workspace", None)
+    limits = read_dataclass(Limits, entries, f"{where}: limits")
+    if box is not None:
+        at = f"{where}: limits.workspace"
+        require(isinstance(box, dict), at, box, "a mapping of low_m and high_m")
+        known_keys(box, {"low_m", "high_m"}, at)
+        corners = [numbers(box.get(name), f"{at}.{name}", 3) for name in ("low_m", "high_m")]
+        limits = replace(limits, workspace=Workspace(*corners))
+    limits.check(parameters)
+    return parameters, limits
