@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
-import os
 import signal
+
+from tactile_resonance.processes import take_priority
 
 READY = "simulated UR5e ready at"
 
@@ -62,23 +63,6 @@ def run(options: argparse.Namespace) -> int:
         f"longest delay {robot.pace.longest_s * 1e3:.1f} ms"
     )
     return 0
-
-
-def take_priority(priority: int) -> None:
-    """Run this process under SCHED_FIFO.
-
-    Raises
-    ------
-    ValueError
-        Where that is not allowed.
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (AttributeError, OSError) as error:
-        raise ValueError(
-            f"priority: {priority} refused ({error}); it needs Linux and an rtprio limit "
-            "(/etc/security/limits.d) or root"
-        ) from error
 
 
 def _check(options: argparse.Namespace) -> None:
