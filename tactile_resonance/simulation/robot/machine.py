@@ -154,15 +154,22 @@ class Machine:
         return jacobian(self.frames, self.tcp[:3, 3]) @ self.joints.qd
 
     @property
+    def outer_torque(self) -> FloatArray:
+        """Torques (6,) [N m] of the joints against the measured force on the tool."""
+        return -jacobian(self.frames, self.tcp[:3, 3]).T @ self.tcp_force
+
+    @property
     def steady(self) -> bool:
         """At rest, with no speed asked for, for half a second."""
         return self._rest_cycles >= STEADY_CYCLES
 
+    def comply(self) -> None:
+        """Let force mode move the target aside; raises as `Target.command`."""
+        self.force_mode.step(self.target, self.tcp_force)
+
     def step(self, powered: bool) -> None:
         """Follow the target for one cycle and feel what the tool touches."""
         self.target.end_cycle()
-        if powered:
-            self.force_mode.step(self.target, self.tcp_force)
         self.joints.step(self.target.q, powered)
         self._rest_cycles = 0 if self.target.qd.any() else self._rest_cycles + 1
         self._observe()
@@ -177,6 +184,15 @@ class Machine:
         flange = tool @ inverse_transform(self.target.tcp)
         near = self.joints.q if q_near is None else q_near
         return nearest_inverse(flange, near, self.config.limits.joint_range_rad)
+
+    def solved(self, tool: FloatArray, q_near: FloatArray | None = None) -> FloatArray:
+        """Return joint angles as `solve`; raises ScriptError out of reach."""
+        q = self.solve(tool, q_near)
+        if q is None:
+            raise ScriptError(
+                f"get_inverse_kin: no joint angles reach the position {np.round(tool[:3, 3], 4)} m"
+            )
+        return q
 
     def within_limits(self, q: FloatArray | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
