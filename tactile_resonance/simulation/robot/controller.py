@@ -7,12 +7,11 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
 from tactile_resonance.simulation.robot.machine import Environment, Machine, MachineConfig
-from tactile_resonance.simulation.robot.outputs import OUTPUT_TYPES, output_value
+from tactile_resonance.simulation.robot.outputs import OUTPUT_TYPES, Outputs, OutputValue
 from tactile_resonance.simulation.robot.ports import (
     INPUT_TYPES,
     InputValue,
@@ -112,11 +111,17 @@ class UrController:
         self.log: deque[str] = deque(maxlen=_LOG_LINES)
         self._cycles = 0
         self._refreshed_s = 0.0
+        self._outputs = Outputs(self)
 
     @property
     def time_s(self) -> float:
         """Robot time since power-up [s]."""
         return self._cycles * CYCLE_S
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program runs."""
+        return self.program is not None
 
     @property
     def input_int(self) -> list[int]:
@@ -166,7 +171,7 @@ class UrController:
         if "external_force_torque" in values:
             self.machine.external_wrench = np.array(values["external_force_torque"], dtype=float)
 
-    def outputs(self, name: str) -> Any:
+    def outputs(self, name: str) -> OutputValue:
         """Return an RTDE output: an int or a float, for vectors a list of them.
 
         Raises
@@ -174,7 +179,7 @@ class UrController:
         KeyError
             Where the output is not known.
         """
-        return output_value(self, name)
+        return self._outputs.value(name)
 
     def start_program(self, text: str) -> None:
         """Run the client's control program, in place of one that runs.
@@ -216,6 +221,11 @@ class UrController:
         self.safety.emergency_stop()
         self._end_program("emergency stop")
 
+    def violation(self, reason: str = "injected") -> None:
+        """Stop for a violated safety limit, until safety is restarted; ends the program."""
+        self.safety.violation(reason)
+        self._end_program(f"safety violation: {reason}")
+
     def release_emergency_stop(self) -> None:
         """Release the emergency stop; power and brakes stay off."""
         self.safety.release_emergency_stop()
@@ -239,7 +249,7 @@ class UrController:
         self.machine.catch_with_brakes()
 
     def restart_safety(self) -> None:
-        """Restart after a violation or fault."""
+        """Restart after a violation; the arm is without power then."""
         self.safety.restart_safety()
 
     def close_popup(self) -> None:
@@ -260,10 +270,8 @@ class UrController:
         if self.program is not None:
             self._run_program()
         was_powered = self.safety.powered
-        try:
-            self.machine.step(was_powered)
-        except ProtectiveStop as stop:
-            self.protective_stop(str(stop))
+        self.machine.step(was_powered)
+        self._outputs = Outputs(self)
         force = float(np.linalg.norm(self.machine.tcp_force[:3]))
         if force > self.machine.config.limits.tool_force_n and self.safety.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")
@@ -279,6 +287,7 @@ class UrController:
         try:
             if not self.program.step():
                 self._end_program("ended by its client")
+            self.machine.comply()
         except ProtectiveStop as stop:
             self.protective_stop(str(stop))
         except ScriptError as error:
@@ -287,12 +296,14 @@ class UrController:
 
     def _watch(self) -> None:
         """End the program where its client refreshes the command register too seldom."""
-        if self.program is None or self.program.watchdog_s is None:
+        program = self.program
+        if program is not None and program.watchdog_s is not None:
+            if program.command_register in self.registers.refreshed:
+                self._refreshed_s = self.time_s
+            elif self.time_s - self._refreshed_s > program.watchdog_s + CYCLE_S / 2:
+                self._end_program("RTDE watchdog: the command register was not refreshed in time")
+        else:
             self._refreshed_s = self.time_s
-        elif self.program.command_register in self.registers.refreshed:
-            self._refreshed_s = self.time_s
-        elif self.time_s - self._refreshed_s > self.program.watchdog_s + CYCLE_S / 2:
-            self._end_program("RTDE watchdog: the command register was not refreshed in time")
         self.registers.refreshed.clear()
 
     def _end_program(self, reason: str) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.simulation.robot.ft_sensor import Payload
-from tactile_resonance.simulation.robot.kinematics import jacobian
 
 FloatArray = NDArray[np.float64]
 
@@ -40,29 +39,22 @@ def gravity_torque(frames: FloatArray, gravity_m_s2: FloatArray, payload: Payloa
         Acceleration of free fall in the base.
     payload : Payload
     """
-    torque = np.zeros(6)
-    for columns, mass in _mass_jacobians(frames, payload):
-        torque -= columns.T @ (gravity_m_s2 * mass)
-    return torque
+    return -_momentum_per_speed(frames, payload) @ gravity_m_s2
 
 
 def momentum(frames: FloatArray, qd: FloatArray, payload: Payload) -> float:
     """Return the norm of the linear momentum of links and payload [kg m/s]."""
-    total = np.zeros(3)
-    for columns, mass in _mass_jacobians(frames, payload):
-        total += mass * (columns @ qd)
-    return float(np.linalg.norm(total))
+    return float(np.linalg.norm(qd @ _momentum_per_speed(frames, payload)))
 
 
-def _mass_jacobians(frames: FloatArray, payload: Payload) -> list[tuple[FloatArray, float]]:
-    """Return how each mass moves with the joints, (3, 6), and the mass."""
-    masses = []
-    for link in range(6):
-        frame = frames[link + 1]
-        columns = jacobian(frames, frame[:3, 3] + frame[:3, :3] @ LINK_CENTRE_M[link])[:3]
-        columns[:, link + 1 :] = 0.0  # joints beyond the link do not move it
-        masses.append((columns, float(LINK_MASS_KG[link])))
-    flange = frames[-1]
-    point = flange[:3, 3] + flange[:3, :3] @ payload.cog_m
-    masses.append((jacobian(frames, point)[:3], payload.mass_kg))
-    return masses
+def _momentum_per_speed(frames: FloatArray, payload: Payload) -> FloatArray:
+    """Return the linear momentum that a unit speed of each joint carries, shape (6, 3)."""
+    mass = np.append(LINK_MASS_KG, payload.mass_kg)
+    links = np.concatenate([frames[1:], frames[-1:]])  # the payload sits on the last link
+    centre = np.concatenate([LINK_CENTRE_M, payload.cog_m[None]])
+    point = links[:, :3, 3] + (links[:, :3, :3] @ centre[..., None])[..., 0]  # (7, 3)
+    # first moment of all that a joint carries, about a point of its axis
+    carried = np.cumsum(mass[::-1])[::-1][:6]
+    moment = np.cumsum((mass[:, None] * point)[::-1], axis=0)[::-1][:6]
+    lever = moment - carried[:, None] * frames[:6, :3, 3]
+    return np.cross(frames[:6, :3, 2], lever)

@@ -1,80 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the joints follow their targets: dead time, a first-order lag, a small wander."""
+"""How the joints follow their targets, and how the tip trembles beside them."""
 
 from __future__ import annotations
-
-from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.simulation.robot.target import CYCLE_S
+from tactile_resonance.simulation.tracking import Jitter, Lag, TrackingParameters
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class JointTracking:
-    """Tracking of targets by the joints.
-
-    Attributes
-    ----------
-    dead_time_s : float
-        Between a target and the first motion; rounded to whole cycles.
-    lag_s : float
-        Time constant of the approach.
-    jitter_rad : float
-        Standard deviation of the wander of one joint; 4 microrad are about 3 micrometres at a tip half
-        a metre from the axes.
-    jitter_time_s : float
-        Its correlation time (Ornstein-Uhlenbeck).
-    """
-
-    dead_time_s: float = 0.004
-    lag_s: float = 0.010
-    jitter_rad: float = 4e-6
-    jitter_time_s: float = 0.05
-
-
 class Joints:
-    """Actual angles and speeds of the joints.
+    """Actual angles and speeds of the joints: dead time and lag behind the target.
 
     Attributes
     ----------
     q, qd : (6,) arrays
-        Actual angles [rad] and speeds [rad/s].
+        What the encoders say: angles [rad] and speeds [rad/s].
+    tremble_m : (3,) array
+        Vibration of the tool in the base, which the encoders do not see.
     """
 
-    def __init__(self, q: FloatArray, tracking: JointTracking, rng: np.random.Generator) -> None:
-        self._rng = rng
+    def __init__(self, q: FloatArray, tracking: TrackingParameters, seed: int) -> None:
         self._tracking = tracking
-        self._keep = float(np.exp(-CYCLE_S / tracking.lag_s)) if tracking.lag_s > 0 else 0.0
-        self._jitter_keep = float(np.exp(-CYCLE_S / tracking.jitter_time_s))
-        self._kick = tracking.jitter_rad * float(np.sqrt(1 - self._jitter_keep**2))
-        self._jitter = tracking.jitter_rad * rng.standard_normal(6)
-        delay = round(tracking.dead_time_s / CYCLE_S)
-        self._pending = deque([np.array(q, dtype=float)] * delay)
-        self._followed = np.array(q, dtype=float)
-        self.q = self._followed + self._jitter
+        self._jitter = Jitter(tracking, CYCLE_S, seed) if tracking.jitter_rms_m > 0 else None
+        self._lag = Lag(tracking, q, CYCLE_S)
+        self.q = self._lag.value
         self.qd = np.zeros(6)
+        self.tremble_m = np.zeros(3)
 
     def step(self, target_q: FloatArray, powered: bool) -> None:
         """Follow for one cycle; without power the brakes hold the joints where they are."""
         if not powered:
             self.qd = np.zeros(6)
             return
-        self._pending.append(target_q)
-        delayed = self._pending.popleft()
-        self._followed = delayed + (self._followed - delayed) * self._keep
-        noise = self._rng.standard_normal(6)
-        self._jitter = self._jitter * self._jitter_keep + self._kick * noise
         before = self.q
-        self.q = self._followed + self._jitter
+        self.q = self._lag.step(target_q)
         self.qd = (self.q - before) / CYCLE_S
+        if self._jitter is not None:
+            self.tremble_m = self._jitter.step()
 
     def hold(self) -> FloatArray:
         """Forget what is pending and return the angles (6,) at which the brakes caught the joints."""
-        self._pending = deque([self.q.copy()] * len(self._pending))
-        self._followed = self.q - self._jitter
-        return self._followed.copy()
+        self._lag = Lag(self._tracking, self.q, CYCLE_S)
+        self.qd = np.zeros(6)
+        return self.q

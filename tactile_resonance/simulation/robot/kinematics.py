@@ -129,10 +129,8 @@ def inverse(flange: FloatArray, wrist_angle_rad: float = 0.0) -> list[tuple[floa
             s5, c5 = math.sin(q5), math.cos(q5)
             # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
             along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
-            if abs(s5) < _EDGE:
-                q6 = wrist_angle_rad
-            else:
-                q6 = math.atan2(-along_y / s5, along_x / s5)
+            parallel = abs(s5) < _EDGE
+            q6 = wrist_angle_rad if parallel else math.atan2(-along_y / s5, along_x / s5)
             s6, c6 = math.sin(q6), math.cos(q6)
             # z and x axes of link 4 in the base
             z4x, z4y, z4z = -s6 * xx - c6 * yx, -s6 * xy - c6 * yy, -s6 * xz - c6 * yz

@@ -18,7 +18,7 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     FtSpecification,
     Payload,
 )
-from tactile_resonance.simulation.robot.joints import Joints, JointTracking
+from tactile_resonance.simulation.robot.joints import Joints
 from tactile_resonance.simulation.robot.kinematics import jacobian, link_frames, nearest_inverse
 from tactile_resonance.simulation.robot.poses import (
     inverse_transform,
@@ -27,6 +27,7 @@ from tactile_resonance.simulation.robot.poses import (
     pose_from_matrix,
 )
 from tactile_resonance.simulation.robot.target import CYCLE_S, MotionLimits, ScriptError, Target
+from tactile_resonance.simulation.tracking import TrackingParameters
 
 FloatArray = NDArray[np.float64]
 
@@ -37,14 +38,19 @@ STEADY_CYCLES = 250
 
 
 class Environment(Protocol):
-    """What the tool touches."""
+    """What the tool touches; `simulation.plant.Plant` is one.
+
+    Attributes
+    ----------
+    force_n, torque_nm : (3,) arrays
+        On the tip and about it, along the axes of the base [N], [N m].
+    """
+
+    force_n: FloatArray
+    torque_nm: FloatArray
 
     def step(self, tip_pose: Pose, dt_s: float) -> None:
         """Move the tip to a true pose in the base within `dt_s`."""
-        ...
-
-    def wrench_on_tip(self) -> FloatArray:
-        """Return force [N] and torque [N m] (6,) on the tip, at it and in its frame."""
         ...
 
 
@@ -61,7 +67,8 @@ class MachineConfig:
     tool : Payload
         True mass on the flange; the controller compensates the payload that the program sets.
     limits : MotionLimits
-    tracking : JointTracking
+    tracking : TrackingParameters
+        Of the joints; the vibration is the tip's.
     ft : FtSpecification
     contact_force_n : float
         Measured force that ``tool_contact`` takes for a contact. The robot's own threshold is not
@@ -74,7 +81,7 @@ class MachineConfig:
     tip_in_flange: FloatArray = field(default_factory=lambda: np.zeros(6))
     tool: Payload = field(default_factory=Payload)
     limits: MotionLimits = field(default_factory=MotionLimits)
-    tracking: JointTracking = field(default_factory=JointTracking)
+    tracking: TrackingParameters = field(default_factory=TrackingParameters)
     ft: FtSpecification = field(default_factory=FtSpecification)
     contact_force_n: float = 15.0
 
@@ -125,7 +132,7 @@ class Machine:
         self.config = config
         self.environment = environment
         self.target = Target(config.start_q, config.limits)
-        self.joints = Joints(config.start_q, config.tracking, rng)
+        self.joints = Joints(config.start_q, config.tracking, int(rng.integers(2**31)))
         self.sensor = FtSensor(config.ft, rng)
         self.force_mode = ForceMode()
         self.payload = config.tool
@@ -154,15 +161,22 @@ class Machine:
         return jacobian(self.frames, self.tcp[:3, 3]) @ self.joints.qd
 
     @property
+    def outer_torque(self) -> FloatArray:
+        """Torques (6,) [N m] of the joints against the measured force on the tool."""
+        return -jacobian(self.frames, self.tcp[:3, 3]).T @ self.tcp_force
+
+    @property
     def steady(self) -> bool:
         """At rest, with no speed asked for, for half a second."""
         return self._rest_cycles >= STEADY_CYCLES
 
+    def comply(self) -> None:
+        """Let force mode move the target aside; raises as `Target.command`."""
+        self.force_mode.step(self.target, self.tcp_force)
+
     def step(self, powered: bool) -> None:
         """Follow the target for one cycle and feel what the tool touches."""
         self.target.end_cycle()
-        if powered:
-            self.force_mode.step(self.target, self.tcp_force)
         self.joints.step(self.target.q, powered)
         self._rest_cycles = 0 if self.target.qd.any() else self._rest_cycles + 1
         self._observe()
@@ -177,6 +191,15 @@ class Machine:
         flange = tool @ inverse_transform(self.target.tcp)
         near = self.joints.q if q_near is None else q_near
         return nearest_inverse(flange, near, self.config.limits.joint_range_rad)
+
+    def solved(self, tool: FloatArray, q_near: FloatArray | None = None) -> FloatArray:
+        """Return joint angles as `solve`; raises ScriptError out of reach."""
+        q = self.solve(tool, q_near)
+        if q is None:
+            raise ScriptError(
+                f"get_inverse_kin: no joint angles reach the position {np.round(tool[:3, 3], 4)} m"
+            )
+        return q
 
     def within_limits(self, q: FloatArray | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
@@ -227,8 +250,14 @@ class Machine:
         wrench = self.config.tool.weight(self.flange, self.gravity_m_s2)
         if self.environment is not None:
             tip = self.flange @ self._tip
+            tip[:3, 3] += self.joints.tremble_m
             self.environment.step(Pose.from_vector(pose_from_matrix(tip)), CYCLE_S)
-            wrench = wrench + moved_wrench(self.environment.wrench_on_tip(), self._tip)
+            felt = np.concatenate([self.environment.force_n, self.environment.torque_nm])
+            # from the tip's place and the base's axes to those of the flange
+            place = np.eye(4)
+            place[:3, :3] = self.flange[:3, :3].T
+            place[:3, 3] = self._tip[:3, 3]
+            wrench = wrench + moved_wrench(felt, place)
         weight = self.payload.weight(self.flange, self.gravity_m_s2)
         if self.external is None:
             self.sensor.step(wrench, weight)

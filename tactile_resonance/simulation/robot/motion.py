@@ -159,11 +159,9 @@ def servoj(target: Target, goal: FloatArray, time_s: float, lookahead_s: float) 
         raise ScriptError(f"servoj: lookahead_time {lookahead_s:g}; accepted is 0.03 to 0.2 s")
     if not time_s > 0.0:
         raise ScriptError(f"servoj: t {time_s:g}; accepted is above 0 s")
-    time = 0.0
-    while time < time_s - CYCLE_S / 2:
+    for _ in range(max(1, round(time_s / CYCLE_S))):
         wanted = (goal - target.q) / lookahead_s * target.pace
         _step_joints(target, wanted, SERVO_ACCELERATION_RAD_S2)
-        time += CYCLE_S
         yield
 
 
@@ -174,8 +172,9 @@ def _step_twist(
     twist = target.twist
     difference = goal - twist
     allowed = acceleration * CYCLE_S
-    moving, turning = np.linalg.norm(difference[:3]), np.linalg.norm(difference[3:])
-    reached = bool(max(moving, turning) <= allowed)
+    moving = float(np.linalg.norm(difference[:3]))
+    turning = float(np.linalg.norm(difference[3:]))
+    reached = max(moving, turning) <= allowed
     if reached:
         new = goal
     else:

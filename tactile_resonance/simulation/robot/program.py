@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program that serves an RTDE client: its command loop, its threads, its registers.
+"""The program that serves an RTDE client.
 
 The client uploads a URScript program that waits for command numbers in an input register. The
 simulated controller does not interpret URScript; it runs this loop, which keeps the same protocol:
@@ -11,24 +11,17 @@ where the program was made for the upper range.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.simulation.robot.commands import Commands
 from tactile_resonance.simulation.robot.machine import Machine
 from tactile_resonance.simulation.robot.registers import Registers
-
-FloatArray = NDArray[np.float64]
-Thread = Generator[None, None, None]
+from tactile_resonance.simulation.robot.script import Script, Thread
 
 READY, DONE = 1, 2
 STOP_SCRIPT = 255
 
-# An asynchronous motion's progress word: counters of 7 bits, then a flag, then 15 bits of progress.
-_COUNTER_SPAN = 128
-_RUNNING = 1 << 15
+# Force mode as the client's program sets it when it starts.
+_GAIN_SCALING, _DAMPING = 0.5, 0.025
 
 
 def register_offset(text: str) -> int:
@@ -53,33 +46,31 @@ def register_offset(text: str) -> int:
 class Program:
     """A running control program.
 
-    Attributes
+    Parameters
     ----------
     machine : Machine
-    threads : dict of str to generator
-        Running threads: speed, servo, move, stop, contact, jog.
-    watchdog_s : float or None
-        Longest time without a refresh of the command register; None without a watchdog.
-    internal_command : int
-        Set by a thread for the main loop, where no command of the client waits.
+        The arm that it moves.
+    registers : Registers
+    offset : int
+        As `register_offset` returns it.
     """
 
     def __init__(self, machine: Machine, registers: Registers, offset: int) -> None:
-        self.machine = machine
-        self.offset = offset
-        self.threads: dict[str, Thread] = {}
-        self.watchdog_s: float | None = None
-        self.internal_command = 0
-        self._registers = registers
-        self._progress_writes = 0
-        self._operation = 0
-        self._commands = Commands(self)
+        machine.force_mode.gain_scaling = _GAIN_SCALING
+        machine.force_mode.damping = _DAMPING
+        self._script = Script(registers, offset)
+        self._commands = Commands(self._script, machine)
         self._main = self._loop()
 
     @property
     def command_register(self) -> str:
         """RTDE name of the register that carries the commands."""
-        return f"input_int_register_{self.offset}"
+        return f"input_int_register_{self._script.offset}"
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """Longest time without a refresh of the command register; None without a watchdog."""
+        return self._script.watchdog_s
 
     def step(self) -> bool:
         """Run one cycle, the main loop before the threads; False once the program has ended.
@@ -93,61 +84,8 @@ class Program:
             next(self._main)
         except StopIteration:
             return False
-        for name, thread in list(self.threads.items()):
-            if self.threads.get(name) is not thread:
-                continue
-            try:
-                next(thread)
-            except StopIteration:
-                self.kill(name)
+        self._script.step_threads()
         return True
-
-    def run(self, name: str, thread: Thread) -> None:
-        """Start a thread; it takes its first step in this cycle, after the main loop."""
-        self.threads[name] = thread
-
-    def kill(self, name: str) -> bool:
-        """End a thread and say whether it was running."""
-        return self.threads.pop(name, None) is not None
-
-    def integer(self, number: int) -> int:
-        """Return an integer input register."""
-        return self._registers.input_int[number + self.offset]
-
-    def double(self, number: int) -> float:
-        """Return a double input register."""
-        return self._registers.input_double[number + self.offset]
-
-    def doubles(self, number: int, count: int = 6) -> FloatArray:
-        """Return double input registers, shape (count,)."""
-        first = number + self.offset
-        return np.array(self._registers.input_double[first : first + count], dtype=float)
-
-    def answer(self, value: int) -> None:
-        """Write an integer result."""
-        self._registers.output_int[1 + self.offset] = int(value)
-
-    def answer_doubles(self, values: FloatArray) -> None:
-        """Write a vector result."""
-        for place, value in enumerate(values.tolist()):
-            self._registers.output_double[place + self.offset] = value
-
-    def begin_asynchronous(self) -> None:
-        """Tell that an asynchronous operation begins."""
-        self._operation = (self._operation + 1) % _COUNTER_SPAN
-        self._write_progress(_RUNNING)
-
-    def end_asynchronous(self) -> None:
-        """Tell that no asynchronous operation runs."""
-        self._write_progress(0)
-
-    def _write_progress(self, state: int) -> None:
-        self._progress_writes = (self._progress_writes + 1) % _COUNTER_SPAN
-        word = (self._operation << 24) + (self._progress_writes << 16) + state
-        self._registers.output_int[2 + self.offset] = word
-
-    def _status(self, value: int) -> None:
-        self._registers.output_int[self.offset] = value
 
     def _loop(self) -> Thread:
         """Serve commands until told to stop: one look at the command register in each cycle.
@@ -155,26 +93,24 @@ class Program:
         A streaming command is done anew as long as it stands in the register; any other once, until
         the client has taken it away.
         """
-        self.machine.force_mode.gain_scaling = 0.5
-        self.machine.force_mode.damping = 0.025
-        self.end_asynchronous()
-        self._status(READY)
+        script = self._script
+        script.end_asynchronous()
+        script.status(READY)
         executing = False
         while True:
-            command = self.integer(0)
+            command = script.integer(0)
             if command == 0:
-                command, self.internal_command = self.internal_command, 0
+                command, script.internal_command = script.internal_command, 0
             if command in self._commands.STREAMING:
                 yield from self._commands.execute(command)
-                self._status(READY)
+                script.status(READY)
             elif command == 0:
                 executing = False
-                self._status(READY)
-            else:
-                if not executing:
-                    if command == STOP_SCRIPT:
-                        return
-                    yield from self._commands.execute(command)
-                    self._status(DONE)
+                script.status(READY)
+            elif not executing:
+                if command == STOP_SCRIPT:
+                    return
+                yield from self._commands.execute(command)
+                script.status(DONE)
                 executing = True
             yield

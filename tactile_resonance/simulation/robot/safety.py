@@ -25,7 +25,6 @@ class SafetyMode(IntEnum):
     PROTECTIVE_STOP = 3
     ROBOT_EMERGENCY_STOP = 7
     VIOLATION = 8
-    FAULT = 9
 
 
 # Bits of RTDE output ``safety_status_bits``.
@@ -34,7 +33,6 @@ _STATUS_BITS = {
     SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
     SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
     SafetyMode.VIOLATION: 1 << 8 | 1 << 10,
-    SafetyMode.FAULT: 1 << 9 | 1 << 10,
 }
 
 # After a protective stop the robot refuses to be unlocked for this long [s] (dashboard server manual).
@@ -88,7 +86,7 @@ class Safety:
         self._time_s = time_s
         if self._next_mode is not None and time_s >= self._due_s:
             self.robot_mode, self._next_mode = self._next_mode, None
-        powerless = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.VIOLATION, SafetyMode.FAULT)
+        powerless = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.VIOLATION)
         if self.safety_mode in powerless and at_rest:
             self.power_off()
 
@@ -148,8 +146,8 @@ class Safety:
         self.safety_mode, self.reason = SafetyMode.VIOLATION, reason
 
     def restart_safety(self) -> None:
-        """Restart after a violation or a fault; the arm is without power then."""
-        if self.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT):
+        """Restart after a violation; the arm is without power then."""
+        if self.safety_mode is SafetyMode.VIOLATION:
             self.safety_mode = SafetyMode.NORMAL
             self.power_off()
 

@@ -22,7 +22,7 @@ class ScriptError(Exception):
     """The program did what the controller does not allow; the controller ends it."""
 
 
-class ProtectiveStop(Exception):  # noqa: N818 - the standard's term
+class ProtectiveStop(Exception):
     """A limit of the robot was reached; the controller brakes and waits to be unlocked."""
 
 
@@ -131,7 +131,7 @@ class Target:
         frames = link_frames(q)
         point = frames[-1] @ self.tcp[:, 3]
         try:
-            qd = np.linalg.solve(jacobian(frames, point[:3]), twist)
+            qd = np.linalg.solve(jacobian(frames, point[:3]), twist).astype(float, copy=False)
         except np.linalg.LinAlgError:
             raise ProtectiveStop("the path leads through a singularity") from None
         self.command(q, qd)

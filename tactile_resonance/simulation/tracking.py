@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a robot's tip follows what it is told: acceleration limit, dead time, lag, vibration."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.fields import require
+
+FloatArray = NDArray[np.float64]
+
+ROTATION_LEVER_M = 0.1
+"""Lever that turns the acceleration limit [m/s2] into one of rotation [rad/s2]."""
+
+
+@dataclass(frozen=True)
+class TrackingParameters:
+    """How an arm follows; the defaults are chosen to resemble a UR e-series, not measured on one.
+
+    Attributes
+    ----------
+    dead_time_s : float
+        From a command to the first motion [s].
+    lag_s : float
+        Time constant of the motion behind its set point [s].
+    jitter_rms_m : float
+        Vibration of the tip on each axis [m], unseen by the joint encoders.
+    jitter_corner_rad_s : float
+        Its spectrum falls as of white noise through two poles at this rate [rad/s].
+    """
+
+    dead_time_s: float = 0.004
+    lag_s: float = 0.010
+    jitter_rms_m: float = 3e-6
+    jitter_corner_rad_s: float = 50.0
+
+    def __post_init__(self) -> None:
+        for name in ("dead_time_s", "lag_s", "jitter_rms_m"):
+            value = getattr(self, name)
+            require(0 <= value < math.inf, name, value, "a number, 0 or above")
+        corner = self.jitter_corner_rad_s
+        require(0 < corner < math.inf, "jitter_corner_rad_s", corner, "a number above 0")
+
+
+class Lag:
+    """Any number of axes behind their set points: dead time, then a first-order lag.
+
+    Exact for set points that run linearly over each period; a dead time that is no multiple of the
+    period is interpolated.
+
+    Attributes
+    ----------
+    value : (n,) array
+        Where the axes are.
+    """
+
+    def __init__(self, parameters: TrackingParameters, start: FloatArray, period_s: float) -> None:
+        self.value = np.array(start, dtype=float)
+        periods = parameters.dead_time_s / period_s
+        whole = int(periods + 1e-9)
+        self._fraction = max(0.0, periods - whole)
+        self._line = deque([self.value.copy()] * (whole + 2), maxlen=whole + 2)
+        self._delayed = self.value.copy()
+        lag = parameters.lag_s
+        self._decay = math.exp(-period_s / lag) if lag > 0 else 0.0
+        self._slope = lag / period_s * (1 - self._decay)
+
+    def step(self, target: FloatArray) -> FloatArray:
+        """Advance one period, at whose end the set point is `target`; return `value`, (n,)."""
+        self._line.append(np.array(target, dtype=float))
+        before = self._delayed
+        self._delayed = self._line[1] + self._fraction * (self._line[0] - self._line[1])
+        self.value = (
+            self._delayed
+            + self._decay * (self.value - before)
+            - self._slope * (self._delayed - before)
+        )
+        return self.value
+
+
+class Jitter:
+    """Stationary vibration of three axes: white noise through two equal real poles, seeded.
+
+    Its autocorrelation is ``s^2 (1 + w |t|) exp(-w |t|)``; the step is exact for any period.
+    """
+
+    def __init__(self, parameters: TrackingParameters, period_s: float, seed: int) -> None:
+        rms, w, t = parameters.jitter_rms_m, parameters.jitter_corner_rad_s, period_s
+        fall = math.exp(-w * t)
+        self._transition = fall * np.array([[1 + w * t, t], [-(w**2) * t, 1 - w * t]])
+        stationary = rms**2 * np.diag([1.0, w**2])
+        driven = stationary - self._transition @ stationary @ self._transition.T
+        # tiny negative eigenvalues are rounding
+        values, vectors = np.linalg.eigh(driven)
+        self._drive = vectors * np.sqrt(np.maximum(values, 0))
+        self._rng = np.random.default_rng(seed)
+        self._state = np.sqrt(stationary) @ self._rng.standard_normal((2, 3))  # [place; speed]
+
+    def step(self) -> FloatArray:
+        """Advance one period; return the displacement (3,) [m]."""
+        noise = self._rng.standard_normal((2, 3))
+        self._state = self._transition @ self._state + self._drive @ noise
+        return self._state[0]
+
+
+class TipMotion:
+    """Six axes of a tip that obeys twists and straight moves, one period at a time.
+
+    Attributes
+    ----------
+    pose : Pose
+        Where the tip is, vibration included.
+    reported : Pose
+        What the arm's encoders say: without vibration.
+    twist : (6,) array
+        Velocity [m/s] and angular velocity [rad/s] of `reported`.
+    """
+
+    def __init__(
+        self, parameters: TrackingParameters, start: Pose, *, period_s: float = 0.002, seed: int = 0
+    ) -> None:
+        self.period_s = period_s
+        self.pose = self.reported = start
+        self.twist = np.zeros(6)
+        self._set_twist = np.zeros(6)  # after the acceleration limit
+        self._set_pose = start
+        self._wanted: FloatArray | Pose = np.zeros(6)
+        self._speed_m_s, self._acceleration_m_s2 = 0.0, 1.0
+        self._lag = Lag(parameters, np.zeros(6), period_s)
+        self._jitter = Jitter(parameters, period_s, seed) if parameters.jitter_rms_m > 0 else None
+
+    def speed(self, twist: FloatArray, acceleration_m_s2: float) -> None:
+        """Go over to a twist (6,) in the base, under an acceleration limit, and keep it."""
+        self._wanted, self._acceleration_m_s2 = np.array(twist, dtype=float), acceleration_m_s2
+
+    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Go straight to a pose and rest there."""
+        self._wanted, self._speed_m_s = pose, speed_m_s
+        self._acceleration_m_s2 = acceleration_m_s2
+
+    def moving(self) -> bool:
+        """Whether a straight move is under way."""
+        if not isinstance(self._wanted, Pose):
+            return False
+        ahead = self._ahead(self._wanted, self._set_pose)
+        return bool(np.abs(ahead).max() > 1e-7 or np.abs(self.twist).max() > 1e-5)
+
+    def step(self) -> None:
+        """Advance one period."""
+        dt, before = self.period_s, self._set_twist
+        self._set_twist = self._limited(self._set_point())
+        if isinstance(self._wanted, Pose):  # only moves need to know how far they have come
+            self._set_pose = moved(self._set_pose, (before + self._set_twist) / 2 * dt)
+        else:
+            self._set_pose = self.reported
+        last = self.twist
+        self.twist = self._lag.step(self._set_twist)
+        self.reported = moved(self.reported, (last + self.twist) / 2 * dt)
+        self.pose = self.reported
+        if self._jitter is not None:
+            place = self.reported.position_m + self._jitter.step()
+            self.pose = Pose(place, self.reported.rotation_rad)
+
+    def _set_point(self) -> FloatArray:
+        if not isinstance(self._wanted, Pose):
+            return self._wanted
+        ahead = self._ahead(self._wanted, self._set_pose)
+        scaled = ahead * np.repeat([1.0, ROTATION_LEVER_M], 3)
+        distance = float(np.linalg.norm(scaled))
+        if distance < 1e-12:
+            return np.zeros(6)
+        # the speed from which the limit still brakes in time, one period of caution included
+        margin = self._acceleration_m_s2 * self.period_s
+        braking = math.sqrt(margin**2 / 4 + 2 * self._acceleration_m_s2 * distance) - margin / 2
+        speed = min(self._speed_m_s, braking, distance / self.period_s)
+        return ahead * (speed / distance)
+
+    def _limited(self, wanted: FloatArray) -> FloatArray:
+        change = wanted - self._set_twist
+        linear = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
+        angular = math.sqrt(change[3] ** 2 + change[4] ** 2 + change[5] ** 2)
+        step = self._acceleration_m_s2 * self.period_s
+        largest = max(linear, angular * ROTATION_LEVER_M)
+        if largest <= step:
+            return wanted
+        return self._set_twist + change * (step / largest)
+
+    @staticmethod
+    def _ahead(target: Pose, pose: Pose) -> FloatArray:
+        """Way (3,) [m] and rotation vector (3,) [rad] from a pose to another, in the base."""
+        turn = np.zeros(3)
+        if target.rotation_rad is not pose.rotation_rad:
+            turn = (target.rotation * pose.rotation.inv()).as_rotvec()
+        return np.concatenate([target.position_m - pose.position_m, turn])
+
+
+def moved(pose: Pose, step: FloatArray) -> Pose:
+    """Return a pose after a small motion (6,) [m, rad] in the base.
+
+    The rotation vector stays the same object where nothing turns, so that what is computed from it
+    can be kept.
+    """
+    rotation = pose.rotation_rad
+    if step[3] or step[4] or step[5]:
+        rotation = (Rotation.from_rotvec(step[3:]) * pose.rotation).as_rotvec()
+    return Pose(pose.position_m + step[:3], rotation)
