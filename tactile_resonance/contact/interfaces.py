@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
 
 
 class Mount(str, Enum):
@@ -30,6 +30,7 @@ class ForceFault(str, Enum):
     SILENT = "silent"
     STUCK = "stuck"
     INVALID = "invalid"  # a value that is no number or outside of the sensor's range
+    JUMP = "jump"  # a step that no contact makes: bias, sign
     OVERLOAD = "overload"
     INCOMPLETE = "incomplete"  # frames of a wrench lost more often than tolerated
     LINK_LOST = "link_lost"
@@ -99,6 +100,27 @@ class ForceInfo:
     range_n: float
     mount: Mount
     clock_uncertainty_s: float = 0.0
+
+
+class Cell(Protocol):
+    """A force sensor by itself: wrenches in its own frame, `ForceSource` in all else."""
+
+    @property
+    def info(self) -> ForceInfo:
+        """What it can do."""
+        ...
+
+    def start(self) -> None:
+        """Connect and stream, also after a fault has ended. Raises `ForceError`."""
+        ...
+
+    def read(self) -> list[CellSample]:
+        """Wrenches since the last call, oldest first, without waiting. Raises `ForceError`."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+        ...
 
 
 class ForceSource(Protocol):

@@ -41,6 +41,25 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class CellSample:
+    """One wrench as a force sensor reports it.
+
+    Attributes
+    ----------
+    time_ns : int
+        When it was measured, on the clock of `WrenchSample`.
+    wrench : (6,) array
+        What acts on the sensor, force [N] and torque about its origin [N m], in its own frame.
+    overload : bool
+        A channel is beyond its range.
+    """
+
+    time_ns: int
+    wrench: NDArray[np.float64]
+    overload: bool = False
+
+
+@dataclass(frozen=True)
 class WrenchSample:
     """One wrench.
 

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance simulate-cell`: a load cell on CAN, as a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.simulation.cell_loop import CellLoop
+from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.transducer import CellParameters
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "simulate-cell",
+        help="a simulated load cell on CAN (socketcand)",
+        description="Serve a simulated six-axis load cell with the frames of Robotous on a CAN bus over TCP "
+        "(socketcand), until interrupted. Lines on standard input change it: 'force 0.01' presses 10 mN on "
+        "its z axis; 'silent 1', 'stuck 1', 'lose_second_every 2', 'invalid 1', 'saturated 1', 'flipped 1', "
+        "'bias_step_n 0.02' make it faulty, and 0 ends the fault.",
+    )
+    parser.add_argument(
+        "--host", default="127.0.1.1", help="address to listen on (default: 127.0.1.1)"
+    )
+    parser.add_argument("--port", type=int, default=29536, help="0: a free one (default: 29536)")
+    parser.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="its scale and errors (default: config/load_cells/fine.yaml)",
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of its noise (default: 1)")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serve until interrupted or told to end."""
+    if not 0 <= options.port <= 65535:
+        raise ValueError(f"--port: {options.port}, expected 0 to 65535")
+    if options.seed < 0:
+        raise ValueError(f"--seed: {options.seed}, expected 0 or above")
+    cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed)
+    try:
+        bus = SocketcandServer(options.host, options.port)
+    except OSError as error:
+        raise ValueError(f"{options.host}:{options.port}: {error.strerror or error}") from error
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    wrench = np.zeros(6)
+    threading.Thread(target=_listen, args=(cell, wrench), daemon=True).start()
+    loop = CellLoop(cell, bus, lambda _: wrench)
+    print(f"load cell: socketcand {options.host}:{bus.port} can0", flush=True)
+    try:
+        loop.run(ended.is_set)
+    finally:
+        bus.close()
+    if loop.stalls:
+        print(f"load cell: late by more than 10 ms {loop.stalls} times", file=sys.stderr)
+    return 0
+
+
+def _listen(cell: LoadCell, wrench: np.ndarray) -> None:
+    """Do what the lines on standard input say."""
+    for line in sys.stdin:
+        try:
+            name, text = line.split()
+            if name == "force":
+                wrench[2] = float(text)
+            else:
+                cell.faults.inject(name, float(text))
+        except ValueError as error:
+            print(f"load cell: {line.strip()!r}: {error}", file=sys.stderr, flush=True)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A device's clock against this machine's, from the stamps of what the device sends.
+
+A message that left at remote time r arrives at local time l = r (1 + drift) + offset + delay. Delays are
+never below the shortest one, so the true relation runs along the lower edge of the points (r, l - r), here
+that edge of their convex hull which spans the middle of the window: the line below all points with the
+smallest mean distance to them (Moon, Skelly, Towsley, Estimation and removal of clock skew from network
+delay measurements, INFOCOM 1999). Late messages, however many and however late, do not move it.
+
+The shortest delay itself cannot be told from an offset by listening only: it is stated by the caller, with
+its uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from dataclasses import dataclass
+
+BLOCK_S = 0.25
+"""Of all messages within a block the one that was quickest counts."""
+WINDOW_BLOCKS = 120
+STEP_S = 0.005
+"""A message that is earlier than the relation allows by more tells of another clock setting."""
+STEP_BLOCKS = 4
+"""So many blocks on end that are later by as much do, too."""
+YOUNG_BLOCKS = 8
+"""Below this many blocks no drift is estimated."""
+FIRST_STD_S = 1e-3
+"""Stated until the first block is complete."""
+USUAL_DRIFT = 2e-4
+"""Of quartz clocks, taken as the uncertainty until a drift is estimated."""
+LARGEST_DRIFT = 1e-3
+
+
+@dataclass(frozen=True)
+class ClockRelation:
+    """Remote to local time.
+
+    Attributes
+    ----------
+    local_ns : int
+        Local time (UNIX) [ns] at remote time `remote_s`.
+    remote_s : float
+    drift : float
+        Rate of the local clock per remote clock, minus 1.
+    uncertainty_s : float
+        Standard deviation of a converted time near the newest message [s].
+    """
+
+    local_ns: int
+    remote_s: float
+    drift: float
+    uncertainty_s: float
+
+    def to_local_ns(self, remote_s: float) -> int:
+        """Local time [ns] of a remote time [s]."""
+        return self.local_ns + round((remote_s - self.remote_s) * (1 + self.drift) * 1e9)
+
+
+class ClockTracker:
+    """Follows a remote clock, message by message.
+
+    Parameters
+    ----------
+    shortest_delay_s, delay_std_s : float
+        Of a message on its way [s], and how well that is known (one standard deviation).
+
+    Attributes
+    ----------
+    restarts : int
+        How often the remote clock was found set anew, or its sender to have stood still.
+    """
+
+    def __init__(self, shortest_delay_s: float = 0.0, delay_std_s: float = 0.0) -> None:
+        for name, value in (("shortest_delay_s", shortest_delay_s), ("delay_std_s", delay_std_s)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}: {value!r}, expected a number, 0 or above")
+        self._delay_s, self._delay_std_s = shortest_delay_s, delay_std_s
+        self.restarts = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._origin: tuple[float, int] | None = None
+        self._blocks: deque[tuple[float, float]] = deque(maxlen=WINDOW_BLOCKS)
+        self._block: tuple[float, float] | None = None  # quickest of the block under way
+        self._block_end_s = 0.0
+        self._last_s = -math.inf
+        # offset at the origin and drift of the lower edge, and how far points are above it
+        self._line = (0.0, 0.0)
+        self._scatter_s = FIRST_STD_S
+
+    def add(self, remote_s: float, local_ns: int) -> None:
+        """Take the stamp [s] of a message and when it arrived [ns].
+
+        Raises
+        ------
+        ValueError
+            If the stamp is no number.
+        """
+        if not math.isfinite(remote_s):
+            raise ValueError(f"remote_s: {remote_s!r}, expected a finite time")
+        if self._origin is not None:
+            x, y = self._point(remote_s, local_ns)
+            early = self._line[0] + self._line[1] * x - y
+            if remote_s < self._last_s or (self._blocks and early > STEP_S):
+                self._clear()
+                self.restarts += 1
+        if self._origin is None:
+            self._origin = (remote_s, local_ns)
+            self._block_end_s = BLOCK_S
+        self._last_s = remote_s
+        x, y = self._point(remote_s, local_ns)
+        if x >= self._block_end_s and self._block is not None:
+            self._blocks.append(self._block)
+            self._block = None
+            self._block_end_s = x + BLOCK_S
+            self._drop_before_a_pause()
+            self._fit()
+        if self._block is None or y < self._block[1]:
+            self._block = (x, y)
+            if not self._blocks:
+                self._line = (y, 0.0)
+
+    def relation(self) -> ClockRelation:
+        """The relation as of now.
+
+        Raises
+        ------
+        ValueError
+            If no message has come yet.
+        """
+        if self._origin is None:
+            raise ValueError("clock relation: no message has come yet")
+        remote_s, local_ns = self._origin
+        x = self._last_s - remote_s
+        offset_s = self._line[0] + self._line[1] * x - self._delay_s
+        return ClockRelation(
+            local_ns=local_ns + round((x + offset_s) * 1e9),
+            remote_s=self._last_s,
+            drift=self._line[1],
+            uncertainty_s=math.hypot(self._scatter_s, self._delay_std_s),
+        )
+
+    def _point(self, remote_s: float, local_ns: int) -> tuple[float, float]:
+        """Remote time and local minus remote time, both since the first message [s]."""
+        assert self._origin is not None
+        x = remote_s - self._origin[0]
+        return x, (local_ns - self._origin[1]) * 1e-9 - x
+
+    def _drop_before_a_pause(self) -> None:
+        """When the sender stood still, its clock is behind from then on."""
+        recent = list(self._blocks)[-STEP_BLOCKS:]
+        late = [y - self._line[0] - self._line[1] * x for x, y in recent]
+        if len(self._blocks) > STEP_BLOCKS and min(late) > STEP_S:
+            self._blocks = deque(recent, maxlen=WINDOW_BLOCKS)
+            self.restarts += 1
+
+    def _fit(self) -> None:
+        points = list(self._blocks)
+        if len(points) < YOUNG_BLOCKS:
+            lowest = min(y for _, y in points)
+            self._line = (lowest, 0.0)
+            unknown_s = USUAL_DRIFT * self._block_end_s
+        else:
+            self._line = _lower_edge(points)
+            unknown_s = 0.0
+        above = [y - self._line[0] - self._line[1] * x for x, y in points]
+        # the newest block tells at once when something has changed
+        self._scatter_s = max(2.0 * statistics.median(above), above[-1], unknown_s)
+
+
+def _lower_edge(points: list[tuple[float, float]]) -> tuple[float, float]:
+    """Offset and slope of the edge of the lower convex hull that spans the mean of x."""
+    hull: list[tuple[float, float]] = []
+    for point in points:  # x rises
+        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    middle = sum(x for x, _ in points) / len(points)
+    for left, right in zip(hull, hull[1:], strict=False):
+        if right[0] >= middle:
+            slope = (right[1] - left[1]) / (right[0] - left[0])
+            slope = min(LARGEST_DRIFT, max(-LARGEST_DRIFT, slope))
+            lowest = min(y - slope * x for x, y in points)
+            return lowest, slope
+    return hull[0][1], 0.0
+
+
+def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tool-mounted cell carries: its weight and inertia, and how to identify them from a few orientations.
+
+Newton and Euler for a rigid body hung on the cell: the body exerts ``m (g - a_c)`` on the cell and
+``c x m (g - a_c)`` about its origin, with a_c the acceleration of the centre of mass at c. The small body's
+own moment of inertia is neglected: a contact never turns it quickly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+GRAVITY_M_S2 = np.array([0.0, 0.0, -9.80665])
+"""Standard gravity in a base that stands upright."""
+LARGEST_CONDITION = 50.0
+"""Largest condition number of the scaled equations: orientations that differ too little exceed it."""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What the cell carries beyond its sensing element.
+
+    Attributes
+    ----------
+    mass_kg : float
+    centre_m : (3,) array
+        Centre of mass in the cell's frame [m].
+    """
+
+    mass_kg: float
+    centre_m: FloatArray
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mass_kg < math.inf:
+            raise ValueError(f"mass_kg: {self.mass_kg!r}, expected a number, 0 or above")
+        if np.shape(self.centre_m) != (3,) or not np.all(np.isfinite(self.centre_m)):
+            raise ValueError(f"centre_m: {self.centre_m!r}, expected 3 finite numbers")
+
+    def wrench(
+        self, rotation: FloatArray, acceleration_m_s2: FloatArray | None = None
+    ) -> FloatArray:
+        """Wrench of the payload on the cell, in the cell's frame.
+
+        Parameters
+        ----------
+        rotation : (..., 3, 3) array
+            From the cell's frame into the base.
+        acceleration_m_s2 : (..., 3) array or None
+            Of the centre of mass, in the base [m/s2].
+
+        Returns
+        -------
+        (..., 6) array
+            Force [N] and torque about the cell's origin [N m].
+        """
+        field = GRAVITY_M_S2 if acceleration_m_s2 is None else GRAVITY_M_S2 - acceleration_m_s2
+        force = self.mass_kg * np.einsum("...ji,...j->...i", rotation, field)
+        return np.concatenate([force, np.cross(self.centre_m, force)], axis=-1)
+
+
+@dataclass(frozen=True)
+class PayloadIdentification:
+    """Result of `identify_payload`.
+
+    Attributes
+    ----------
+    payload : Payload
+    bias : (6,) array
+        What the cell reads without any load [N], [N m].
+    covariance : (10, 10) array
+        Of mass [kg], centre (3) [m] and bias (6), from the stated noise.
+    condition_number : float
+        Of the equations, columns scaled to length 1.
+    chi_square, dof : float, int
+        Weighted sum of squared residuals, and what it is expected to be.
+    """
+
+    payload: Payload
+    bias: FloatArray
+    covariance: FloatArray
+    condition_number: float
+    chi_square: float
+    dof: int
+
+    @property
+    def consistent(self) -> bool:
+        """Whether noise explains the residuals (5 standard deviations of chi square)."""
+        return self.chi_square < self.dof + 5 * math.sqrt(2 * max(1, self.dof))
+
+
+def identify_payload(
+    rotations: FloatArray, wrenches: FloatArray, std: FloatArray
+) -> PayloadIdentification:
+    """Mass, centre of mass and bias from mean wrenches at rest in several orientations.
+
+    Linear least squares in mass, mass times centre, and bias, weighted by the stated noise.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) array
+        From the cell's frame into the base, for each orientation.
+    wrenches : (n, 6) array
+        Mean readings [N], [N m].
+    std : (6,) or (n, 6) array
+        Standard deviation of these means.
+
+    Raises
+    ------
+    ValueError
+        If the orientations do not tell the unknowns apart, or the mass comes out negative.
+    """
+    rotations, wrenches = np.asarray(rotations, float), np.asarray(wrenches, float)
+    n = len(rotations)
+    if rotations.shape != (n, 3, 3) or wrenches.shape != (n, 6):
+        raise ValueError(
+            f"shapes: rotations {rotations.shape} and wrenches {wrenches.shape}, "
+            "expected (n, 3, 3) and (n, 6)"
+        )
+    sigma = np.broadcast_to(np.asarray(std, float), (n, 6))
+    if not (np.all(sigma > 0) and np.all(np.isfinite(wrenches))):
+        raise ValueError("std, wrenches: expected finite wrenches and standard deviations above 0")
+    if n < 3:
+        raise ValueError(f"orientations: {n}, expected at least 3")
+    gravity = np.einsum("nji,j->ni", rotations, GRAVITY_M_S2)  # (n, 3) in the cell's frame
+    equations = np.zeros((n, 6, 10))
+    equations[:, :3, 0] = gravity
+    # (m c) x g = -[g]x (m c)
+    x, y, z = gravity.T
+    zero = np.zeros(n)
+    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # (3, 3, n)
+    equations[:, 3:, 1:4] = -np.moveaxis(skew, -1, 0)
+    equations[:, :, 4:] = np.eye(6)
+    a = (equations / sigma[..., None]).reshape(6 * n, 10)
+    b = (wrenches / sigma).ravel()
+    scale = np.linalg.norm(a, axis=0)
+    scale[scale == 0] = 1.0  # an unknown that no equation holds: found by the condition number
+    u, s, vt = np.linalg.svd(a / scale, full_matrices=False)
+    condition = float(s[0] / s[-1]) if s[-1] > 0 else math.inf
+    if not condition < LARGEST_CONDITION:
+        raise ValueError(
+            f"orientations: condition number {condition:.3g}, expected below {LARGEST_CONDITION:g}: "
+            "turn the tool about two axes, by 45 degrees or more"
+        )
+    theta = (vt.T @ ((u.T @ b) / s)) / scale
+    inverse = (vt.T / s) / scale[:, None]
+    covariance = inverse @ inverse.T
+    residual = a @ theta - b
+    mass = float(theta[0])
+    mass_std = math.sqrt(covariance[0, 0])
+    if mass <= 2 * mass_std:
+        raise ValueError(
+            f"mass: {mass:.4g} +- {mass_std:.2g} kg, expected a positive one: check the frame of the "
+            "cell and its signs, or whether it carries anything at all"
+        )
+    # centre = (m c) / m
+    jacobian = np.eye(10)
+    jacobian[1:4, 1:4] /= mass
+    jacobian[1:4, 0] = -theta[1:4] / mass**2
+    return PayloadIdentification(
+        payload=Payload(mass, theta[1:4] / mass),
+        bias=theta[4:],
+        covariance=jacobian @ covariance @ jacobian.T,
+        condition_number=condition,
+        chi_square=float(residual @ residual),
+        dof=6 * n - 10,
+    )

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The zero of a force source, taken just before each approach, and refused where it cannot be relied on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.samples import WrenchSample
+
+FloatArray = NDArray[np.float64]
+
+FEWEST = 20
+
+
+class TareError(ValueError):
+    """The zero cannot be relied on; the message says why."""
+
+
+@dataclass(frozen=True)
+class TareLimits:
+    """What a tare must keep; figures of each axis of force.
+
+    Attributes
+    ----------
+    noise_rms_n : float
+        Of one sample, as the source states it; half as much again is accepted.
+    std_n : float
+        Largest standard deviation of the zero.
+    drift_n_per_s : float
+        Largest drift that is told from noise.
+    offset_n : float
+        Largest zero: more means a bias step, a wrong sign, or something that touches.
+    """
+
+    noise_rms_n: float
+    std_n: float = 2e-4
+    drift_n_per_s: float = 2e-3
+    offset_n: float = math.inf
+
+
+@dataclass(frozen=True)
+class Tare:
+    """A zero.
+
+    Attributes
+    ----------
+    force_n, torque_nm : (3,) arrays
+        Mean reading without contact.
+    force_std_n : (3,) array
+        Standard deviation of that mean, with the correlation of the samples.
+    noise_rms_n : (3,) array
+        Of one sample about the line through all.
+    drift_n_per_s, drift_std_n_per_s : (3,) arrays
+    time_ns : int
+        Of the middle of the samples.
+    """
+
+    force_n: FloatArray
+    torque_nm: FloatArray
+    force_std_n: FloatArray
+    noise_rms_n: FloatArray
+    drift_n_per_s: FloatArray
+    drift_std_n_per_s: FloatArray
+    time_ns: int
+
+    def apply(self, sample: WrenchSample) -> WrenchSample:
+        """The sample with this zero taken off."""
+        return replace(
+            sample,
+            force_n=sample.force_n - self.force_n,
+            torque_nm=sample.torque_nm - self.torque_nm,
+        )
+
+
+def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
+    """Zero from samples without contact.
+
+    The standard deviation of the mean takes the correlation of neighbouring samples into account: a filter
+    in the sensor makes it no smaller than it is.
+
+    Raises
+    ------
+    TareError
+        Too few samples or an overload; noise, drift or offset beyond the limits, with the figures.
+    """
+    if len(samples) < FEWEST:
+        raise TareError(f"tare: {len(samples)} samples, expected at least {FEWEST}")
+    if any(sample.overload for sample in samples):
+        raise TareError("tare: the sensor is overloaded")
+    force = np.array([sample.force_n for sample in samples])  # (n, 3)
+    torque = np.array([sample.torque_nm for sample in samples])
+    if not (np.all(np.isfinite(force)) and np.all(np.isfinite(torque))):
+        raise TareError("tare: a sample is no number")
+    stamps = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    middle_ns = int(stamps[0]) + int(stamps[-1] - stamps[0]) // 2
+    t = (stamps - middle_ns) * 1e-9
+    if not np.any(t > t[0]):
+        raise TareError("tare: all samples have one time stamp")
+    n = len(t)
+    t = t - t.mean()
+    mean = force.mean(axis=0)
+    slope = t @ (force - mean) / (t @ t)
+    residual = force - mean - t[:, None] * slope
+    rms = np.sqrt((residual**2).sum(axis=0) / (n - 2))
+    inflation = _inflation(residual)
+    mean_std = inflation * rms / math.sqrt(n)
+    slope_std = inflation * rms / math.sqrt(t @ t)
+    result = Tare(mean, torque.mean(axis=0), mean_std, rms, slope, slope_std, middle_ns)
+    _check(result, limits)
+    return result
+
+
+def _inflation(residual: FloatArray) -> FloatArray:
+    """How much wider (3,) than for white noise the mean scatters, from neighbouring samples' correlation.
+
+    For noise behind a first-order low-pass, sqrt((1 + r) / (1 - r)); the estimate of r is biased by about
+    -(1 + 4 r) / n (Marriott and Pope, Biometrika 41, 1954).
+    """
+    n = len(residual)
+    power = (residual**2).sum(axis=0)
+    r = (residual[1:] * residual[:-1]).sum(axis=0) / np.where(power > 0, power, 1.0)
+    r = np.clip(r + (1 + 4 * r) / n, 0.0, 0.999)
+    return np.sqrt((1 + r) / (1 - r))
+
+
+def _check(result: Tare, limits: TareLimits) -> None:
+    for axis, name in enumerate("xyz"):
+        rms, std = float(result.noise_rms_n[axis]), float(result.force_std_n[axis])
+        drift, drift_std = float(result.drift_n_per_s[axis]), float(result.drift_std_n_per_s[axis])
+        zero = float(result.force_n[axis])
+        if rms > 1.5 * limits.noise_rms_n:
+            raise TareError(
+                f"tare: noise of F{name} {rms * 1e3:.3g} mN rms, the source states "
+                f"{limits.noise_rms_n * 1e3:.3g} mN: does something touch or shake?"
+            )
+        # what is no more than noise is not called drift
+        if abs(drift) - 3 * drift_std > limits.drift_n_per_s:
+            raise TareError(
+                f"tare: F{name} drifts by {drift * 1e3:.3g} +- {drift_std * 1e3:.2g} mN/s, accepted are "
+                f"{limits.drift_n_per_s * 1e3:.3g} mN/s"
+            )
+        if std > limits.std_n:
+            raise TareError(
+                f"tare: zero of F{name} uncertain by {std * 1e3:.3g} mN, accepted are "
+                f"{limits.std_n * 1e3:.3g} mN: take more samples"
+            )
+        if abs(zero) > limits.offset_n:
+            raise TareError(
+                f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are "
+                f"{limits.offset_n * 1e3:.4g} mN"
+            )

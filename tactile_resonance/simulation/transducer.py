@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a load cell makes of the wrench on it: bias, drift, noise, filter, counts, overload; and its faults."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.simulation.fields import known_keys, number, numbers, read_yaml, require
+
+FloatArray = NDArray[np.float64]
+
+SAMPLE_PERIOD_S = 0.001
+"""The cell converts at 1 kHz, the fastest rate that it can send."""
+LARGEST_COUNT = 32767
+NO_NUMBER = -32768
+"""The count of a converter that has no result."""
+
+
+@dataclass(frozen=True)
+class CellParameters:
+    """A cell's scale and errors; see ``config/load_cells``.
+
+    Attributes
+    ----------
+    name : str
+    force_divisor, torque_divisor : float
+        Counts per N and per N m.
+    force_noise_rms_n, torque_noise_rms_nm : float
+        Of one conversion, white, before the filter.
+    force_range_n, torque_range_nm : float
+        Largest of each axis without overload.
+    force_bias_n, torque_bias_nm : tuple of 3 float
+        What the unloaded cell reads at the start.
+    force_drift_n_per_s : float
+        Of the bias, on each axis of force.
+    """
+
+    name: str
+    force_divisor: float
+    torque_divisor: float
+    force_noise_rms_n: float
+    torque_noise_rms_nm: float
+    force_range_n: float
+    torque_range_nm: float
+    force_bias_n: tuple[float, ...] = (0.0, 0.0, 0.0)
+    torque_bias_nm: tuple[float, ...] = (0.0, 0.0, 0.0)
+    force_drift_n_per_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("force_divisor", "torque_divisor", "force_range_n", "torque_range_nm"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, name, value, "a number above 0")
+        for name in ("force_noise_rms_n", "torque_noise_rms_nm"):
+            value = getattr(self, name)
+            require(0 <= value < math.inf, name, value, "a number, 0 or above")
+
+    @classmethod
+    def from_yaml(cls, path: Path | None = None) -> CellParameters:
+        """Read a file; without a path ``config/load_cells/fine.yaml``. Raises ``ValueError``."""
+        path = share_path("config/load_cells/fine.yaml") if path is None else path
+        content = read_yaml(path)
+        known_keys(content, {f.name for f in fields(cls)}, path.name)
+        values: dict[str, object] = {}
+        for key, value in content.items():
+            field = f"{path.name}: {key}"
+            if key == "name":
+                values[key] = str(value)
+            elif key in ("force_bias_n", "torque_bias_nm"):
+                values[key] = numbers(value, field, 3)
+            else:
+                values[key] = number(value, field)
+        try:
+            return cls(**values)  # type: ignore[arg-type]
+        except TypeError as error:
+            raise ValueError(f"{path.name}: a value is missing ({error})") from error
+
+
+@dataclass
+class CellFaults:
+    """What is wrong with the cell at present; each can be set while it runs.
+
+    Attributes
+    ----------
+    silent : bool
+        Neither sends nor answers.
+    stuck : bool
+        Repeats its last counts.
+    lose_second_every : int
+        The second frame of every n-th wrench is lost; 0: none.
+    invalid : bool
+        The z axis has the count of no number.
+    saturated : bool
+        The z axis is at full scale, without an overload bit.
+    flipped : bool
+        Every axis has the wrong sign.
+    bias_step_n : float
+        Added to the z force.
+    """
+
+    silent: bool = False
+    stuck: bool = False
+    lose_second_every: int = 0
+    invalid: bool = False
+    saturated: bool = False
+    flipped: bool = False
+    bias_step_n: float = 0.0
+
+    def inject(self, name: str, value: float) -> None:
+        """Set a fault by its name; 0 ends it. Raises ``ValueError`` for a name that is none."""
+        kinds = {f.name: type(getattr(self, f.name)) for f in fields(self)}
+        require(name in kinds, "fault", name, ", ".join(kinds))
+        require(math.isfinite(value), name, value, "a finite number")
+        setattr(self, name, kinds[name](value))
+
+
+class Transducer:
+    """Wrenches in, counts out, at a fixed period.
+
+    Parameters
+    ----------
+    parameters : CellParameters
+    seed : int
+        Of the noise.
+
+    Attributes
+    ----------
+    faults : CellFaults
+    overload_counts : list of 6 int
+        How often each axis went beyond its range.
+    """
+
+    def __init__(self, parameters: CellParameters, seed: int = 1) -> None:
+        self.parameters = parameters
+        self.faults = CellFaults()
+        self.overload_counts = [0] * 6
+        p = parameters
+        self._random = np.random.default_rng(seed)
+        self._divisor = np.repeat([p.force_divisor, p.torque_divisor], 3)
+        self._noise = np.repeat([p.force_noise_rms_n, p.torque_noise_rms_nm], 3)
+        self._range = np.repeat([p.force_range_n, p.torque_range_nm], 3)
+        self._offset = np.array([*p.force_bias_n, *p.torque_bias_nm], dtype=float)
+        self._drift = np.array([p.force_drift_n_per_s] * 3 + [0.0] * 3) * SAMPLE_PERIOD_S
+        self._zero = np.zeros(6)  # what the bias command subtracts
+        self._filtered: FloatArray | None = None
+        self._overloaded = np.zeros(6, dtype=bool)
+        self._counts = np.zeros(6, dtype=int)
+        self._keep = 0.0
+        self.cutoff_hz = 0.0
+
+    @property
+    def cutoff_hz(self) -> float:
+        """Corner of the first-order low-pass [Hz]; 0: off."""
+        return self._cutoff_hz
+
+    @cutoff_hz.setter
+    def cutoff_hz(self, value: float) -> None:
+        self._cutoff_hz = value
+        self._keep = math.exp(-2 * math.pi * value * SAMPLE_PERIOD_S) if value > 0 else 0.0
+
+    def set_zero(self, on: bool) -> None:
+        """Take the present reading as zero, or end that."""
+        reading = np.zeros(6) if self._filtered is None else self._filtered
+        self._zero = reading.copy() if on else np.zeros(6)
+
+    def convert(self, wrench: FloatArray) -> tuple[list[int], int]:
+        """Convert once: from the wrench on the cell (6,) [N, N m] to six counts and overload bits.
+
+        Bit 5 belongs to Fx, bit 0 to Tz.
+        """
+        faults = self.faults
+        load = -wrench if faults.flipped else wrench
+        over = np.abs(load) > self._range
+        self._offset = self._offset + self._drift
+        reading = load + self._offset + self._noise * self._random.standard_normal(6)
+        if faults.flipped:  # the bias turns with the sign too
+            reading = reading - 2 * self._offset
+        reading[2] += faults.bias_step_n
+        if self._filtered is not None:
+            reading = self._keep * self._filtered + (1 - self._keep) * reading
+        self._filtered = reading
+        for axis in np.flatnonzero(over & ~self._overloaded):
+            self.overload_counts[axis] += 1
+        self._overloaded = over
+        if not faults.stuck:
+            counts = np.rint((reading - self._zero) * self._divisor)
+            self._counts = np.clip(counts, -LARGEST_COUNT, LARGEST_COUNT).astype(int)
+        result = self._counts.tolist()
+        if faults.saturated:
+            result[2] = LARGEST_COUNT
+        if faults.invalid:
+            result[2] = NO_NUMBER
+        bits = sum(1 << (5 - int(axis)) for axis in np.flatnonzero(over))
+        return result, bits

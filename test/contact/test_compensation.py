@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Payload and mounting against closed forms, and identification against its own covariance."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.mounting import Motion, Mounting
+from tactile_resonance.contact.payload import Payload, identify_payload
+from tactile_resonance.contact.samples import Pose
+
+G = 9.80665
+vectors = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array)
+
+
+def pose(position=(0.0, 0.0, 0.0), rotvec=(0.0, 0.0, 0.0)):
+    return Pose(np.array(position, float), np.array(rotvec, float))
+
+
+def tilts(*rotvecs):
+    return Rotation.from_rotvec(np.array(rotvecs, float)).as_matrix()
+
+
+def test_weight_of_a_payload_upright_and_on_its_side():
+    payload = Payload(0.1, np.array([0.0, 0.0, 0.05]))
+    np.testing.assert_allclose(payload.wrench(np.eye(3)), [0, 0, -0.1 * G, 0, 0, 0], atol=1e-15)
+    # the cell's z axis along the base's x: gravity is the cell's +x, lever 50 mm about y
+    side = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()
+    np.testing.assert_allclose(
+        payload.wrench(side), [0.1 * G, 0, 0, 0, 0.05 * 0.1 * G, 0], atol=1e-15
+    )
+
+
+def test_a_falling_payload_weighs_nothing():
+    payload = Payload(0.1, np.array([0.01, 0.02, 0.03]))
+    assert np.abs(payload.wrench(np.eye(3), np.array([0, 0, -G]))).max() == 0
+
+
+def test_inertia_of_30_g_at_half_a_metre_per_second_squared_is_15_mn():
+    payload = Payload(0.03, np.zeros(3))
+    moving = payload.wrench(np.eye(3), np.array([0, 0, 0.5])) - payload.wrench(np.eye(3))
+    np.testing.assert_allclose(moving[:3], [0, 0, -0.015], atol=1e-15)
+
+
+def test_a_turning_tool_is_pulled_outwards():
+    # 0.2 m from the tip, 3 rad/s about z: centripetal acceleration w^2 r towards the tip
+    zero = np.zeros(3)
+    motion = Motion(zero, np.eye(3), zero, np.array([0, 0, 3.0]), zero)
+    np.testing.assert_allclose(motion.acceleration_of(np.array([0.2, 0, 0])), [-1.8, 0, 0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(vectors, vectors, vectors, vectors, vectors, vectors)
+def test_the_tool_mounted_cell_gives_back_the_contact(force, torque, place, turn, at, attitude):
+    mounting = Mounting(Mount.TOOL, pose(place, turn), Payload(0.08, np.array([0.01, 0, 0.04])))
+    motion = Motion.at_rest(pose(at, attitude))
+    own = Rotation.from_rotvec(turn).as_matrix()
+    # balance of moments about the cell: the contact acts at the tip, the weight at its centre
+    weight = own.T @ motion.rotation.T @ [0, 0, -0.08 * G]
+    on_cell = np.concatenate(
+        [
+            own.T @ force + weight,
+            own.T @ (torque + np.cross(-place, force)) + np.cross([0.01, 0, 0.04], weight),
+        ]
+    )
+    np.testing.assert_allclose(
+        mounting.to_tip(on_cell, motion), [*force, *torque], rtol=0, atol=1e-12
+    )
+
+
+@settings(max_examples=50, deadline=None)
+@given(vectors, vectors, vectors, vectors, vectors)
+def test_the_cell_under_the_sample_feels_the_opposite(force, place, turn, at, attitude):
+    mounting = Mounting(Mount.TABLE, pose(place, turn))
+    motion = Motion.at_rest(pose(at, attitude))
+    own = Rotation.from_rotvec(turn).as_matrix()
+    in_base = motion.rotation @ force
+    on_cell = np.concatenate([own.T @ -in_base, own.T @ np.cross(at - place, -in_base)])
+    got = mounting.to_tip(on_cell, motion)
+    np.testing.assert_allclose(got, [*force, 0, 0, 0], rtol=0, atol=1e-12)
+
+
+def test_pressing_down_is_a_positive_z_force_at_the_tip():
+    # tip upright: +z out of the surface; the cell under the sample is pushed down by 10 mN
+    mounting = Mounting(Mount.TABLE, pose((0.3, 0.0, -0.05)))
+    motion = Motion.at_rest(pose((0.3, 0.01, 0.0)))
+    torque = np.cross([0, 0.01, 0.05], [0, 0, -0.01])
+    got = mounting.to_tip(np.array([0, 0, -0.01, *torque]), motion)
+    np.testing.assert_allclose(got, [0, 0, 0.01, 0, 0, 0], atol=1e-15)
+
+
+def test_a_batch_is_transformed_as_its_members_are():
+    rng = np.random.default_rng(1)
+    mounting = Mounting(Mount.TOOL, pose((0.1, 0, 0), (0.2, 0.1, 0)), Payload(0.1, np.ones(3)))
+    motion = Motion.at_rest(pose((0, 0, 0), (0, 1, 0)))
+    wrenches = rng.standard_normal((4, 6))
+    together = mounting.to_tip(wrenches, motion)
+    np.testing.assert_allclose(together, [mounting.to_tip(w, motion) for w in wrenches])
+
+
+def test_a_sample_is_no_payload():
+    with pytest.raises(ValueError, match="payload"):
+        Mounting(Mount.TABLE, pose(), Payload(0.1, np.zeros(3)))
+
+
+ORIENTATIONS = tilts((0, 0, 0), (0.8, 0, 0), (-0.8, 0, 0), (0, 0.8, 0), (0, -0.8, 0))
+TRUTH = np.array([0.06, 0.004, -0.002, 0.035, 0.02, -0.01, 0.03, 2e-4, -1e-4, 5e-5])
+STD = np.repeat([1e-4, 5e-6], 3)
+
+
+def readings(rng=None):
+    payload = Payload(TRUTH[0], TRUTH[1:4])
+    clean = payload.wrench(ORIENTATIONS) + TRUTH[4:]
+    return clean if rng is None else clean + STD * rng.standard_normal(clean.shape)
+
+
+def test_the_payload_is_exact_without_noise():
+    found = identify_payload(ORIENTATIONS, readings(), STD)
+    got = np.array([found.payload.mass_kg, *found.payload.centre_m, *found.bias])
+    np.testing.assert_allclose(got, TRUTH, rtol=1e-10)
+    assert found.dof == 20
+    assert found.consistent
+
+
+def test_the_stated_covariance_is_that_of_the_errors():
+    rng = np.random.default_rng(7)
+    n = 400
+    z, chi = [], []
+    for _ in range(n):
+        found = identify_payload(ORIENTATIONS, readings(rng), STD)
+        got = np.array([found.payload.mass_kg, *found.payload.centre_m, *found.bias])
+        error = got - TRUTH
+        z.append(error @ np.linalg.solve(found.covariance, error))
+        chi.append(found.chi_square)
+    # chi square of 10 and of 20 degrees of freedom; five standard errors of the mean
+    assert np.mean(z) == pytest.approx(10, abs=5 * np.sqrt(20 / n))
+    assert np.mean(chi) == pytest.approx(20, abs=5 * np.sqrt(40 / n))
+
+
+@pytest.mark.parametrize(
+    "turns",
+    [
+        [(0, 0, 0), (0, 0, 1), (0, 0, 2)],  # about the vertical: gravity stays where it is
+        [(0, 0, 0), (0.02, 0, 0), (0, 0.02, 0), (-0.02, 0, 0)],  # by one degree
+        [(0, 0, 0), (0.5, 0, 0), (1e-6, 0, 0)],  # two alike
+    ],
+)
+def test_orientations_that_tell_nothing_are_refused(turns):
+    rotations = tilts(*turns)
+    wrenches = Payload(0.06, np.array([0, 0, 0.03])).wrench(rotations)
+    with pytest.raises(ValueError, match="condition number"):
+        identify_payload(rotations, wrenches, STD)
+
+
+def test_a_wrong_sign_is_found():
+    with pytest.raises(ValueError, match="mass: -0.06"):
+        identify_payload(ORIENTATIONS, -readings(), STD)
+
+
+def test_a_cable_that_pulls_is_no_noise():
+    wrenches = readings()
+    wrenches[2, 0] += 0.02
+    assert not identify_payload(ORIENTATIONS, wrenches, STD).consistent
+
+
+@pytest.mark.parametrize("rotations", [ORIENTATIONS[:2], ORIENTATIONS[:4]])
+def test_shapes_are_checked(rotations):
+    with pytest.raises(ValueError, match=r"orientations|shapes"):
+        identify_payload(rotations, readings()[: 2 if len(rotations) == 2 else 3], STD)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tare: its stated uncertainty against Monte Carlo, and what it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.contact.tare import TareError, TareLimits, tare
+
+LIMITS = TareLimits(noise_rms_n=1e-3, std_n=1e-3)
+ZERO_N = np.array([0.02, -0.01, 0.03])
+
+
+def samples(n=200, *, rms=1e-3, drift=0.0, seed=0, keep=0.0, overload=False):
+    """Readings at 1 kHz; `keep` is the correlation of successive samples."""
+    rng = np.random.default_rng(seed)
+    noise = np.zeros((n, 3))
+    now = rng.standard_normal(3)
+    for i in range(n):
+        now = keep * now + math.sqrt(1 - keep**2) * rng.standard_normal(3)
+        noise[i] = rms * now
+    t = np.arange(n) * 1e-3
+    force = ZERO_N + noise + drift * t[:, None]
+    return [
+        WrenchSample(round(s * 1e9), f, np.full(3, 1e-4), overload)
+        for s, f in zip(t, force, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.9])
+def test_the_stated_uncertainty_is_that_of_the_mean(keep):
+    z = []
+    for seed in range(300):
+        limits = TareLimits(noise_rms_n=1e-3, std_n=1e-3, drift_n_per_s=1.0)
+        zero = tare(samples(400, seed=seed, keep=keep), limits)
+        z.append((zero.force_n - ZERO_N) / zero.force_std_n)
+    # chi square over 900 values, five standard errors; the correlation is estimated too: one more tenth
+    assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.1 + 5 * math.sqrt(2 / 900))
+
+
+def test_it_takes_the_zero_off():
+    readings = samples()
+    zero = tare(readings, LIMITS)
+    left = np.mean([zero.apply(sample).force_n for sample in readings], axis=0)
+    assert np.abs(left).max() < 1e-12
+    assert np.abs(zero.apply(readings[0]).torque_nm).max() < 1e-15
+
+
+def test_noise_beyond_the_stated_is_refused_with_the_figures():
+    with pytest.raises(TareError, match=r"noise of Fx .* mN rms, the source states 1 mN"):
+        tare(samples(rms=2e-3), LIMITS)
+
+
+def test_drift_is_refused():
+    with pytest.raises(TareError, match=r"Fx drifts by 10.* mN/s, accepted are 2 mN/s"):
+        tare(samples(drift=0.010, rms=1e-4), LIMITS)
+
+
+def test_what_is_noise_is_not_called_drift():
+    refused = 0
+    for seed in range(200):
+        try:
+            tare(samples(100, seed=seed), LIMITS)
+        except TareError:
+            refused += 1
+    # 0.1 s of 1 mN noise has a slope of 3.5 mN/s rms
+    assert refused <= 3
+
+
+def test_too_few_samples_for_the_zero_asked_for_are_refused():
+    with pytest.raises(TareError, match="take more samples"):
+        tare(samples(30), TareLimits(noise_rms_n=1e-3, std_n=5e-5))
+
+
+@pytest.mark.parametrize(
+    ("readings", "reason"),
+    [
+        (samples(5), "5 samples, expected at least 20"),
+        (samples(overload=True), "overloaded"),
+        ([samples()[0]] * 30, "one time stamp"),
+    ],
+)
+def test_what_is_no_measurement_is_refused(readings, reason):
+    with pytest.raises(TareError, match=reason):
+        tare(readings, LIMITS)
+
+
+def test_an_offset_that_no_bias_explains_is_refused():
+    with pytest.raises(TareError, match=r"Fx reads .* mN without contact, accepted are 15 mN"):
+        tare(samples(), TareLimits(noise_rms_n=1e-3, offset_n=0.015))
