@@ -105,7 +105,7 @@ class UrArm:
         self._check_commands(client)
         fault = motion_fault(client.safety_bits, client.robot_mode, client.runtime_state)
         # the wall clock may be set; how long ago the state held is known by the monotonic one
-        age_ns = time.monotonic_ns() - round(client.state_s * 1e9)
+        age_ns = time.monotonic_ns() - client.state_ns
         return ArmSample(
             time_ns=time.time_ns() - age_ns,
             robot_time_s=client.robot_time_s,
@@ -113,6 +113,7 @@ class UrArm:
             tip_velocity=np.array(client.tip_speed),
             moving_allowed=fault is None,
             message="" if fault is None else fault[1],
+            tool_wrench=np.array(client.tip_force),
         )
 
     def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
@@ -196,7 +197,7 @@ class UrArm:
         client = self._exchange.read()
         if client is None or not client.connected:
             raise ArmError(ArmFault.LINK_LOST, f"the connection to {self.config.host} is lost")
-        age_s = time.monotonic() - min(client.state_s, client.received_ns * 1e-9)
+        age_s = (time.monotonic_ns() - min(client.state_ns, client.received_ns)) * 1e-9
         if age_s > self.config.max_state_age_s:
             raise ArmError(
                 ArmFault.STALE,
@@ -210,6 +211,8 @@ class UrArm:
         self._sent = {number: each for number, each in sent.items() if number > client.done}
         if client.refused > self._refused:
             self._refused = client.refused
+            if motion_fault(client.safety_bits, client.robot_mode, client.runtime_state) is not None:
+                return  # a stop is why; the state tells it
             name = sent[client.refused][0] if client.refused in sent else "an earlier command"
             raise ArmError(
                 ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {self._last_error()}"

@@ -37,6 +37,7 @@ GIVE_UP_S = 1.2
 # A constructor of the library may hang with Python's lock held; the kernel then ends this process.
 HANG_S = 20
 LONGEST_MESSAGE = 8192
+REFUSAL_S = 0.008
 
 
 class Client:
@@ -86,6 +87,9 @@ class Client:
             except Exception as error:  # the library raises what it likes; the owner hears of it
                 print(f"{name}: {error}", file=sys.stderr)
                 done = False
+            if not done:
+                # a stop that is why shows in the states a cycle or two later than in the refusal
+                time.sleep(REFUSAL_S)
             self._states.note_moving(self._motion.moving)
             self._states.report(number, done)
 

@@ -15,7 +15,7 @@ from dataclasses import astuple, dataclass, fields
 
 SIZE = mmap.PAGESIZE
 _STATE_AT, _HEARTBEAT_AT = 0, SIZE - 8
-_STATE = struct.Struct("<q2d12d4i2?2Q2d")
+_STATE = struct.Struct("<qdq18d4i2?2Q2d")
 _CHECKSUM = struct.Struct("<I")
 _HEARTBEAT = struct.Struct("<q")
 
@@ -33,9 +33,10 @@ class ClientState:
         When it came (``time.monotonic_ns``).
     robot_time_s : float
         The robot's time stamp.
-    state_s : float
-        The same on this machine's monotonic clock [s].
-    tip_pose, tip_speed : tuples of 6 floats
+    state_ns : int
+        The same on this machine's monotonic clock.
+    tip_pose, tip_speed, tip_force : tuples of 6 floats
+        In the base; the force is what the robot's own sensor tells.
     safety_bits, runtime_state, robot_mode, safety_mode : int
         As RTDE names them.
     connected : bool
@@ -45,16 +46,17 @@ class ClientState:
     done, refused : int
         Numbers of the last command that was done, and of the last that was refused (0: none).
     clock_std_s : float
-        Of `state_s`.
+        Of `state_ns` [s].
     rate_hz : float
         States received in the last second.
     """
 
     received_ns: int
     robot_time_s: float
-    state_s: float
+    state_ns: int
     tip_pose: tuple[float, ...]
     tip_speed: tuple[float, ...]
+    tip_force: tuple[float, ...]
     safety_bits: int
     runtime_state: int
     robot_mode: int
@@ -94,7 +96,7 @@ class Exchange:
             data = block[: _STATE.size]
             if _CHECKSUM.unpack(block[_STATE.size :])[0] == zlib.crc32(data):
                 v = _STATE.unpack(data)
-                return ClientState(*v[:3], v[3:9], v[9:15], *v[15:])
+                return ClientState(*v[:3], v[3:9], v[9:15], v[15:21], *v[21:])
             if not any(block):
                 return None
         raise RuntimeError("robot client: its memory is never in order")
@@ -112,4 +114,4 @@ class Exchange:
         self._page.close()
 
 
-assert len(fields(ClientState)) == 15  # the layout above is that of its fields
+assert len(fields(ClientState)) == 16  # the layout above is that of its fields

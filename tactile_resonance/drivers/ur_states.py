@@ -3,25 +3,28 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
 from dataclasses import replace
 from typing import Any
 
+from tactile_resonance.contact.clocks import ClockTracker
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.drivers.robot_clock import RobotClock
 from tactile_resonance.drivers.ur_exchange import ClientState, Exchange
 
 VARIABLES = [
     "timestamp",
     "actual_TCP_pose",
     "actual_TCP_speed",
+    "actual_TCP_force",
     "safety_status_bits",
     "runtime_state",
     "robot_mode",
     "safety_mode",
 ]
+CYCLE_S = 0.002
 # No command is given where the newest state is older.
 HEALTHY_S = 0.1
 
@@ -47,7 +50,9 @@ class StateReader:
         self._receive = receive
         self._control: Any = None
         self._exchange = exchange
-        self._clock = RobotClock(round_trip_s)
+        # what all messages share cannot be seen by listening: half of the round trip, and how long a
+        # state waits in the robot before it is sent, at most a cycle
+        self._clock = ClockTracker(round_trip_s / 2, math.hypot(round_trip_s, CYCLE_S) / 12**0.5)
         self._lock = threading.Lock()
         self._newest: ClientState | None = None
         self._newest_s = time.monotonic()
@@ -98,13 +103,15 @@ class StateReader:
         if self._newest is not None and robot_s == self._newest.robot_time_s:
             return
         pose, speed = receive.getActualTCPPose(), receive.getActualTCPSpeed()
+        force = receive.getActualTCPForce()
         safety_bits = receive.getSafetyStatusBits()
         runtime, mode = receive.getRuntimeState(), receive.getRobotMode()
         safety_mode = receive.getSafetyMode()
         if receive.getTimestamp() != robot_s:
             return  # the next state came meanwhile: these values are of two
         self._newest_s = now_ns * 1e-9
-        self._clock.add(robot_s, self._newest_s)
+        self._clock.add(robot_s, now_ns)
+        relation = self._clock.relation()
         self._arrivals.append(self._newest_s)
         while self._arrivals[0] < self._newest_s - 1.0:
             self._arrivals.popleft()
@@ -112,9 +119,10 @@ class StateReader:
             ClientState(
                 received_ns=now_ns,
                 robot_time_s=robot_s,
-                state_s=self._clock.local_s(robot_s),
+                state_ns=relation.to_local_ns(robot_s),
                 tip_pose=tuple(pose),
                 tip_speed=tuple(speed),
+                tip_force=tuple(force),
                 safety_bits=safety_bits,
                 runtime_state=runtime,
                 robot_mode=mode,
@@ -123,7 +131,7 @@ class StateReader:
                 moving=self._moving,
                 done=self._done,
                 refused=self._refused,
-                clock_std_s=self._clock.uncertainty_s,
+                clock_std_s=relation.uncertainty_s,
                 rate_hz=float(len(self._arrivals)),
             )
         )

@@ -39,9 +39,9 @@ class ControlPort:
             "state": self._state,
             "freeze": self._freeze,
             "drop": lambda _: {"dropped": robot.rtde.drop()},
-            "protective_stop": lambda _: _done(controller.protective_stop()),
-            "emergency_stop": lambda _: _done(controller.emergency_stop()),
-            "release_emergency_stop": lambda _: _done(controller.release_emergency_stop()),
+            "protective_stop": _plain(controller.protective_stop),
+            "emergency_stop": _plain(controller.emergency_stop),
+            "release_emergency_stop": _plain(controller.release_emergency_stop),
             "remote_control": lambda fields: self._set(controller, "remote_control", fields),
             "script_starts": lambda fields: self._set(controller, "script_starts", fields),
             "registers_in_use": lambda fields: self._set(robot.rtde, "registers_in_use", fields),
@@ -142,5 +142,11 @@ def order(host: str, command: str, port: int = PORT, timeout_s: float = 5.0, **f
     return answer
 
 
-def _done(_: None) -> dict:
-    return {}
+def _plain(action: Callable[[], None]) -> Callable[[dict], dict]:
+    """A command without fields and without an answer."""
+
+    def command(_: dict) -> dict:
+        action()
+        return {}
+
+    return command

@@ -52,6 +52,7 @@ class SimulatedRobot:
     controller : UrController
     reactor : Reactor
     rtde : RtdeServer
+    control : ControlPort
     pace : Pace
     after_step : list of callables
         Called after each step of the controller: what shares its clock.
@@ -80,12 +81,13 @@ class SimulatedRobot:
         self._halted_until_ns = 0
         self._stopping = False
         self.rtde = rtde_server.RtdeServer(controller)
+        self.control = ControlPort(self)
         self.reactor = Reactor(host)
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
             self.reactor.listen(dashboard.PORT, dashboard.DashboardServer(controller).serve)
             self.reactor.listen(script_server.PORT, script_server.ScriptServer(controller).serve)
-            self.reactor.listen(control_port, ControlPort(self).serve, freezable=False)
+            self.reactor.listen(control_port, self.control.serve, freezable=False)
         except ValueError:
             self.reactor.close()
             raise
