@@ -40,6 +40,7 @@ def _parser() -> OneLineParser:
     from tactile_resonance.commands import (
         analyze,
         benchmark,
+        check_robot,
         demo,
         figures,
         simulate_cell,
@@ -51,7 +52,7 @@ def _parser() -> OneLineParser:
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze, figures, benchmark, simulate_ur, simulate_cell):
+    for command in (demo, analyze, figures, benchmark, simulate_ur, simulate_cell, check_robot):
         command.add_parser(commands)
     return parser
 

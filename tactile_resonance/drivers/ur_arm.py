@@ -211,7 +211,10 @@ class UrArm:
         self._sent = {number: each for number, each in sent.items() if number > client.done}
         if client.refused > self._refused:
             self._refused = client.refused
-            if motion_fault(client.safety_bits, client.robot_mode, client.runtime_state) is not None:
+            if (
+                motion_fault(client.safety_bits, client.robot_mode, client.runtime_state)
+                is not None
+            ):
                 return  # a stop is why; the state tells it
             name = sent[client.refused][0] if client.refused in sent else "an earlier command"
             raise ArmError(
