@@ -37,14 +37,22 @@ def _parser() -> OneLineParser:
     # give. Before numpy is imported, which reads it once.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from tactile_resonance.commands import analyze, benchmark, demo, figures, simulate_cell
+    from tactile_resonance.commands import (
+        analyze,
+        benchmark,
+        check_robot,
+        demo,
+        figures,
+        simulate_cell,
+        simulate_ur,
+    )
 
     parser = OneLineParser(
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze, figures, benchmark, simulate_cell):
+    for command in (demo, analyze, figures, benchmark, simulate_ur, simulate_cell, check_robot):
         command.add_parser(commands)
     return parser
 

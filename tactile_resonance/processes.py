@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting node processes and leaving none behind."""
+"""Starting node processes and leaving none behind; their priority."""
 
 from __future__ import annotations
 
@@ -113,6 +113,23 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
                 continue
         return domain
     raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
+
+
+def take_priority(priority: int) -> None:
+    """Run this process under SCHED_FIFO.
+
+    Raises
+    ------
+    ValueError
+        Where that is not allowed.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (AttributeError, OSError) as error:
+        raise ValueError(
+            f"priority: {priority} refused ({error}); it needs Linux and an rtprio limit "
+            "(/etc/security/limits.d) or root"
+        ) from error
 
 
 def _end_with_parent() -> None:

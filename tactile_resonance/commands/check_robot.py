@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance check-robot`: whether a robot is ready and its link fit for contact. Moves nothing."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "check-robot",
+        help="whether a Universal Robots arm is ready and its link fit",
+        description="Identify the robot, upload the control program, set TCP, payload and watchdog as the "
+        "configuration says, watch the states for some seconds, disconnect. Nothing moves. docs/robot.md "
+        "says what to set at the robot.",
+    )
+    parser.add_argument(
+        "--host", help="name or address of the robot (default: the configuration's)"
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="default: config/devices/ur5e.yaml"
+    )
+    parser.add_argument("--seconds", type=float, default=5.0, help="to watch (default: 5)")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print what was found; status 1 where the link does not serve."""
+    if not 0.5 <= options.seconds <= 3600:
+        raise ValueError(f"seconds: {options.seconds:g}, expected 0.5 to 3600")
+    if find_spec("rtde_control") is None:
+        raise ValueError("check-robot: ur_rtde is not installed: pip install 'ur-rtde>=1.6.5,<1.7'")
+    from tactile_resonance.configuration import share_path
+    from tactile_resonance.contact.interfaces import ArmError
+    from tactile_resonance.drivers.ur_check import identify, watch
+    from tactile_resonance.drivers.ur_config import read_ur_config
+
+    config = read_ur_config(options.config or share_path("config/devices/ur5e.yaml"))
+    if options.host is not None:
+        config = dataclasses.replace(config, host=options.host)
+    try:
+        if config.check_dashboard:
+            robot = identify(config.host)
+            print(
+                f"{robot.model}, PolyScope {robot.version}; {robot.robot_mode}; {robot.safety_status}"
+            )
+            print(f"remote control: {'yes' if robot.remote_control else 'NO'}")
+        report = watch(config, options.seconds)
+    except ArmError as error:
+        raise ValueError(f"{error} ({error.fault.value})") from error
+    limit_ms = config.max_state_age_s * 1e3
+    print(f"states: {report.rate_hz:.1f} Hz over {report.duration_s:.1f} s, {report.missed} missed")
+    print(f"longest gap: {report.longest_gap_s * 1e3:.0f} ms")
+    print(
+        f"age: median {report.age_median_s * 1e3:.1f}, 99 % {report.age_p99_s * 1e3:.1f}, "
+        f"largest {report.age_max_s * 1e3:.1f} ms; limit {limit_ms:.0f} ms, beyond it "
+        f"{report.stale} times"
+    )
+    print(f"clock of the robot: known to {report.clock_uncertainty_s * 1e3:.2f} ms (1 sigma)")
+    if report.stale:
+        print("NOT FIT: states came too late; see 'The network' in docs/robot.md")
+        return 1
+    print("fit: no state came too late")
+    return 0

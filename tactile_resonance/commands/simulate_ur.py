@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance simulate-ur`: a simulated UR5e on the ports of a real one."""
+
+from __future__ import annotations
+
+import argparse
+import ipaddress
+import math
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_resonance.processes import take_priority
+
+if TYPE_CHECKING:
+    from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+
+READY = "simulated UR5e ready at"
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "simulate-ur",
+        help="a simulated UR5e that ur_rtde connects to",
+        description="Serve RTDE (30004), dashboard (29999), scripts (30003) and a port for faults on one "
+        "address, at 500 Hz, until interrupted. Nothing here is a robot.",
+    )
+    parser.add_argument(
+        "--host", default="127.0.1.1", help="any 127.x.y.z, one for each robot (default: 127.0.1.1)"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=1.0, help="robot time over wall time (default: 1)"
+    )
+    parser.add_argument(
+        "--control-port", type=int, default=30020, help="for faults and queries (default: 30020)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of noise and wander (default: 0)")
+    parser.add_argument(
+        "--priority",
+        type=int,
+        default=0,
+        metavar="N",
+        help="real-time priority 1 to 99 (SCHED_FIFO; needs the right to it)",
+    )
+    bench = parser.add_argument_group("what the tool touches, on the robot's clock")
+    bench.add_argument(
+        "--tissue", metavar="NAME", help="of config/tissues.yaml; puts it on the table"
+    )
+    bench.add_argument(
+        "--surface-height",
+        type=float,
+        default=0.2,
+        metavar="M",
+        help="of the tissue above the robot's base (default: 0.2)",
+    )
+    bench.add_argument("--tilt", type=float, default=0.0, metavar="DEG", help="(default: 0)")
+    bench.add_argument(
+        "--rigid-tip", action="store_true", help="the ball without the sensor's beam"
+    )
+    bench.add_argument(
+        "--cell", type=Path, metavar="FILE", help="load cell (default: config/load_cells/fine.yaml)"
+    )
+    bench.add_argument(
+        "--mount", choices=("table", "tool"), default="table", help="of the cell (default: table)"
+    )
+    bench.add_argument(
+        "--can-port", type=int, default=29536, help="its socketcand port (default: 29536)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serve until SIGINT or SIGTERM, then say how well the pace was kept."""
+    _check(options)
+    from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
+    from tactile_resonance.simulation.robot.controller import ControllerConfig, UrController
+    from tactile_resonance.simulation.robot.machine import MachineConfig
+    from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+
+    bench = None if options.tissue is None else _Bench(options)
+    controller = UrController(
+        ControllerConfig(MachineConfig(tip_in_flange=TIP_IN_FLANGE.vector)),
+        None if bench is None else bench.tabletop.plant,
+        seed=options.seed,
+    )
+    robot = SimulatedRobot(
+        controller, options.host, speed=options.speed, control_port=options.control_port
+    )
+    ready = f"{READY} {options.host}, control port {options.control_port}"
+    if bench is not None:
+        bench.attach(robot)
+        ready += f"; {options.tissue} under it, load cell: socketcand port {options.can_port}"
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: robot.stop())
+    if options.priority:
+        take_priority(options.priority)
+    print(ready, flush=True)
+    robot.run()
+    print(
+        f"ended after {robot.controller.time_s:.1f} s of robot time, {robot.pace.stalls} stalls, "
+        f"longest delay {robot.pace.longest_s * 1e3:.1f} ms"
+    )
+    return 0
+
+
+class _Bench:
+    """Tissue and load cell as the options want them."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        from tactile_resonance.contact.interfaces import Mount
+        from tactile_resonance.simulation.library import read_tissues
+        from tactile_resonance.simulation.parameters import read_sensor
+        from tactile_resonance.simulation.plant_process import BenchSetup, Tabletop
+
+        setup = BenchSetup(
+            tissue=options.tissue,
+            surface_height_m=options.surface_height,
+            tilt_rad=math.radians(options.tilt),
+            rigid_tip=options.rigid_tip,
+            mount=Mount(options.mount),
+        )
+        self.tabletop = Tabletop(setup, read_tissues(), read_sensor())
+        self._options = options
+
+    def attach(self, robot: SimulatedRobot) -> None:
+        """Serve the cell's bus and take orders for both at the robot's control port."""
+        from tactile_resonance.simulation.load_cell import LoadCell
+        from tactile_resonance.simulation.plant_process import CellOnBus, attach
+        from tactile_resonance.simulation.socketcand import SocketcandServer
+        from tactile_resonance.simulation.transducer import CellParameters
+
+        options = self._options
+        cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed + 1)
+        try:
+            bus = SocketcandServer(options.host, options.can_port)
+        except OSError as error:
+            raise ValueError(
+                f"can-port: {options.can_port} of {options.host}: {error.strerror}"
+            ) from error
+        attach(robot, self.tabletop, CellOnBus(self.tabletop.plant, cell, bus))
+
+
+def _check(options: argparse.Namespace) -> None:
+    try:
+        loopback = ipaddress.IPv4Address(options.host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback:
+        raise ValueError(f"host: {options.host!r}, expected an address 127.x.y.z")
+    if not 1024 <= options.control_port <= 65535:
+        raise ValueError(f"control-port: {options.control_port}, expected 1024 to 65535")
+    if not 0 <= options.priority <= 99:
+        raise ValueError(f"priority: {options.priority}, expected 0 to 99")
+    if options.seed < 0:
+        raise ValueError(f"seed: {options.seed}, expected at least 0")

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which Universal Robots arm carries the tip, and how it may be used: read from YAML and checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from tactile_resonance.contact.samples import Pose
+
+
+def _no_offset() -> Pose:
+    return Pose(np.zeros(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class UrArmConfig:
+    """What `UrArm` needs to know; see ``config/devices/ur5e.yaml``.
+
+    Attributes
+    ----------
+    host : str
+        Name or address of the robot.
+    tip_in_flange : Pose
+        Frame `tip` in the tool flange: what the robot gets as its TCP.
+    payload_kg : float or None
+        Mass on the flange; None leaves what is set on the pendant.
+    payload_cog_m : (3,) tuple
+        Its centre of gravity in the flange.
+    rate_hz : float
+        Of the robot's states; 500 is what an e-series sends.
+    watchdog_hz : float
+        The robot stops by itself where commands come less often; at least 25.
+    max_state_age_s : float
+        An older state is refused as stale.
+    owner_timeout_s : float
+        While the arm moves, whoever moves it must call at least this often, else the robot is left to
+        its watchdog.
+    connect_timeout_s : float
+        For the whole of `UrArm.connect`.
+    max_speed_m_s, max_turn_rad_s, max_acceleration_m_s2 : float
+        Faster commands are refused.
+    check_dashboard : bool
+        Ask the dashboard server for remote control and modes; PolyScope X has none.
+    realtime_priority : int
+        SCHED_FIFO priority of the client process, 1 to 99; 0: none.
+    """
+
+    host: str
+    tip_in_flange: Pose = field(default_factory=_no_offset)
+    payload_kg: float | None = None
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rate_hz: float = 500.0
+    watchdog_hz: float = 25.0
+    max_state_age_s: float = 0.020
+    owner_timeout_s: float = 0.100
+    connect_timeout_s: float = 15.0
+    max_speed_m_s: float = 0.25
+    max_turn_rad_s: float = 1.0
+    max_acceleration_m_s2: float = 2.0
+    check_dashboard: bool = True
+    realtime_priority: int = 0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.host, str) or not self.host:
+            raise ValueError(f"host: {self.host!r}, expected a name or an address")
+        for name, low, high in (
+            ("rate_hz", 25.0, 500.0),
+            ("watchdog_hz", 25.0, 125.0),
+            ("max_state_age_s", 0.004, 1.0),
+            ("owner_timeout_s", 0.005, 1.0),
+            ("connect_timeout_s", 1.0, 120.0),
+            ("max_speed_m_s", 1e-4, 1.5),
+            ("max_turn_rad_s", 1e-4, math.pi),
+            ("max_acceleration_m_s2", 1e-3, 20.0),
+        ):
+            _check_number(name, getattr(self, name), low, high)
+        if self.payload_kg is not None:
+            _check_number("payload_kg", self.payload_kg, 0.0, 50.0)
+        for name, values in (
+            ("payload_cog_m", self.payload_cog_m),
+            ("tip_in_flange", self.tip_in_flange.vector),
+        ):
+            if not all(math.isfinite(value) and abs(value) < 10 for value in values):
+                raise ValueError(f"{name}: {list(values)}, expected numbers within +-10")
+        if not isinstance(self.realtime_priority, int) or not 0 <= self.realtime_priority <= 99:
+            raise ValueError(f"realtime_priority: {self.realtime_priority!r}, expected 0 to 99")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as plain numbers and lists."""
+        fields = {name.name: getattr(self, name.name) for name in dataclasses.fields(self)}
+        fields["tip_in_flange"] = self.tip_in_flange.vector.tolist()
+        fields["payload_cog_m"] = list(self.payload_cog_m)
+        return fields
+
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> UrArmConfig:
+        """Build from plain values.
+
+        Raises
+        ------
+        ValueError
+            Names the field that is unknown, missing or not acceptable.
+        """
+        known = [name.name for name in dataclasses.fields(cls)]
+        for name in fields:
+            if name not in known:
+                raise ValueError(f"{name}: not known, expected one of {', '.join(known)}")
+        if "host" not in fields:
+            raise ValueError("host: missing, expected a name or an address")
+        given = dict(fields)
+        for name, length in (("tip_in_flange", 6), ("payload_cog_m", 3)):
+            if name in given:
+                given[name] = _numbers(name, given[name], length)
+        if "tip_in_flange" in given:
+            given["tip_in_flange"] = Pose.from_vector(np.array(given["tip_in_flange"]))
+        return cls(**given)
+
+
+def read_ur_config(path: Path) -> UrArmConfig:
+    """Read a YAML file.
+
+    Raises
+    ------
+    ValueError
+        Names file and field.
+    """
+    try:
+        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(fields, dict):
+            raise ValueError("expected names and values")
+        return UrArmConfig.from_dict(fields)
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _check_number(name: str, value: Any, low: float, high: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise ValueError(f"{name}: {value!r}, expected {low:g} to {high:g}")
+
+
+def _numbers(name: str, values: Any, length: int) -> tuple[float, ...]:
+    if (
+        not isinstance(values, (list, tuple))
+        or len(values) != length
+        or not all(isinstance(value, (int, float)) for value in values)
+    ):
+        raise ValueError(f"{name}: {values!r}, expected {length} numbers")
+    return tuple(float(value) for value in values)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robot, tissue and load cell of the bench on one clock, each on the ports of a real one."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.beam import sensor_modes
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.library import TissueLibrary
+from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.parameters import SensorParameters
+from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
+from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.tissue import Tissue
+
+TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
+"""Where the tip sits: 0.12 m before the flange, its z against the flange's."""
+
+
+@dataclass(frozen=True)
+class BenchSetup:
+    """What lies on the table and how the cell is mounted.
+
+    Attributes
+    ----------
+    tissue : str
+        Name in the library.
+    surface_height_m, tilt_rad, azimuth_rad : float
+        Of the undisturbed surface in the robot's base; see `Plane.tilted`.
+    rigid_tip : bool
+        The ball on the robot itself; else at the end of the sensor's beam.
+    mount : Mount
+    carried_kg : float
+        What the cell carries besides.
+    """
+
+    tissue: str = "gel12"
+    surface_height_m: float = 0.2
+    tilt_rad: float = 0.0
+    azimuth_rad: float = 0.0
+    rigid_tip: bool = False
+    mount: Mount = Mount.TABLE
+    carried_kg: float = 0.0
+
+    def __post_init__(self) -> None:
+        height = self.surface_height_m
+        require(-1 <= height <= 1, "surface_height_m", height, "-1 to 1")
+        require(abs(self.tilt_rad) <= 0.35, "tilt_rad", self.tilt_rad, "-0.35 to 0.35 (20 degrees)")
+        require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
+
+
+class Tabletop:
+    """The plant with what can be exchanged on it while it runs.
+
+    Attributes
+    ----------
+    plant : Plant
+        What the controller's tool touches.
+    """
+
+    def __init__(self, setup: BenchSetup, library: TissueLibrary, sensor: SensorParameters) -> None:
+        self._library = library
+        self._tissue: Tissue | None = library[setup.tissue]
+        modes, radius_m = sensor_modes(sensor), sensor.tip.radius_m
+
+        def tip(tissue: Tissue) -> TipOnTissue:
+            indenter = Indenter(
+                tissue, tip_radius_m=radius_m, poisson_ratio=library.contact.poisson_ratio
+            )
+            return (
+                RigidTip(indenter) if setup.rigid_tip else SprungIndenter.on_beam(indenter, modes)
+            )
+
+        self.plant = Plant(
+            Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
+            lambda _: self._tissue,
+            tip,
+            tip_radius_m=radius_m,
+            mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
+        )
+
+    def place_surface(self, fields: dict) -> dict:
+        """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
+        setup = BenchSetup(
+            surface_height_m=_number(fields, "height_m"),
+            tilt_rad=_number(fields, "tilt_rad", 0.0),
+            azimuth_rad=_number(fields, "azimuth_rad", 0.0),
+        )
+        self.plant.surface = Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        return {}
+
+    def place_tissue(self, fields: dict) -> dict:
+        """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
+        name = fields.get("name")
+        self._tissue = None if name is None else self._library[str(name)]
+        return {}
+
+    def truth(self, _: dict) -> dict:
+        """Control port: what no instrument tells."""
+        plant = self.plant
+        return {
+            "time_s": plant.time_s,
+            "force_n": plant.force_n.tolist(),
+            "depth_m": plant.depth_m,
+            "in_contact": plant.in_contact,
+            "touches": plant.touches,
+        }
+
+
+class CellOnBus:
+    """Steps the load cell with the plant and serves its bus.
+
+    Parameters
+    ----------
+    plant : Plant
+    cell : LoadCell
+    bus : SocketcandServer
+    """
+
+    def __init__(self, plant: Plant, cell: LoadCell, bus: SocketcandServer) -> None:
+        self._plant, self._cell, self._bus = plant, cell, bus
+
+    def step(self) -> None:
+        """Take what clients sent, advance to the plant's time, send what is due."""
+        self._bus.epoch_s = time.time() - self._plant.time_s
+        for can_id, data in self._bus.poll():
+            self._bus.send(self._cell.receive(can_id, data))
+        force_n, torque_nm = self._plant.wrench_at_cell()
+        wrench = np.concatenate([force_n, torque_nm])
+        self._bus.send(self._cell.step(wrench, self._plant.time_s))
+
+    def inject(self, fields: dict) -> dict:
+        """Control port: fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
+        fault = fields.get("fault")
+        if fault == "server_gone":
+            self._bus.drop_clients()
+        else:
+            self._cell.faults.inject(str(fault), _number(fields, "value"))
+        return {}
+
+
+def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = None) -> None:
+    """Add the commands of table and cell to the robot's control port, and the cell to its clock."""
+    commands = robot.control.commands
+    commands["place_surface"] = tabletop.place_surface
+    commands["place_tissue"] = tabletop.place_tissue
+    commands["truth"] = tabletop.truth
+    if cell is not None:
+        commands["cell_fault"] = cell.inject
+        robot.after_step.append(cell.step)
+
+
+def _number(fields: dict, name: str, default: float | None = None) -> float:
+    value = fields.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"{name}: {value!r}, expected a number")
+    return float(value)

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that move the arm: moves, speeds, servo, stops, jogging, moves until contact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.simulation.robot import motion
+from tactile_resonance.simulation.robot.kinematics import forward
+from tactile_resonance.simulation.robot.machine import Machine
+from tactile_resonance.simulation.robot.poses import matrix_from_pose
+from tactile_resonance.simulation.robot.script import Script, Thread
+from tactile_resonance.simulation.robot.target import CYCLE_S, ScriptError, Target
+
+FloatArray = NDArray[np.float64]
+SpeedMotion = Callable[[Target, FloatArray, float, float], Thread]
+
+# Set by the contact thread for the main loop: go back to where the contact began.
+CONTACT_FOUND = 254
+# Deceleration [m/s^2] of the stop after a contact.
+CONTACT_STOP = 3.0
+# Defaults of URScript's movel: acceleration [m/s^2] and speed [m/s].
+MOVE_ACCELERATION, MOVE_SPEED = 1.2, 0.25
+
+
+class MotionCommands:
+    """Handlers of the commands that move the arm; a generator where moving takes time."""
+
+    def __init__(self, script: Script, machine: Machine) -> None:
+        self._script = script
+        self._machine = machine
+        self._target = machine.target
+        # linear or in the joints; the client's program sets this by asynchronous stops alone
+        self._stop_linear = False
+        self._speed: tuple[SpeedMotion, FloatArray, float, float] = (
+            motion.speedl,
+            np.zeros(6),
+            0.5,
+            0.5,
+        )
+        self._servo: tuple[FloatArray, float, float] = (self._target.q, CYCLE_S, 0.1)
+        self._jog_twist = np.zeros(6)
+        self._contact_steps = 0
+
+    def movej(self) -> Thread:
+        """Move to joint angles, asynchronously where integer 1 says so."""
+        return self._movej(self._script.doubles(0))
+
+    def movej_pose(self) -> Thread:
+        """Move the joints to where the TCP has a pose."""
+        return self._movej(self._machine.solved(matrix_from_pose(self._script.doubles(0))))
+
+    def movel(self) -> Thread:
+        """Move straight to a pose."""
+        return self._movel(matrix_from_pose(self._script.doubles(0)))
+
+    def movel_joints(self) -> Thread:
+        """Move straight to the pose of joint angles."""
+        return self._movel(forward(self._script.doubles(0)) @ self._target.tcp)
+
+    def _movej(self, goal: FloatArray) -> Thread:
+        speed, acceleration = self._script.double(6), self._script.double(7)
+        return self._move(motion.movej(self._target, goal, acceleration, speed))
+
+    def _movel(self, goal: FloatArray) -> Thread:
+        speed, acceleration = self._script.double(6), self._script.double(7)
+        return self._move(motion.movel(self._target, goal, acceleration, speed))
+
+    def _move(self, move: Thread) -> Thread:
+        self._stop_asynchronous_move()
+        if self._script.integer(1) == 1:
+            self._script.run("move", self._told(move))
+        else:
+            yield from move
+
+    def _told(self, work: Thread) -> Thread:
+        """Run a motion as an asynchronous operation, its begin and end told to the client."""
+        self._script.begin_asynchronous()
+        yield from work
+        self._script.end_asynchronous()
+
+    def _stop_asynchronous_move(self) -> None:
+        if self._script.kill("move"):
+            self._script.end_asynchronous()
+
+    def stop(self) -> Thread:
+        """Stop, asynchronously where integer 1 says so."""
+        script = self._script
+        if script.kill("stop"):
+            script.end_asynchronous()
+        else:
+            self._stop_asynchronous_move()
+        asynchronous = script.integer(1) == 1
+        if asynchronous:
+            self._stop_linear = True
+        stop = motion.stopl if self._stop_linear else motion.stopj
+        work = stop(self._target, script.double(0))
+        if asynchronous:
+            script.run("stop", self._told(work))
+        else:
+            yield from work
+
+    def speedl(self) -> None:
+        """Move the TCP with a twist until told otherwise."""
+        self._speed_to(motion.speedl)
+
+    def speedj(self) -> None:
+        """Move the joints with speeds until told otherwise."""
+        self._speed_to(motion.speedj)
+
+    def _speed_to(self, run: SpeedMotion) -> None:
+        script = self._script
+        self._speed = (run, script.doubles(0), script.double(6), script.double(7))
+        if "speed" not in script.threads:
+            script.run("speed", self._speeding())
+
+    def _speeding(self) -> Thread:
+        # A new speed is taken up when the time of the last one is over, not before.
+        while True:
+            run, speed, acceleration, time_s = self._speed
+            yield from run(self._target, speed, acceleration, time_s)
+
+    def speed_stop(self) -> Thread:
+        """End a motion with a speed."""
+        self._script.kill("speed")
+        stop = motion.stopl if self._speed[0] is motion.speedl else motion.stopj
+        return stop(self._target, self._script.double(0))
+
+    def servoj(self) -> None:
+        """Follow joint angles."""
+        self._servo_to(self._script.doubles(0))
+
+    def servol(self) -> None:
+        """Follow poses, each taken as the joint angles nearest to the actual ones."""
+        self._servo_to(self._machine.solved(matrix_from_pose(self._script.doubles(0))))
+
+    def _servo_to(self, goal: FloatArray) -> None:
+        script = self._script
+        gain = script.double(10)
+        if not 100 <= gain <= 2000:
+            raise ScriptError(f"servoj: gain {gain:g}; accepted is 100 to 2000")
+        self._servo = (goal, script.double(8), script.double(9))
+        if "servo" not in script.threads:
+            script.run("servo", self._servoing())
+
+    def _servoing(self) -> Thread:
+        while True:
+            yield from motion.servoj(self._target, *self._servo)
+
+    def servo_stop(self) -> Thread:
+        """End following."""
+        self._script.kill("servo")
+        return motion.stopl(self._target, self._script.double(0))
+
+    def move_until_contact(self) -> Thread:
+        """Move with a twist until the tool touches something, and back to where it did."""
+        script = self._script
+        speed, direction, acceleration = script.doubles(0), script.doubles(6, 3), script.double(12)
+        while (steps := self._machine.contact_steps(direction)) == 0:
+            yield from motion.speedl(self._target, speed, acceleration, CYCLE_S)
+        yield from self._return(steps)
+
+    def _return(self, steps: int) -> Thread:
+        """Stop, and go back to where the arm was some cycles ago."""
+        q = self._machine.past_joints(steps)
+        yield from motion.stopl(self._target, CONTACT_STOP)
+        goal = forward(q) @ self._target.tcp
+        yield from motion.movel(self._target, goal, MOVE_ACCELERATION, MOVE_SPEED)
+
+    def start_contact(self) -> None:
+        """Watch for a contact along a direction; zero: along the motion."""
+        self._script.kill("contact")
+        self._script.run("contact", self._watching(self._script.doubles(0, 3)))
+
+    def _watching(self, direction: FloatArray) -> Thread:
+        """Wait until nothing is touched, then for a contact; zero: along the motion."""
+        self._contact_steps = 0
+        follow = not direction.any()
+
+        def steps() -> int:
+            along = self._target.twist[:3] if follow else direction
+            return self._machine.contact_steps(along)
+
+        while steps() > 0:
+            yield
+        while (found := steps()) == 0:
+            yield
+        self._contact_steps = found
+        self._script.internal_command = CONTACT_FOUND
+
+    def stop_contact(self) -> None:
+        """End watching; how many cycles ago a contact began, 0 for none."""
+        self._script.kill("contact")
+        self._script.answer(self._contact_steps)
+
+    def read_contact(self) -> None:
+        """How many cycles before it was found a contact began, 0 for none."""
+        self._script.answer(self._contact_steps)
+
+    def back_to_contact(self) -> Thread:
+        """Stop and go back to where the contact began."""
+        self._stop_asynchronous_move()
+        return self._return(self._contact_steps)
+
+    def start_jog(self) -> None:
+        """Move with a twist in the base, the tool or another frame."""
+        script = self._script
+        axes = [np.eye(3), self._machine.tcp[:3, :3], matrix_from_pose(script.doubles(8))[:3, :3]]
+        feature = round(script.double(6))
+        if feature not in (0, 1, 2):
+            raise ScriptError(f"jog: feature {feature}; accepted are 0 base, 1 tool, 2 custom")
+        twist = script.doubles(0)
+        self._jog_twist = np.concatenate([axes[feature] @ twist[:3], axes[feature] @ twist[3:]])
+        if "jog" not in script.threads:
+            script.run("jog", self._jogging(script.double(7)))
+
+    def _jogging(self, acceleration: float) -> Thread:
+        while True:
+            yield from motion.speedl(self._target, self._jog_twist, acceleration, 5 * CYCLE_S)
+
+    def stop_jog(self) -> Thread:
+        """End jogging."""
+        self._script.kill("jog")
+        return motion.stopl(self._target, 1.2)

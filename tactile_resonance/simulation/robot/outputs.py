@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE outputs of the controller: names, types and how each follows from its state.
+
+Names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". Not modelled, and nominal
+therefore: temperatures, voltages, execution time, analogue inputs; the accelerometer in the tool feels
+gravity alone. Currents are torques over an assumed constant, without friction or inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.simulation.robot.dynamics import gravity_torque, momentum
+from tactile_resonance.simulation.robot.machine import Machine
+from tactile_resonance.simulation.robot.ports import Ports
+from tactile_resonance.simulation.robot.poses import pose_from_matrix
+from tactile_resonance.simulation.robot.registers import REGISTER_COUNT, Registers
+from tactile_resonance.simulation.robot.safety import RobotMode, Safety
+
+FloatArray = NDArray[np.float64]
+OutputValue = float | int | list[float] | list[int]
+
+# Joint torque per motor current [N m/A]; the maker publishes none.
+TORQUE_PER_CURRENT = 10.0
+# Of the joints (RTDE guide): running, or without power.
+JOINT_RUNNING, JOINT_POWER_OFF = 253, 239
+NOMINAL_TEMPERATURE_C = 28.0
+MAINS_V, ROBOT_BUS_V = 230.0, 48.0
+
+
+class Robot(Protocol):
+    """What the outputs are read from."""
+
+    machine: Machine
+    safety: Safety
+    registers: Registers
+    ports: Ports
+
+    @property
+    def time_s(self) -> float:
+        """Robot time [s]."""
+        ...
+
+    @property
+    def runtime_state(self) -> int:
+        """Of the program."""
+        ...
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program runs."""
+        ...
+
+
+class Outputs:
+    """Outputs of one cycle; what several of them share is computed once, when first asked for."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    def value(self, name: str) -> OutputValue:
+        """Return an output: an int or a float, for vectors a list of them. Raises KeyError."""
+        if name not in _OUTPUTS:
+            raise KeyError(f"RTDE output {name!r}: not known")
+        value = _OUTPUTS[name][1](self)
+        return value.tolist() if isinstance(value, np.ndarray) else value
+
+    @cached_property
+    def target_moment(self) -> FloatArray:
+        """Torques (6,) that hold the arm at its target."""
+        machine = self.robot.machine
+        return gravity_torque(machine.target.frames, machine.gravity_m_s2, machine.payload)
+
+    @cached_property
+    def actual_moment(self) -> FloatArray:
+        """Torques (6,) that hold the arm against gravity and against what pushes the tool."""
+        machine = self.robot.machine
+        held = gravity_torque(machine.frames, machine.gravity_m_s2, machine.payload)
+        return held + machine.outer_torque
+
+    @property
+    def tool_accelerometer(self) -> FloatArray:
+        """What an accelerometer at rest in the flange feels (3,) [m/s^2]."""
+        machine = self.robot.machine
+        return -(machine.flange[:3, :3].T @ machine.gravity_m_s2)
+
+    @property
+    def status_bits(self) -> int:
+        """Power in bit 0, a running program in bit 1."""
+        powered = self.robot.safety.robot_mode is not RobotMode.POWER_OFF
+        return int(powered) | int(self.robot.program_running) << 1
+
+    @property
+    def joint_mode(self) -> list[int]:
+        """Mode of each joint."""
+        return [JOINT_RUNNING if self.robot.safety.powered else JOINT_POWER_OFF] * 6
+
+
+Reader = Callable[[Outputs], FloatArray | OutputValue]
+
+_OUTPUTS: dict[str, tuple[str, Reader]] = {
+    "timestamp": ("DOUBLE", lambda o: o.robot.time_s),
+    "target_q": ("VECTOR6D", lambda o: o.robot.machine.target.q),
+    "target_qd": ("VECTOR6D", lambda o: o.robot.machine.target.qd),
+    "target_qdd": ("VECTOR6D", lambda o: o.robot.machine.target.qdd),
+    "target_current": ("VECTOR6D", lambda o: o.target_moment / TORQUE_PER_CURRENT),
+    "target_moment": ("VECTOR6D", lambda o: o.target_moment),
+    "actual_q": ("VECTOR6D", lambda o: o.robot.machine.joints.q),
+    "actual_qd": ("VECTOR6D", lambda o: o.robot.machine.joints.qd),
+    "actual_current": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
+    "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
+    "joint_control_output": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
+    "actual_TCP_pose": ("VECTOR6D", lambda o: pose_from_matrix(o.robot.machine.tcp)),
+    "actual_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.tcp_twist),
+    "actual_TCP_force": ("VECTOR6D", lambda o: o.robot.machine.tcp_force),
+    "target_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.target.pose),
+    "target_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.target.twist),
+    "actual_digital_input_bits": ("UINT64", lambda o: o.robot.ports.digital_inputs),
+    "actual_digital_output_bits": ("UINT64", lambda o: o.robot.ports.digital_outputs),
+    "joint_temperatures": ("VECTOR6D", lambda o: [NOMINAL_TEMPERATURE_C] * 6),
+    "actual_execution_time": ("DOUBLE", lambda o: 0.0),
+    "robot_mode": ("INT32", lambda o: int(o.robot.safety.robot_mode)),
+    "joint_mode": ("VECTOR6INT32", lambda o: o.joint_mode),
+    "safety_mode": ("INT32", lambda o: int(o.robot.safety.safety_mode)),
+    "actual_tool_accelerometer": ("VECTOR3D", lambda o: o.tool_accelerometer),
+    "speed_scaling": (
+        "DOUBLE",
+        lambda o: o.robot.ports.speed_slider if o.robot.program_running else 0.0,
+    ),
+    "target_speed_fraction": ("DOUBLE", lambda o: o.robot.ports.speed_slider),
+    "actual_momentum": (
+        "DOUBLE",
+        lambda o: momentum(
+            o.robot.machine.frames, o.robot.machine.joints.qd, o.robot.machine.payload
+        ),
+    ),
+    "actual_main_voltage": ("DOUBLE", lambda o: MAINS_V),
+    "actual_robot_voltage": ("DOUBLE", lambda o: ROBOT_BUS_V if o.robot.safety.powered else 0.0),
+    "actual_robot_current": (
+        "DOUBLE",
+        lambda o: float(np.abs(o.actual_moment).sum()) / TORQUE_PER_CURRENT,
+    ),
+    "actual_joint_voltage": ("VECTOR6D", lambda o: [ROBOT_BUS_V * o.robot.safety.powered] * 6),
+    "runtime_state": ("UINT32", lambda o: int(o.robot.runtime_state)),
+    "standard_analog_input0": ("DOUBLE", lambda o: 0.0),
+    "standard_analog_input1": ("DOUBLE", lambda o: 0.0),
+    "standard_analog_output0": ("DOUBLE", lambda o: o.robot.ports.analog_outputs[0]),
+    "standard_analog_output1": ("DOUBLE", lambda o: o.robot.ports.analog_outputs[1]),
+    "robot_status_bits": ("UINT32", lambda o: o.status_bits),
+    "safety_status_bits": ("UINT32", lambda o: o.robot.safety.status_bits),
+    "ft_raw_wrench": ("VECTOR6D", lambda o: o.robot.machine.sensor.raw),
+    "payload": ("DOUBLE", lambda o: o.robot.machine.payload.mass_kg),
+    "payload_cog": ("VECTOR3D", lambda o: o.robot.machine.payload.cog_m),
+    "payload_inertia": ("VECTOR6D", lambda o: o.robot.machine.payload.inertia_kg_m2),
+    "tcp_offset": ("VECTOR6D", lambda o: pose_from_matrix(o.robot.machine.target.tcp)),
+    "tcp_force_scalar": (
+        "DOUBLE",
+        lambda o: float(np.linalg.norm(o.robot.machine.tcp_force[:3])),
+    ),
+}
+
+
+def _register(kind: str, number: int) -> Reader:
+    return lambda o: getattr(o.robot.registers, f"output_{kind}")[number]
+
+
+for _number in range(REGISTER_COUNT):
+    _OUTPUTS[f"output_int_register_{_number}"] = ("INT32", _register("int", _number))
+    _OUTPUTS[f"output_double_register_{_number}"] = ("DOUBLE", _register("double", _number))
+
+# RTDE types of all outputs, by name.
+OUTPUT_TYPES: dict[str, str] = {name: kind for name, (kind, _) in _OUTPUTS.items()}

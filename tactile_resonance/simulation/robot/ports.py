@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE inputs: general purpose registers, digital and analogue outputs, speed slider."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from tactile_resonance.simulation.robot.registers import REGISTER_COUNT, Registers
+
+# Types of all inputs, as the RTDE guide names them.
+INPUT_TYPES: dict[str, str] = {
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8",
+    "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8",
+    "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8",
+    "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE",
+    "standard_analog_output_1": "DOUBLE",
+    "external_force_torque": "VECTOR6D",
+    **{f"input_int_register_{n}": "INT32" for n in range(REGISTER_COUNT)},
+    **{f"input_double_register_{n}": "DOUBLE" for n in range(REGISTER_COUNT)},
+}
+
+# Groups of digital outputs and their first bit in the word of all.
+_DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
+
+InputValue = float | int | Sequence[float]
+
+
+class Ports:
+    """Digital and analogue outputs and the speed slider.
+
+    Attributes
+    ----------
+    digital_inputs, digital_outputs : int
+        Bits 0-7 standard, 8-15 configurable, 16-17 tool.
+    analog_outputs : list of 2 floats
+        As written, 0 to 1 of the range.
+    speed_slider : float
+        Above 0 to 1.
+    """
+
+    def __init__(self) -> None:
+        self.digital_inputs = 0
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.speed_slider = 1.0
+
+    def write(self, values: Mapping[str, InputValue]) -> None:
+        """Take the inputs of one package; only what its masks select is written."""
+
+        def number(name: str) -> float:
+            value = values.get(name, 0)
+            assert not isinstance(value, Sequence)
+            return value
+
+        for group, first in _DIGITAL.items():
+            mask = int(number(f"{group}_digital_output_mask")) << first
+            bits = int(number(f"{group}_digital_output")) << first
+            self.digital_outputs = (self.digital_outputs & ~mask) | (bits & mask)
+        for channel in range(2):
+            if int(number("standard_analog_output_mask")) >> channel & 1:
+                self.analog_outputs[channel] = number(f"standard_analog_output_{channel}")
+        if int(number("speed_slider_mask")):
+            self.speed_slider = min(1.0, max(0.0, number("speed_slider_fraction")))
+
+
+def write_registers(registers: Registers, values: Mapping[str, InputValue]) -> None:
+    """Write general purpose registers by their RTDE names, and note them as refreshed."""
+    for name, value in values.items():
+        kind, _, place = name.rpartition("_")
+        if kind == "input_int_register":
+            registers.input_int[int(place)] = int(value)  # type: ignore[arg-type]
+        elif kind == "input_double_register":
+            registers.input_double[int(place)] = float(value)  # type: ignore[arg-type]
+        else:
+            continue
+        registers.refreshed.add(name)

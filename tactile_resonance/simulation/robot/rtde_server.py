@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE server of the simulated controller (port 30004)."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from tactile_resonance.simulation.robot.controller import UrController
+from tactile_resonance.simulation.robot.reactor import Connection
+from tactile_resonance.simulation.robot.rtde_packets import (
+    PROTOCOL_VERSION,
+    Kind,
+    Layout,
+    PacketReader,
+    packet,
+)
+
+PORT = 30004
+CYCLE_HZ = 500.0
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    names: tuple[str, ...]
+    layout: Layout
+
+
+class RtdeServer:
+    """All RTDE connections of one controller.
+
+    Attributes
+    ----------
+    registers_in_use : bool
+        A fieldbus or another program claims the input registers: every input recipe is refused.
+    """
+
+    def __init__(self, controller: UrController) -> None:
+        self.controller = controller
+        self.registers_in_use = False
+        self._services: list[_Service] = []
+
+    def serve(self, connection: Connection) -> _Service:
+        """Serve a new connection."""
+        service = _Service(self, connection)
+        self._services.append(service)
+        return service
+
+    @property
+    def connections(self) -> int:
+        """How many clients are connected."""
+        return len(self._services)
+
+    def publish(self, cycle: int) -> None:
+        """Send this cycle's outputs to whom they are due."""
+        for service in list(self._services):
+            service.publish(cycle)
+
+    def drop(self) -> int:
+        """Abort all connections; returns how many there were."""
+        services = list(self._services)
+        for service in services:
+            service.connection.close(reset=True)
+        return len(services)
+
+    def forget(self, service: _Service) -> None:
+        """Free what a connection held."""
+        self._services.remove(service)
+
+    def claimed(self, name: str, asking: _Service) -> bool:
+        """Whether another connection, or a fieldbus, writes an input."""
+        if self.registers_in_use and "register" in name:
+            return True
+        return any(name in service.inputs for service in self._services if service is not asking)
+
+
+class _Service:
+    """One RTDE connection: its recipes, and whether it is started."""
+
+    def __init__(self, server: RtdeServer, connection: Connection) -> None:
+        self.connection = connection
+        self.inputs: set[str] = set()
+        self._server = server
+        self._reader = PacketReader()
+        self._recipes: dict[int, _Recipe] = {}
+        self._outputs: _Recipe | None = None
+        self._period = 1
+        self._started = False
+        self._answers = {
+            Kind.PROTOCOL_VERSION: self._protocol_version,
+            Kind.CONTROLLER_VERSION: self._controller_version,
+            Kind.OUTPUTS: self._set_up_outputs,
+            Kind.INPUTS: self._set_up_inputs,
+            Kind.START: self._start,
+            Kind.PAUSE: self._pause,
+        }
+
+    def received(self, data: bytes) -> None:
+        """Answer requests and take inputs."""
+        for kind, payload in self._reader.add(data):
+            if kind == Kind.DATA:
+                self._take(payload)
+            elif kind in self._answers:
+                kind = Kind(kind)
+                self.connection.send(packet(kind, self._answers[kind](payload)))
+            elif kind != Kind.TEXT:
+                raise ValueError(f"RTDE packet: type {kind}, expected one of 'VvMUOISP'")
+
+    def closed(self) -> None:
+        """Free the inputs."""
+        self._server.forget(self)
+
+    def publish(self, cycle: int) -> None:
+        """Send the outputs where they are due; a client that does not read misses them."""
+        recipe = self._outputs
+        if not self._started or recipe is None or cycle % self._period:
+            return
+        outputs = self._server.controller.outputs
+        values = [outputs(name) for name in recipe.names]
+        self.connection.send(recipe.layout.pack(1, values), droppable=True)
+
+    def _protocol_version(self, payload: bytes) -> bytes:
+        return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
+
+    def _controller_version(self, _: bytes) -> bytes:
+        return struct.pack(">4I", *self._server.controller.config.polyscope)
+
+    def _set_up_outputs(self, payload: bytes) -> bytes:
+        if len(payload) < 8:
+            raise ValueError("RTDE outputs: no frequency")
+        (frequency_hz,) = struct.unpack_from(">d", payload)
+        if not 1.0 <= frequency_hz <= CYCLE_HZ:
+            return b"\x00"
+        self._period = round(CYCLE_HZ / frequency_hz)
+        names = _names(payload[8:])
+        known = self._server.controller.OUTPUT_TYPES
+        types = [known.get(name, "NOT_FOUND") for name in names]
+        if "NOT_FOUND" in types:
+            return b"\x00" + ",".join(types).encode()
+        self._outputs = _Recipe(names, Layout(types))
+        return b"\x01" + ",".join(types).encode()
+
+    def _set_up_inputs(self, payload: bytes) -> bytes:
+        names = _names(payload)
+        known = self._server.controller.INPUT_TYPES
+        types = [
+            "IN_USE" if self._server.claimed(name, self) else known.get(name, "NOT_FOUND")
+            for name in names
+        ]
+        if "IN_USE" in types or "NOT_FOUND" in types:
+            return b"\x00" + ",".join(types).encode()
+        recipe = len(self._recipes) + 1
+        self._recipes[recipe] = _Recipe(names, Layout(types))
+        self.inputs.update(names)
+        return bytes([recipe]) + ",".join(types).encode()
+
+    def _start(self, _: bytes) -> bytes:
+        self._started = self._outputs is not None
+        return bytes([self._started])
+
+    def _pause(self, _: bytes) -> bytes:
+        self._started = False
+        return b"\x01"
+
+    def _take(self, payload: bytes) -> None:
+        recipe = self._recipes.get(payload[0]) if payload else None
+        if recipe is None:
+            return
+        values = recipe.layout.unpack(payload)
+        if values is None:  # a real controller takes no packet of the wrong size either
+            return
+        self._server.controller.write_inputs(dict(zip(recipe.names, values, strict=True)))
+
+
+def _names(text: bytes) -> tuple[str, ...]:
+    return tuple(name for name in text.decode("ascii", "replace").split(",") if name)
