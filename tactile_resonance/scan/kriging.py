@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A quantity between its points: Gaussian process regression (kriging) with the noise of each point.
+
+Ordinary kriging: an unknown constant mean and a Matern covariance of smoothness 5/2, whose length and size
+are those of greatest restricted likelihood (Rasmussen and Williams, Gaussian Processes for Machine Learning,
+2006, chapters 2, 4 and 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from tactile_resonance.simulation.fields import require
+
+FloatArray = npt.NDArray[np.float64]
+LEAST_POINTS = 5
+# Of the variance of the process; below it neighbours are too much alike to invert their covariance.
+_JITTER = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class KrigedSurface:
+    """What is known of the quantity everywhere.
+
+    Attributes
+    ----------
+    xy_m : (n, 2) float
+        Points measured.
+    values : (n,) float
+    noise_std : (n,) float
+    length_m : float
+        Distance over which the quantity changes.
+    process_std : float
+        How much it varies; 0 where nothing but noise is seen.
+    mean : float
+    """
+
+    xy_m: FloatArray
+    values: FloatArray
+    noise_std: FloatArray
+    length_m: float
+    process_std: float
+    mean: float
+
+    def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) value and its standard deviation at (..., 2) positions.
+
+        The standard deviation is that of the quantity itself, not of a new measurement of it; it
+        includes that of the mean, but not that of length and size.
+        """
+        at = np.asarray(xy_m, float)
+        points = at.reshape(-1, 2)
+        factor, ones = self._factor(), np.ones(len(self.values))
+        cross = self.process_std**2 * _matern(_distances(points, self.xy_m) / self.length_m)
+        weights = cho_solve(factor, cross.T)  # (n, q)
+        value = self.mean + weights.T @ (self.values - self.mean)
+        # what the mean's own uncertainty adds
+        known = ones @ cho_solve(factor, ones)
+        rest = 1 - weights.T @ ones
+        explained = np.sum(cross.T * weights, axis=0)
+        variance = self.process_std**2 - explained + rest**2 / known
+        std = np.sqrt(np.maximum(variance, 0))
+        return value.reshape(at.shape[:-1]), std.reshape(at.shape[:-1])
+
+    def _factor(self) -> tuple[FloatArray, bool]:
+        distances = _distances(self.xy_m, self.xy_m)
+        return _factor(distances, self.noise_std, self.length_m, self.process_std)
+
+
+def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) -> KrigedSurface:
+    """Fit length, size and mean.
+
+    Parameters
+    ----------
+    xy_m : (n, 2) float
+        Positions, n at least `LEAST_POINTS`, not all in one place.
+    values : (n,) float
+    noise_std : (n,) float
+        Of each value; 0 means exact.
+
+    Raises
+    ------
+    ValueError
+        If there are too few points, or two exact ones in one place.
+    """
+    xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
+    require(xy.ndim == 2 and xy.shape[1] == 2, "xy_m", xy.shape, "shape (n, 2)")
+    require(len(xy) >= LEAST_POINTS, "xy_m", len(xy), f"{LEAST_POINTS} points or more")
+    same = y.shape == noise.shape == (len(xy),)
+    require(same, "values, noise_std", (y.shape, noise.shape), f"shape ({len(xy)},)")
+    good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)) and np.all(noise >= 0))
+    require(good and bool(np.all(np.isfinite(noise))), "values", "NaN", "finite numbers")
+    distances = _distances(xy, xy)
+    apart = distances + np.diag(np.full(len(xy), np.inf))
+    extent = float(distances.max())
+    require(extent > 0, "xy_m", "one place", "places apart from each other")
+    twice = (apart < 1e-9 * extent) & (noise[:, None] == 0) & (noise == 0)
+    require(not twice.any(), "xy_m", "one place twice, without noise", "one exact value a place")
+    scale = float(np.std(y))
+    if scale == 0:
+        return KrigedSurface(xy, y, noise, extent, 0.0, float(y[0]))
+    # starts over the lengths that the points can tell: a likelihood may have several maxima
+    nearest = float(np.median(apart.min(axis=1)))
+    lowest, highest = np.log(0.3 * nearest), np.log(10 * extent)
+    best = min(
+        (
+            minimize(
+                _cost,
+                np.array([start, np.log(scale)]),
+                args=(distances, y, noise),
+                method="L-BFGS-B",
+                bounds=[(lowest, highest), (np.log(1e-4 * scale), np.log(100 * scale))],
+            )
+            for start in np.linspace(lowest, np.log(extent), 4)
+        ),
+        key=lambda found: found.fun,
+    )
+    length, size = np.exp(best.x)
+    factor = _factor(distances, noise, length, size)
+    ones = np.ones(len(y))
+    mean = float(ones @ cho_solve(factor, y) / (ones @ cho_solve(factor, ones)))
+    return KrigedSurface(xy, y, noise, float(length), float(size), mean)
+
+
+def _cost(x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray) -> float:
+    """Minus the logarithm of the restricted likelihood, but for a constant."""
+    length, size = np.exp(x)
+    factor = _factor(distances, noise, length, size)
+    ones = np.ones(len(y))
+    known = ones @ cho_solve(factor, ones)
+    residual = y - ones @ cho_solve(factor, y) / known
+    log_volume = 2 * np.sum(np.log(np.diag(factor[0]))) + np.log(known)
+    return float(0.5 * (residual @ cho_solve(factor, residual) + log_volume))
+
+
+def _factor(
+    distances: FloatArray, noise: FloatArray, length: float, size: float
+) -> tuple[FloatArray, bool]:
+    covariance = size**2 * _matern(distances / length)
+    return cho_factor(covariance + np.diag(noise**2 + _JITTER * size**2), lower=True)
+
+
+def _matern(ratio: FloatArray) -> FloatArray:
+    """Correlation at distances over length."""
+    scaled = np.sqrt(5) * ratio
+    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
+
+
+def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(a[:, None] - b[None, :], axis=-1))

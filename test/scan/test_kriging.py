@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface goes through exact points, and where it does not it says by how much."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.scan.kriging import krige
+
+
+def matern(distance, length):
+    s = np.sqrt(5) * distance / length
+    return (1 + s + s**2 / 3) * np.exp(-s)
+
+
+def draw(rng, xy, length, std, mean):
+    distance = np.linalg.norm(xy[:, None] - xy, axis=-1)
+    covariance = std**2 * matern(distance, length) + 1e-12 * np.eye(len(xy))
+    return mean + np.linalg.cholesky(covariance) @ rng.standard_normal(len(xy))
+
+
+def test_exact_points_are_met_with_no_uncertainty():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0, 0.02, (20, 2))
+    y = 250 + 3 * np.sin(200 * xy[:, 0]) + 100 * xy[:, 1]
+    surface = krige(xy, y, np.zeros(20))
+    value, std = surface.predict(xy)
+    np.testing.assert_allclose(value, y, atol=1e-5)
+    assert np.all(std < 1e-3)
+    _, between = surface.predict([[0.1, 0.1]])
+    assert between > 1
+
+
+def test_a_constant_and_units_of_length_and_value_do_not_matter():
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 0.02, (15, 2))
+    y = draw(rng, xy, 0.006, 2.0, 0.0)
+    noise = rng.uniform(0.05, 0.2, 15)
+    at = rng.uniform(0, 0.02, (7, 2))
+    value, std = krige(xy, y, noise).predict(at)
+    moved, moved_std = krige(1000 * xy + 5, 0.01 * y + 250, 0.01 * noise).predict(1000 * at + 5)
+    np.testing.assert_allclose(moved, 0.01 * value + 250, atol=1e-5)
+    np.testing.assert_allclose(moved_std, 0.01 * std, rtol=1e-2)
+
+
+def test_among_nothing_but_noise_it_is_the_weighted_mean():
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, 0.02, (200, 2))
+    y = 250 + 0.1 * rng.standard_normal(200)
+    value, std = krige(xy, y, np.full(200, 0.1)).predict([[0.01, 0.01]])
+    assert value == pytest.approx(250, abs=0.05)
+    assert std < 0.05
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.7])
+def test_coverage_is_honest(noise):
+    """Seeded Monte Carlo over processes: errors in stated standard deviations have mean square near 1.
+
+    Length and size are estimated from the same points and their uncertainty is left out: a little more than
+    1 is expected, by about (parameters) / (points).
+    """
+    rng, runs, count = np.random.default_rng(4), 60, 36
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 0.02, 6)] * 2), axis=-1).reshape(-1, 2)
+    errors = []
+    for _ in range(runs):
+        at = rng.uniform(0, 0.02, (10, 2))
+        truth = draw(rng, np.concatenate([grid, at]), 0.006, 2.0, 255.0)
+        surface = krige(grid, truth[:count] + noise * rng.standard_normal(count), [noise] * count)
+        value, std = surface.predict(at)
+        errors.append((value - truth[count:]) / std)
+    errors = np.array(errors)
+    per_run = np.mean(errors**2, axis=1)
+    standard_error = per_run.std() / np.sqrt(runs)
+    assert 1 - 4 * standard_error < per_run.mean() < 1.3 + 4 * standard_error
+    assert 0.90 < np.mean(np.abs(errors) < 1.96) < 0.98
+
+
+@pytest.mark.parametrize(
+    ("xy", "noise", "reason"),
+    [
+        (np.zeros((4, 2)), 0.1, "5 points or more"),
+        (np.zeros((6, 2)), 0.1, "apart from each other"),
+        (np.array([[0, 0], [0, 0], [1, 0], [2, 0], [3, 0]]), 0.0, "one place twice"),
+        (np.full((5, 2), np.nan), 0.1, "finite"),
+    ],
+)
+def test_what_determines_nothing_is_refused(xy, noise, reason):
+    with pytest.raises(ValueError, match=reason):
+        krige(xy, np.arange(len(xy)), np.full(len(xy), noise))
