@@ -94,7 +94,8 @@ def identify_batch(
         usable &= np.isfinite(variance)
     known: VarianceModel | None = None
     if variance is not None and selected.dof > 0 and bool(np.all((variance > 0) | ~usable)):
-        known = model_variance(np.where(usable, variance, np.nan), selected.dof)
+        gain = np.where(usable, np.abs(g) ** 2, 0.0)
+        known = model_variance(np.where(usable, variance, np.nan), selected.dof, gain)
         weights = known.variance
     else:
         count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)
