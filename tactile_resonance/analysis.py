@@ -21,7 +21,7 @@ from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.estimator import POLES_METHODS
 from tactile_resonance.identification.identify import identify_poles
-from tactile_resonance.identification.joint import identify_poles_from_records
+from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording

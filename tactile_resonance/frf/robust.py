@@ -11,6 +11,9 @@ from tactile_resonance.frf.fast import response, response_status
 from tactile_resonance.frf.result import FRF, ComplexArray, FloatArray, FrfStatus
 from tactile_resonance.frf.spectra import PeriodicSpectra, ratio_variance
 
+# Chance alone makes realisations of one period look like a transient once in ten thousand times.
+TRANSIENT_SCORE = 3.7
+
 
 @dataclass(frozen=True, eq=False)
 class RobustFrf:
@@ -96,7 +99,7 @@ def robust_frf(
             - 2 * np.real(noise[..., 0, 1, :] * g.conj())
         )
         variance_noise = output / np.mean(np.abs(each[..., 1, :]) ** 2, axis=-2)
-    status, message = _robust_status(each, spectra.covariance)
+    status, message = _robust_status(each, spectra.covariance, g)
     frf = FRF(
         frequency_hz=spectra.frequency_hz(sample_rate_hz),
         g=g,
@@ -157,11 +160,45 @@ def _distortion(frf: FRF) -> FloatArray | None:
     return frf.realisations * (frf.variance_total - frf.variance_noise)
 
 
-def _robust_status(each: ComplexArray, covariance: ComplexArray | None) -> tuple[FrfStatus, str]:
-    if covariance is None:
+def _robust_status(
+    each: ComplexArray, covariance: ComplexArray | None, g: ComplexArray
+) -> tuple[FrfStatus, str]:
+    if covariance is not None:
+        return response_status(each, covariance)
+    if transient_score(each, g) > TRANSIENT_SCORE:
         return (
-            FrfStatus.OK,
-            "one period per realisation: noise cannot be told from distortion, the variance over "
-            "realisations holds both, and a transient would not show",
+            FrfStatus.SUSPECT,
+            "a transient: what the realisations differ by is alike on neighbouring lines, which noise "
+            "and distortion are not; record two periods or more of each, or wait before the record",
         )
-    return response_status(each, covariance)
+    return (
+        FrfStatus.OK,
+        "one period per realisation: noise cannot be told from distortion, the variance over "
+        "realisations holds both",
+    )
+
+
+def transient_score(each: ComplexArray, g: ComplexArray) -> float:
+    """How alike neighbouring lines of ``Y_m - G U_m`` are, in standard deviations of chance.
+
+    Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
+    smooth. Every product of neighbours has mean zero then and brings its own variance, so that lines
+    may differ in noise.
+
+    Parameters
+    ----------
+    each : (..., M, 2, F) complex
+        Spectra [Y; U] of the realisations.
+    g : (..., F) complex
+        Mean response.
+
+    Returns
+    -------
+    float
+        The largest over the leading axes; NaN for fewer than two lines.
+    """
+    error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
+    product = np.real(error[..., 1:] * error[..., :-1].conj())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        score = product.sum(axis=(-2, -1)) / np.sqrt(np.sum(product**2, axis=(-2, -1)))
+    return float(np.max(score))

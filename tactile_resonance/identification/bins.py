@@ -59,6 +59,18 @@ class BinData:
             cut(self.covariance_yu),
         )
 
+    def turned(self, error: ComplexArray) -> ComplexArray:
+        """(batch, K) errors of y turned by the phase of u.
+
+        Errors of a response are smooth over lines; those of y are so only after this, for the phases
+        of the excitation are random.
+        """
+        if self.u is None:
+            return error
+        size = np.abs(self.u)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return error * np.where(size > 0, self.u.conj() / size, 1.0)
+
     def residual_variance(self, g: ComplexArray | None) -> FloatArray:
         """(batch, K or 1) variance of ``y - g u`` for a response g (batch, K)."""
         if self.variance_u is None or g is None:

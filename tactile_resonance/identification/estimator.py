@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.identify import identify_poles
-from tactile_resonance.identification.joint import identify_poles_from_bins
+from tactile_resonance.identification.joint_records import identify_poles_from_bins
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 

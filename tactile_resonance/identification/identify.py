@@ -16,6 +16,8 @@ from tactile_resonance.identification.judgement import (
     Evidence,
     assemble,
     difference_of_halves,
+    difference_of_models,
+    richer,
     single,
 )
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
@@ -94,7 +96,8 @@ def identify_batch(
         usable &= np.isfinite(variance)
     known: VarianceModel | None = None
     if variance is not None and selected.dof > 0 and bool(np.all((variance > 0) | ~usable)):
-        known = model_variance(np.where(usable, variance, np.nan), selected.dof)
+        gain = np.where(usable, np.abs(g) ** 2, 0.0)
+        known = model_variance(np.where(usable, variance, np.nan), selected.dof, gain)
         weights = known.variance
     else:
         count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)
@@ -266,27 +269,37 @@ def _identify(
         evidence = evidence.with_model_error(weighted)
     result = assemble(evidence, structure, band_hz, shape, method)
     if suspect.any():
-        halves = _difference_of_halves(plan, data, usable, np.flatnonzero(suspect), band_hz)
-        total = result.total_covariance.reshape((batch, *halves.shape[1:]))
-        total[suspect] += halves
+        systematic = _systematic(plan, fit, data, usable, np.flatnonzero(suspect), band_hz)
+        total = result.total_covariance.reshape((batch, *systematic.shape[1:]))
+        total[suspect] += systematic
     return result
 
 
-def _difference_of_halves(
+@np.errstate(over="ignore", invalid="ignore")
+def _systematic(
     plan: LinesPlan,
+    fit: LinesFit,
     data: BinData,
     usable: npt.NDArray[np.bool_],
     rows: npt.NDArray[np.int64],
     band_hz: tuple[float, float],
 ) -> FloatArray:
-    """(rows, places, 2, 2) as `judgement.difference_of_halves`."""
+    """(rows, places, 2, 2) what halves of the lines, and one mode more, make of the poles."""
     poles = []
     part = data.rows(rows)
     for parity in (0, 1):
         left_out = np.arange(usable.shape[1]) % 2 == parity
         half = replace(part, variance_y=np.where(left_out, np.inf, part.variance_y))
         poles.append(modes_in_band(plan.fit(half).model.poles_rad_s(), band_hz))
-    return difference_of_halves(*poles)
+    systematic = difference_of_halves(*poles)
+    structure = richer(plan.structure)
+    if usable[rows].sum(axis=-1).min() > structure.fewest_lines:
+        model = LinesPlan.on_lines(plan.frequency_hz, structure).fit(part).model
+        systematic = systematic + difference_of_models(
+            modes_in_band(fit.model.poles_rad_s()[rows], band_hz),
+            modes_in_band(model.poles_rad_s(), band_hz),
+        )
+    return systematic
 
 
 def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from tactile_resonance.identification.covariance import pole_quantities, real_covariance
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
 from tactile_resonance.identification.result import (
+    SMOOTH_RESIDUAL,
     STATUS_CODE,
     ComplexArray,
     FloatArray,
@@ -112,7 +113,7 @@ def model_error_factor(
         Weighted.
     cost, expected_cost : (batch,) float
     """
-    ratio = np.maximum(cost / expected_cost, 1.0)
+    ratio = np.fmax(cost / expected_cost, 1.0)  # 1 where the level itself is from the residuals
     return ratio * correlation_length(residual)
 
 
@@ -152,6 +153,36 @@ def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> F
     )
     difference = even - odd  # (..., places, 2)
     return np.asarray(difference[..., :, None] * difference[..., None, :])
+
+
+def difference_of_models(poles_rad_s: ComplexArray, richer_rad_s: ComplexArray) -> FloatArray:
+    """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
+
+    Two modes nearer to each other than their widths are fitted by one between them so well that
+    residuals tell little of how far it is from either.
+
+    Parameters
+    ----------
+    poles_rad_s : (..., places) complex
+    richer_rad_s : (..., more places) complex
+        NaN where there is no mode; the nearest one counts.
+
+    Returns
+    -------
+    (..., places, 2, 2) float
+        0 where the richer model has no mode.
+    """
+    distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
+    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
+    other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
+    return np.nan_to_num(difference_of_halves(poles_rad_s, other))
+
+
+def richer(structure: ModelStructure) -> ModelStructure:
+    """One mode more, as many residual terms."""
+    return replace(
+        structure, order=structure.order + 2, numerator_order=structure.numerator_order + 2
+    )
 
 
 def assemble(
@@ -194,8 +225,8 @@ def assemble(
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
         for where, status in (
-            (evidence.suspect, PolesStatus.MODEL_ERROR),
             (not evidence.level_known, PolesStatus.NO_COVARIANCE),
+            (evidence.suspect, PolesStatus.MODEL_ERROR),
             ((poles.real >= 0).any(axis=-1), PolesStatus.UNSTABLE_POLE),
             (~np.isfinite(poles).any(axis=-1), PolesStatus.NO_RESONANCE),
             (~(fit.condition_number < LARGEST_CONDITION_NUMBER), PolesStatus.ILL_CONDITIONED),
@@ -354,11 +385,26 @@ def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) ->
         "model is wrong",
         PolesStatus.NO_COVARIANCE: "the variance is not known independently of the fit: a model "
         "error would not show",
-        PolesStatus.MODEL_ERROR: f"cost {batch.cost[index]:.4g} where the variance explains "
-        f"{batch.expected_cost[index]:.4g}: the model leaves something out, rely on the total "
-        "covariance",
+        PolesStatus.MODEL_ERROR: f"{_contradiction(batch, index)}: the model leaves something out, "
+        "rely on the total covariance",
     }
     return sentences.get(status, "")
+
+
+def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
+    """What noise alone would not make."""
+    found = []
+    if np.isfinite(batch.cost[index]):
+        found.append(
+            f"cost {batch.cost[index]:.4g} where the variance explains "
+            f"{batch.expected_cost[index]:.4g}"
+        )
+    if batch.whiteness[index] > SMOOTH_RESIDUAL:
+        found.append(
+            f"residuals of neighbouring lines alike (whiteness {batch.whiteness[index]:.1f} where "
+            f"noise makes {SMOOTH_RESIDUAL} at most)"
+        )
+    return ", ".join(found)
 
 
 def _rows(model, rows):

@@ -118,6 +118,7 @@ class LinesPlan:
             residual[rows] = self.residual(data.rows(rows), theta[rows])
         return LinesFit(model, cost, parameters, condition, converged, residual)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
         """Plan with bases orthonormal in the weights of the fit itself.
 
@@ -161,11 +162,11 @@ class LinesPlan:
         return plan
 
     def residual(self, data: BinData, theta: FloatArray) -> ComplexArray:
-        """(batch, F) weighted residuals."""
+        """(batch, F) weighted residuals, those of spectra turned by the phase of the input."""
         with np.errstate(all="ignore"):
             _, _, y, g = self.problem.model(self.problem.groups[0], data, theta)
             variance = data.residual_variance(g)
-            return (data.y - y) / np.sqrt(variance)
+            return data.turned(data.y - y) / np.sqrt(variance)
 
     def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
         """(batch, n, n) ``Re J^H J`` for the weights of `data`."""

@@ -18,6 +18,9 @@ FloatArray = npt.NDArray[np.float64]
 
 # Bartlett's test rejects a flat variance wrongly in one of ten thousand bands.
 FALSE_ALARM = 1e-4
+REWEIGHTINGS = 3
+# Of the mean over the band: below it a fitted variance is taken for an accident.
+LEAST_VARIANCE = 1e-3
 KINDS = ("flat", "sloped", "per line")
 
 
@@ -54,11 +57,16 @@ class VarianceModel:
         With weights 1/s^2 of nu complex degrees of freedom each, ``E[1/s^2] = nu / (nu - 1) /
         sigma^2`` and ``E[1/s^4] = nu^2 / ((nu - 1)(nu - 2)) / sigma^4``; the plain covariance
         becomes (nu - 1)/nu of the bound and the estimate's own (nu - 1)/(nu - 2), together nu / (nu
-        - 2). NaN for nu <= 2, where the weights have no second moment. 1 where the variance is
-        pooled.
+        - 2). NaN for nu <= 2, where the weights have no second moment.
+
+        A level pooled to nu degrees of freedom makes errors over their stated deviation Student
+        distributed: with 2 nu real degrees of freedom their variance is ``nu / (nu - 1)``.
         """
         per_line = self.dof / (self.dof - 2) if self.dof > 2 else np.nan
-        return np.where(self.kind == 2, per_line, 1.0)
+        pooled = self.pooled_dof
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.where(pooled > 1, pooled / (pooled - 1), np.nan)
+        return np.where(self.kind == 2, per_line, factor)
 
     def expected_cost(self, parameters: int) -> FloatArray:
         """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
@@ -100,7 +108,7 @@ def f_quantile(probability: float, dof_1: FloatArray, dof_2: FloatArray) -> Floa
         return np.where(bottom > 0, (root / bottom) ** 3, np.inf)
 
 
-def model_variance(variance: FloatArray, dof: int) -> VarianceModel:
+def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = None) -> VarianceModel:
     """Flat where a test lets it pass, else sloped, else line by line.
 
     Parameters
@@ -109,6 +117,10 @@ def model_variance(variance: FloatArray, dof: int) -> VarianceModel:
         Sample variance per line; lines where it is not positive and finite are left out.
     dof : int
         Complex degrees of freedom of each.
+    gain : (batch, F) float, optional
+        ``|G|^2``: flat then means flat noise on both channels, which makes the variance of a response
+        ``a + b |G|^2``. At a resonance that matters where a test of few degrees of freedom sees no
+        difference, for there is the information on the pole.
 
     References
     ----------
@@ -123,9 +135,16 @@ def model_variance(variance: FloatArray, dof: int) -> VarianceModel:
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.log(variance if whole else np.where(usable, variance, 1.0))
         log_mean = log.sum(axis=-1) / count
-        model = np.broadcast_to(mean, variance.shape)
         kind = np.zeros(variance.shape[0], np.int64)
-        unequal = np.log(mean[:, 0]) - log_mean > _bartlett_limit(lines, dof, 1)
+        if gain is None:
+            model = np.broadcast_to(mean, variance.shape)
+            spread = np.log(mean[:, 0]) - log_mean
+        else:
+            model = _two_channels(known, gain, usable)
+            ratio = np.where(usable, known / model, 0.0)
+            spread = np.log(ratio.sum(axis=-1) / count) - log_mean
+            spread += np.where(usable, np.log(model), 0.0).sum(axis=-1) / count
+        unequal = spread > _bartlett_limit(lines, dof, 1 if gain is None else 2)
     if unequal.any():
         model = model.copy()
         rest = np.flatnonzero(unequal)
@@ -151,6 +170,34 @@ def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> 
     correction = 1 + (count + 1) / (3 * count * real_dof)
     quantile = special.chdtri(count - parameters, FALSE_ALARM)
     return quantile * correction / (real_dof * count)
+
+
+def _two_channels(
+    variance: FloatArray, gain: FloatArray, usable: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
+
+    Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
+    variable is proportional to its squared mean.
+    """
+    scale = variance.sum(axis=-1, keepdims=True) / np.maximum(usable.sum(axis=-1)[:, None], 1)
+    level = np.where(usable, gain, 0.0)
+    level = level / np.maximum(level.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
+    sample = variance / scale
+    model = np.ones_like(sample)
+    for _ in range(REWEIGHTINGS):
+        weight = np.where(usable, model**-2, 0.0)
+        by_level = weight * level
+        s0, s1, s2 = weight.sum(-1), by_level.sum(-1), np.einsum("bf,bf->b", by_level, level)
+        t0 = np.einsum("bf,bf->b", weight, sample)
+        t1 = np.einsum("bf,bf->b", by_level, sample)
+        determinant = s0 * s2 - s1**2
+        b = np.where(determinant > 1e-9 * s0 * s2, (s0 * t1 - s1 * t0) / determinant, 0.0)
+        a = (t0 - b * s1) / s0
+        b = np.where(b < 0, 0.0, np.where(a < 0, t1 / s2, b))
+        a = np.maximum((t0 - b * s1) / s0, 0.0)
+        model = np.maximum(a[:, None] + b[:, None] * level, LEAST_VARIANCE)
+    return model * scale
 
 
 def _log_linear(variance: FloatArray, usable: npt.NDArray[np.bool_]) -> FloatArray:

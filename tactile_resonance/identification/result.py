@@ -104,6 +104,9 @@ class Poles:
     message: str = ""
 
 
+# Neighbouring residuals of noise alone are more alike than this once in a thousand fits.
+SMOOTH_RESIDUAL = 3.09
+
 STATUSES = tuple(PolesStatus)
 STATUS_CODE = {status: code for code, status in enumerate(STATUSES)}
 
@@ -125,7 +128,8 @@ class PolesBatch:
         Of the free coefficients of ``fit``: denominator, numerator, transient (from noise).
     cost, expected_cost, condition_number : (...) float
     residual : (..., F) complex
-        Weighted residuals on the (excited) lines; 0 on those left out.
+        Weighted residuals on the (excited) lines; 0 on those left out. Those of spectra are turned
+        by the phase of the input, to be as smooth as an error of the response.
     lines : (...) int
     status_code : (...) uint8
         Index into `STATUSES`.
@@ -171,12 +175,7 @@ class PolesBatch:
 
         NaN where there are no two of them.
         """
-        first, second = self.residual[..., :-1], self.residual[..., 1:]
-        pairs = np.sum((first != 0) & (second != 0), axis=-1)
-        used = np.maximum(np.sum(self.residual != 0, axis=-1), 1)
-        power = np.sum(np.abs(self.residual) ** 2, axis=-1) / used
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sum(np.real(first * second.conj()), axis=-1) / (power * np.sqrt(pairs / 2))
+        return whiteness(self.residual)
 
     def has_status(self, status: PolesStatus) -> npt.NDArray[np.bool_]:
         """(...) which points have a status."""
@@ -185,6 +184,21 @@ class PolesBatch:
     def status(self, index: tuple[int, ...] | int = ()) -> PolesStatus:
         """Status of one point."""
         return STATUSES[int(self.status_code[index])]
+
+
+def whiteness(residual: ComplexArray) -> FloatArray:
+    """(...) correlation of neighbouring residuals (..., F) over its standard deviation if white.
+
+    Residuals of 0 are those of lines left out. NaN where there are no two others.
+    """
+    first, second = residual[..., :-1], residual[..., 1:]
+    there = residual != 0
+    pairs = np.sum(there[..., :-1] & there[..., 1:], axis=-1)
+    used = np.maximum(np.sum(there, axis=-1), 1)
+    power = np.sum(residual.real**2 + residual.imag**2, axis=-1) / used
+    with np.errstate(divide="ignore", invalid="ignore"):
+        together = np.sum(first.real * second.real + first.imag * second.imag, axis=-1)
+        return np.asarray(together / (power * np.sqrt(pairs / 2)))
 
 
 def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:

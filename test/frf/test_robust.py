@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.fast import fast_frf
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FrfStatus
-from tactile_resonance.frf.robust import robust_frf
+from tactile_resonance.frf.robust import TRANSIENT_SCORE, robust_frf, transient_score
 from tactile_resonance.frf.smoothing import smoothed_frf
 from tactile_resonance.frf.spectra import averaged_spectra
 
@@ -177,3 +178,41 @@ def test_refusals(multisine):
     few = averaged_spectra(u[0], u[0], LINES[:8])
     with pytest.raises(ValueError, match="order, dof: 2, 6 need 9 excited lines, there are 8"):
         smoothed_frf(few, sample_rate_hz=1.0)
+
+
+def test_single_periods_from_rest_are_told_from_settled_ones():
+    """Realisations of one period of a resonance at 20 lines' distance of zero, damping 5 %."""
+    rng = np.random.default_rng(8)
+    n, lines = 2000, np.arange(1, 400)
+    pole = 2 * np.pi * 60 / n * (-0.05 + 1j)
+    time = np.arange(2 * n)
+    impulse = np.exp(pole * time).imag  # decays within a period
+    u = np.empty((6, 1, n))
+    for m in range(6):
+        spectrum = np.zeros(n // 2 + 1, complex)
+        spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
+        u[m, 0] = np.fft.irfft(spectrum) * n / 20
+    twice = np.tile(u[:, 0], 2)
+    response = np.fft.rfft(impulse, 4 * n)
+    y = np.fft.irfft(np.fft.rfft(twice, 4 * n) * response)[:, : 2 * n].reshape(6, 2, 1, n)
+    y = y + 0.1 * rng.standard_normal(y.shape)
+    from_rest, settled = (
+        estimate_frf(u, y[:, k], sample_rate_hz=float(n), harmonics=lines) for k in (0, 1)
+    )
+    assert from_rest.status is FrfStatus.SUSPECT
+    assert "transient" in from_rest.message
+    assert settled.status is FrfStatus.OK
+    assert "transient" not in settled.message
+
+
+def test_noise_that_differs_over_lines_is_no_transient():
+    rng = np.random.default_rng(9)
+    scores = []
+    for _ in range(2000):
+        shape = (3, 2, 60, 2)
+        each = rng.standard_normal(shape).view(complex)[..., 0] * [[1.0], [0.0]]
+        each = each * np.logspace(0, 2, 60)
+        each[:, 1] = np.exp(2j * np.pi * rng.random((3, 60)))
+        scores.append(transient_score(each, (each[:, 0] / each[:, 1]).mean(axis=0)))
+    assert np.mean(np.array(scores) > 2.33) < 0.015
+    assert np.max(scores) < TRANSIENT_SCORE

@@ -14,7 +14,8 @@ from benchmarks.poles_plant import (
     Plant,
     judge,
 )
-from tactile_resonance.identification.joint import JointPlan, identify_poles_from_records
+from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 

@@ -14,7 +14,7 @@ import rclpy
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.identification.joint import identify_poles_from_records
+from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.conversions import (
     excitation_to_message,

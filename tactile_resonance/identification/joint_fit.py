@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint estimator on the bins of a few points: coefficients, noise level, and what contradicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.covariance import invert_normal
+from tactile_resonance.identification.dense import refit_failed
+from tactile_resonance.identification.joint_layout import JointLayout
+from tactile_resonance.identification.joint_noise import BINS_PER_BAND, noise_between_harmonics
+from tactile_resonance.identification.judgement import (
+    MODEL_ERROR_PROBABILITY,
+    difference_of_halves,
+    difference_of_models,
+)
+from tactile_resonance.identification.noise_level import f_quantile
+from tactile_resonance.identification.result import SMOOTH_RESIDUAL, whiteness
+from tactile_resonance.identification.solver import Solution, minimise
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+# Of the power of the data: residuals below are rounding.
+ROUNDED = 1e-22
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Fits of a batch.
+
+    Attributes
+    ----------
+    theta : (batch, n) float
+        Coefficients [A without its last, B, C].
+    covariance : (batch, n, n) float
+        Of them, from noise.
+    condition : (batch,) float
+    converged, usable : (batch,) bool
+        Usable are points whose bins are all finite.
+    cost, expected : (batch,) float
+        Of the excited bins; NaN where the level is from the residuals themselves.
+    suspect : (batch,) bool
+        Whether cost or whiteness contradict the model.
+    noise : (batch, 2) float
+        Variance of a bin of Y and of U.
+    kind : (batch,) str
+        What the variance was taken for.
+    residual : (batch, K_e) complex
+        Weighted, on the excited bins, turned by the phase of the input.
+    systematic : (batch, places, 2, 2) float
+        What a model error moves (f0_hz, damping_ratio) by, as an outer product; 0 where there is no
+        suspicion.
+    """
+
+    theta: FloatArray
+    covariance: FloatArray
+    condition: FloatArray
+    converged: BoolArray
+    usable: BoolArray
+    cost: FloatArray
+    expected: FloatArray
+    suspect: BoolArray
+    noise: FloatArray
+    kind: npt.NDArray[np.str_]
+    residual: ComplexArray
+    systematic: FloatArray
+
+    @classmethod
+    def joined(cls, parts: list[JointFit]) -> JointFit:
+        """The batch of several."""
+        if len(parts) == 1:
+            return parts[0]
+        names = [f.name for f in fields(cls)]
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Noise level of a batch, in units of the variances weighted with; see `JointFit`."""
+
+    scale: FloatArray
+    cost: FloatArray
+    expected: FloatArray
+    suspect: BoolArray
+    noise: FloatArray
+    correction: FloatArray
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
+    """Fit of a few points.
+
+    Parameters
+    ----------
+    layout : JointLayout
+    u, y : (batch, K) complex
+        At its bins.
+    """
+    batch = u.shape[0]
+    usable = np.asarray(np.isfinite(u).all(axis=-1) & np.isfinite(y).all(axis=-1))
+    if not usable.all():
+        u, y = (np.where(usable[:, None], v, 0) for v in (u, y))
+    where = layout.excited_bins - layout.bins[0]
+    u_e, y_e = np.take(u, where, axis=1), np.take(y, where, axis=1)
+    one = np.ones((batch, 1))
+    problem = layout.problem
+    if layout.other_bins.size == 0:
+        kind = np.full(batch, "flat", "U8")
+        ratio = layout.input_noise_ratio or 0.0
+        data = [BinData(y_e, u_e, one, ratio * one if ratio else None, None)]
+        solution = minimise(problem, data)
+    else:
+        others = layout.other_bins - layout.bins[0]
+        u_o, y_o = np.take(u, others, axis=1), np.take(y, others, axis=1)
+        data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
+        rough = problem.rough(data)
+        data, noise, kind = _with_noise(layout, data, u_o, rough)
+        solution = minimise(problem, data, rough)
+    solution = refit_failed(problem, solution, data)
+    inverse, condition = invert_normal(solution.normal.sum(axis=1))
+    if layout.other_bins.size == 0:
+        level = _level_from_residuals(layout, solution)
+    else:
+        level = _level_from_others(layout, solution, inverse, noise, kind)
+    residual = _residual(layout, data[-1], solution.theta) / np.sqrt(level.scale)[:, None]
+    # what rounding leaves of exact data says nothing
+    told = level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
+    suspect = level.suspect | (told & (whiteness(residual) > SMOOTH_RESIDUAL))
+    systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
+    if suspect.any():
+        systematic[suspect] = _systematic(layout, data, solution.theta, suspect)
+    # real and imaginary part of a circular complex error have half its variance each
+    return JointFit(
+        theta=solution.theta,
+        covariance=inverse * (0.5 * level.scale * level.correction)[:, None, None],
+        condition=condition,
+        converged=solution.converged,
+        usable=usable,
+        cost=level.cost,
+        expected=level.expected,
+        suspect=suspect,
+        noise=level.noise,
+        kind=kind,
+        residual=residual,
+        systematic=systematic,
+    )
+
+
+def _level_from_residuals(layout: JointLayout, solution: Solution) -> _Level:
+    """One period: a model error hides in the level, unless the residuals are smooth."""
+    batch = solution.cost.size
+    dof = max(layout.excited_bins.size - sum(layout.problem.sizes) / 2, 0.5)
+    level = solution.cost / dof
+    ratio = layout.input_noise_ratio or 0.0
+    nothing = np.full(batch, np.nan)
+    return _Level(
+        level,
+        nothing,
+        nothing,
+        np.zeros(batch, bool),
+        np.stack([level, ratio * level], axis=-1),
+        np.full(batch, _student_variance(dof)),
+    )
+
+
+def _level_from_others(
+    layout: JointLayout,
+    solution: Solution,
+    inverse: FloatArray,
+    noise: FloatArray,
+    kind: npt.NDArray[np.str_],
+) -> _Level:
+    """The bins between harmonics tell the level, the excited ones whether the model holds."""
+    n = solution.theta.shape[-1]
+    # leverage of the others
+    used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0])
+    dof_o = layout.other_bins.size - used / 2
+    dof_e = layout.excited_bins.size - (n - used) / 2
+    level = solution.group_cost[:, 0] / dof_o
+    cost = solution.group_cost[:, 1] / level
+    expected = dof_e * dof_o / (dof_o - 1)
+    limit = dof_e * f_quantile(1 - MODEL_ERROR_PROBABILITY, 2 * dof_e, 2 * dof_o)
+    pieces = kind == "per line"
+    if pieces.any():
+        # weights from few bins: moments of F(2, 2 nu), as in `VarianceModel.cost_quantile`
+        mean = BINS_PER_BAND / (BINS_PER_BAND - 1)
+        std = mean * np.sqrt(BINS_PER_BAND / (BINS_PER_BAND - 2))
+        quantile = special.ndtri(1 - MODEL_ERROR_PROBABILITY)
+        expected = np.where(pieces, expected * mean, expected)
+        limit = np.where(pieces, dof_e * mean + np.sqrt(dof_e) * std * quantile, limit)
+    suspect = cost > limit
+    dof = dof_e + dof_o
+    pooled = solution.group_cost.sum(axis=-1) / dof
+    return _Level(
+        np.where(suspect, level, pooled),
+        cost,
+        expected,
+        suspect,
+        noise * level[:, None],
+        _student_variance(dof),
+    )
+
+
+def _student_variance(dof):
+    """Variance of Student's distribution for a level of `dof` complex degrees of freedom."""
+    return np.where(dof > 1, dof / (dof - 1), np.nan)
+
+
+def _with_noise(
+    layout: JointLayout, data: list[BinData], u_o: ComplexArray, rough: FloatArray
+) -> tuple[list[BinData], FloatArray, npt.NDArray]:
+    """Data with the noise that the bins between harmonics show, its variances, its kind."""
+    problem, others = layout.problem, data[0]
+    inverse_a, _, model, _ = problem.model(problem.groups[0], others, rough)
+    g = problem.split(rough)[1] @ layout.numerator_on_others.T * inverse_a
+    noise = noise_between_harmonics(others.y - model, u_o, g, layout.noise_bands, problem.sizes[2])
+    excited = BinData(
+        data[1].y,
+        data[1].u,
+        noise.on(layout.noise_bands.of_excited, noise.variance_y),
+        noise.on(layout.noise_bands.of_excited, noise.variance_u),
+        noise.covariance_yu,
+    )
+    y_o = others.y if noise.through_input is None else others.y - noise.through_input
+    other = BinData(y_o, None, noise.on(layout.noise_bands.of_others, noise.variance_rest))
+    return [other, excited], noise.mean_variances, noise.kind
+
+
+def _systematic(
+    layout: JointLayout, data: list[BinData], theta: FloatArray, rows: BoolArray
+) -> FloatArray:
+    """(rows, places, 2, 2) what halves of the excited bins, and one mode more, make of the poles."""
+    *other, excited = (values.rows(rows) for values in data)
+    poles = []
+    for parity in (0, 1):
+        left_out = np.arange(excited.y.shape[1]) % 2 == parity
+        half = replace(excited, variance_y=np.where(left_out, np.inf, excited.variance_y))
+        found = minimise(layout.problem, [*other, half], theta[rows]).theta
+        poles.append(layout.poles_in_band(found))
+    systematic = difference_of_halves(*poles)
+    if layout.richer is not None:
+        found = minimise(layout.richer.problem, [*other, excited]).theta
+        systematic = systematic + difference_of_models(
+            layout.poles_in_band(theta[rows]), layout.richer.poles_in_band(found)
+        )
+    return systematic
+
+
+def _power(values: ComplexArray) -> FloatArray:
+    """(batch,) mean square."""
+    return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1))
+
+
+def _residual(layout: JointLayout, excited: BinData, theta: FloatArray) -> ComplexArray:
+    """(batch, K_e) weighted residuals on the excited bins, turned by the phase of the input."""
+    _, _, y, g = layout.problem.model(layout.problem.groups[-1], excited, theta)
+    return excited.turned(excited.y - y) / np.sqrt(excited.residual_variance(g))

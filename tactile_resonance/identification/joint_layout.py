@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the joint estimator of poles and transient makes of a band before any sample is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.basis import PolynomialBasis
+from tactile_resonance.identification.bins import BinGroup
+from tactile_resonance.identification.covariance import modes_in_band
+from tactile_resonance.identification.joint_noise import NoiseBands
+from tactile_resonance.identification.joint_transient import (
+    default_transient_terms,
+    transient_basis,
+)
+from tactile_resonance.identification.judgement import richer
+from tactile_resonance.identification.model import Variable
+from tactile_resonance.identification.solver import Problem
+from tactile_resonance.identification.structure import ModelStructure
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class JointLayout:
+    """Bins, bases and groups of the joint estimator: what does not depend on the samples.
+
+    Parameters
+    ----------
+    sample_rate_hz : float
+    samples_per_period : int
+        N.
+    periods : int
+        P.
+    harmonics : (F,) int or None
+        Excited multiples of ``sample_rate_hz / samples_per_period``; those outside the band are
+        ignored. None for an input that is not periodic: then all bins count as excited, and the
+        input as free of noise.
+    band_hz : (low, high)
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+    transient_terms : int, optional
+        Coefficients of the transient's numerator. When absent those of the model's own modes and of
+        as many residual terms as suit the structure: the transients of modes outside the band are
+        smooth over it, as their responses are.
+    input_noise_ratio : float, optional
+        Variance of the noise on a bin of U over that on a bin of Y. Needed for one period only:
+        with several it is estimated.
+
+    Attributes
+    ----------
+    excited_bins, other_bins : (K_e,), (K_o,) int
+        Of the DFT of the whole record.
+    bins : (K,) int
+        All of the band, ascending.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+    """
+
+    sample_rate_hz: float
+    samples_per_period: int
+    periods: int
+    harmonics: IntArray | None
+    band_hz: tuple[float, float]
+    structure: ModelStructure = field(default_factory=ModelStructure)
+    transient_terms: int | None = None
+    input_noise_ratio: float | None = None
+    bins: IntArray = field(init=False)
+    excited_bins: IntArray = field(init=False)
+    other_bins: IntArray = field(init=False)
+    problem: Problem = field(init=False)
+    variable: Variable = field(init=False)
+    denominator_basis: PolynomialBasis = field(init=False)
+    numerator_basis: PolynomialBasis = field(init=False)
+    numerator_on_others: ComplexArray = field(init=False, repr=False)
+    noise_bands: NoiseBands = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._check()
+        samples = self.samples_per_period * self.periods
+        resolution = self.sample_rate_hz / samples
+        first = max(1, int(np.ceil(self.band_hz[0] / resolution - 1e-9)))
+        last = min((samples - 1) // 2, int(np.floor(self.band_hz[1] / resolution + 1e-9)))
+        bins = np.arange(first, last + 1)
+        excited = np.ones(bins.size, bool)
+        if self.harmonics is not None:
+            excited = np.isin(bins, np.asarray(self.harmonics) * self.periods)
+        parameters = self.structure.parameters
+        if excited.sum() <= self.structure.fewest_lines:
+            raise ValueError(
+                f"band_hz: {self.band_hz} holds {excited.sum()} excited lines, "
+                f"{parameters} parameters need more than {self.structure.fewest_lines}"
+            )
+        if self.structure.delay:
+            raise ValueError("structure: the joint estimator takes no delay")
+        frequency_hz = np.asarray(bins * resolution, float)
+        variable = Variable.for_lines(frequency_hz, self.structure)
+        x = variable.of_frequency(frequency_hz)
+        denominator = PolynomialBasis.on_lines(x, self.structure.order)
+        numerator = PolynomialBasis.on_lines(x[excited], self.structure.numerator_order)
+        terms = self.transient_terms
+        if terms is None:
+            terms = default_transient_terms(self.structure)
+        transient = transient_basis(
+            frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
+        )
+        groups = [BinGroup(denominator.values[excited], numerator.values, transient[excited])]
+        if not excited.all():
+            groups.insert(0, BinGroup(denominator.values[~excited], None, transient[~excited]))
+        fields = {
+            "transient_terms": terms,
+            "bins": bins,
+            "excited_bins": bins[excited],
+            "other_bins": bins[~excited],
+            "problem": Problem(tuple(groups)),
+            "variable": variable,
+            "denominator_basis": denominator,
+            "numerator_basis": numerator,
+            "numerator_on_others": numerator.at(x[~excited])[0],
+            "noise_bands": NoiseBands.of(bins, excited),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def richer(self) -> JointLayout | None:
+        """With one mode more; None where the band holds too few lines for it."""
+        try:
+            return JointLayout(
+                self.sample_rate_hz,
+                self.samples_per_period,
+                self.periods,
+                self.harmonics,
+                self.band_hz,
+                richer(self.structure),
+                input_noise_ratio=self.input_noise_ratio,
+            )
+        except ValueError:
+            return None
+
+    def poles_in_band(self, theta: FloatArray) -> ComplexArray:
+        """(batch, places) poles [rad/s] of coefficients (batch, n)."""
+        roots = self.denominator_basis.roots(self.problem.split(theta)[0])
+        return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
+
+    def _check(self) -> None:
+        for name in ("sample_rate_hz", "samples_per_period", "periods"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: {getattr(self, name)}, expected above 0")
+        low, high = self.band_hz
+        if not 0 <= low < high:
+            raise ValueError(f"band_hz: {self.band_hz}, expected 0 <= low < high")
+        ratio = self.input_noise_ratio
+        if ratio is not None and not ratio >= 0:
+            raise ValueError(f"input_noise_ratio: {ratio}, expected 0 or above")
+        if self.transient_terms is not None and self.transient_terms < 1:
+            raise ValueError(f"transient_terms: {self.transient_terms}, expected at least 1")
