@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 
@@ -37,6 +38,23 @@ def test_eigenvalues_satisfy_the_transcendental_equation_and_none_is_missed(mass
     dense = np.linspace(1e-3, 10 * np.pi, 20001)
     values = np.array([frequency_equation(b, mass_ratio) for b in dense])
     assert np.count_nonzero(values[1:] * values[:-1] < 0) == beta.size
+
+
+def test_modal_frequencies_are_roots_of_the_transcendental_equation(sensor):
+    """To 1e-6: the equation changes sign within that of every root, in mpmath's arithmetic."""
+    modes = sensor_modes(sensor)
+    beam = sensor.beam
+    line_mass, length = mass_per_length(beam), beam.free_length_m
+    mu = mpmath.mpf(sensor.tip.mass_kg) / (line_mass * length)
+    for natural in modes.natural_rad_s:
+        values = []
+        for factor in (1 - 1e-6, 1 + 1e-6):
+            # beta from the frequency by the beam's dispersion
+            ratio = natural * factor * np.sqrt(line_mass / modes.bending_stiffness_nm2)
+            b = mpmath.mpf(np.sqrt(ratio) * length)
+            inertia = mu * b * (mpmath.cos(b) * mpmath.sinh(b) - mpmath.sin(b) * mpmath.cosh(b))
+            values.append(1 + mpmath.cos(b) * mpmath.cosh(b) + inertia)
+        assert values[0] * values[1] < 0
 
 
 def test_forty_modes_do_not_overflow():

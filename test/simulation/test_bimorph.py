@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poles, zeros and response of the coupled sensor, and the published table of one mode."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,20 +33,36 @@ def coupled(name, bench, library):
     return bench.coupled(None if name is None else library[name])
 
 
-def test_mode_is_that_of_the_reference_table(name, coupled):
+def table_row(coupled):
+    """f0, damping ratio, pole and peak of the mode, shape (5,)."""
     mode = coupled.mode_near(250.0)
     response = coupled.frequency_response(np.linspace(200, 300, 20001))
-    found = np.array(
-        [
-            mode.f0_hz,
-            mode.damping_ratio,
-            mode.pole_rad_s.real,
-            mode.pole_rad_s.imag,
-            20 * np.log10(np.abs(response).max()),
-        ]
-    )
+    peak_db = 20 * np.log10(np.abs(response).max())
+    pole = mode.pole_rad_s
+    return np.array([mode.f0_hz, mode.damping_ratio, pole.real, pole.imag, peak_db])
+
+
+def test_mode_is_that_of_the_reference_table(name, coupled):
+    found = table_row(coupled)
     units_off = np.round(found / UNITS) - np.round(np.array(TABLE[name]) / UNITS)
     assert np.all(np.abs(units_off) <= 1), (found, TABLE[name])
+    if name is None or not name.startswith("gel"):
+        assert np.all(units_off == 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "modulus_pa"),
+    [("gel10", 18.335e3), ("gel12", 26.54e3), ("gel14", 36.54e3), ("gel16", 48.535e3)],
+)
+def test_gelatine_of_the_table_is_before_rounding_of_its_moduli(bench, library, name, modulus_pa):
+    """Why gelatine comes out up to 0.01 Hz low: the table lists its moduli to three digits.
+
+    With moduli that round to those listed, every digit of the row is found.
+    """
+    listed = library[name]
+    assert abs(modulus_pa - listed.relaxation_modulus_1s_pa) < 50
+    found = table_row(bench.coupled(replace(listed, relaxation_modulus_1s_pa=modulus_pa)))
+    np.testing.assert_array_equal(np.round(found / UNITS), np.round(np.array(TABLE[name]) / UNITS))
 
 
 def test_order_and_other_modes(name, coupled):

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import simpson, solve_ivp
+from scipy.linalg import expm
 
 from tactile_resonance.simulation.lines import Lines, sample_period
 from tactile_resonance.simulation.response import ResponseStream, free_decay, steady_state
@@ -98,15 +99,67 @@ def test_steady_state_response_is_the_analytic_one(coupled, multisine):
     np.testing.assert_allclose(spectrum, expected, rtol=1e-9)
 
 
-def test_from_rest_less_its_transient_the_response_is_the_analytic_one(coupled, multisine):
-    lines = Lines.of(multisine(6))
-    record = ResponseStream(coupled.modal).play(lines)
+def test_steady_state_is_what_a_long_time_integration_ends_in(coupled):
+    """State equations and drive as one system, stepped by its matrix exponential over 800 s."""
+    harmonics = np.array([1, 3, 4, 9])
+    lines = Lines(harmonics, np.exp(1j * harmonics) * 0.3, 50e3, 500)
+    a, b, c, d = coupled.state_space
+    n, omega = b.size, 2 * np.pi * lines.frequency_hz
+    whole = np.zeros((n + 8, n + 8))
+    whole[:n, :n] = a
+    for k, w in enumerate(omega):  # each line an oscillator (cos, -sin) of its own
+        i = n + 2 * k
+        whole[i, i + 1], whole[i + 1, i] = w, -w
+        whole[:n, i] = b
+    start = np.zeros(n + 8)
+    start[n::2], start[n + 1 :: 2] = lines.phasor_v.real, -lines.phasor_v.imag
+    step = expm(whole / 50e3)
+    state = np.linalg.matrix_power(step, 500 * 80_000) @ start
+    found = []
+    for _ in range(500):
+        found.append(c @ state[:n] + d * state[n::2].sum())
+        state = step @ state
+    expected = sample_period(lines, coupled.frequency_response(lines.frequency_hz))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("samples", [500, 5000, 20_000])
+@pytest.mark.parametrize("periods", [1, 3])
+def test_from_rest_less_its_transient_the_response_is_the_analytic_one(
+    coupled, multisine, samples, periods
+):
+    lines = Lines.of(multisine(6, samples_per_period=samples, band_hz=(20, 10e3)))
+    stream = ResponseStream(coupled.modal)
+    record = np.concatenate([stream.play(lines) for _ in range(periods)])
     transient = -steady_state(coupled.modal, lines)  # it starts at the negative steady state
     record = record - free_decay(coupled.modal, transient, record.size, 1 / 50e3)
-    ratio = (
-        np.fft.rfft(record)[lines.harmonics] / np.fft.rfft(sample_period(lines))[lines.harmonics]
-    )
+    bins = periods * lines.harmonics
+    drive_v = np.tile(sample_period(lines), periods)
+    ratio = np.fft.rfft(record)[bins] / np.fft.rfft(drive_v)[bins]
     np.testing.assert_allclose(ratio, coupled.frequency_response(lines.frequency_hz), rtol=1e-9)
+
+
+@pytest.mark.parametrize("samples", [1001, 2501])
+def test_burst_from_rest_to_rest_has_the_analytic_response_at_any_frequency(
+    coupled, multisine, samples
+):
+    """The Laplace transforms of response and burst, from their samples by Simpson's rule."""
+    rate_hz = 400e3
+    lines = Lines.of(
+        multisine(9, band_hz=(100, 600), samples_per_period=20_000, sample_rate_hz=rate_hz)
+    )
+    until = ResponseStream(coupled.modal).play(lines, samples)  # its last sample still driven
+    stream = ResponseStream(coupled.modal)
+    stream.play(lines, samples - 1)
+    after = stream.silence(400_001, rate_hz)  # 1 s
+    time = np.arange(samples + after.size - 1) / rate_hz
+    drive_v = sample_period(lines)[:samples]
+    for frequency in (130.0, 251.7, 402.3):
+        s = 20 + 2j * np.pi * frequency  # damped: what is left after 1 s counts exp(-20)
+        early, late = np.exp(-s * time[:samples]), np.exp(-s * time[samples - 1 :])
+        burst = simpson(drive_v * early, dx=1 / rate_hz)
+        answer = simpson(until * early, dx=1 / rate_hz) + simpson(after * late, dx=1 / rate_hz)
+        assert answer / burst == pytest.approx(complex(coupled.response(s)), rel=1e-6)
 
 
 def test_free_decay_equals_the_sum_of_exponentials(coupled):
