@@ -54,7 +54,7 @@ class NodeProcesses:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+                preexec_fn=end_with_parent if sys.platform == "linux" else None,
             )
 
     def bring_up(
@@ -132,7 +132,8 @@ def take_priority(priority: int) -> None:
         ) from error
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Called in a child between fork and exec: it is told to end should its parent die."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 
 READY = "simulated UR5e ready at"
+# Under the tip as the simulated robot starts, x of the scene along its beam.
+TABLE_IN_BASE = [-0.49, -0.13, 0.2, 0.0, 0.0, -1.5707963267948966]
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -48,6 +50,17 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--tissue", metavar="NAME", help="of config/tissues.yaml; puts it on the table"
     )
     bench.add_argument(
+        "--scene", type=Path, metavar="FILE", help="in its place: a scene of config/scenes"
+    )
+    bench.add_argument(
+        "--table",
+        type=float,
+        nargs=6,
+        default=TABLE_IN_BASE,
+        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
+        help="frame of the scene in the robot's base: metres and rotation vector",
+    )
+    bench.add_argument(
         "--surface-height",
         type=float,
         default=0.2,
@@ -78,7 +91,8 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.simulation.robot.machine import MachineConfig
     from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 
-    bench = None if options.tissue is None else _Bench(options)
+    nothing = options.tissue is None and options.scene is None
+    bench = None if nothing else _Bench(options)
     controller = UrController(
         ControllerConfig(MachineConfig(tip_in_flange=TIP_IN_FLANGE.vector)),
         None if bench is None else bench.tabletop.plant,
@@ -90,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     ready = f"{READY} {options.host}, control port {options.control_port}"
     if bench is not None:
         bench.attach(robot)
-        ready += f"; {options.tissue} under it, load cell: socketcand port {options.can_port}"
+        ready += f"; {options.tissue or options.scene} under it, load cell: socketcand port {options.can_port}"
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: robot.stop())
     if options.priority:
@@ -108,19 +122,28 @@ class _Bench:
     """Tissue and load cell as the options want them."""
 
     def __init__(self, options: argparse.Namespace) -> None:
+        import numpy as np
+
         from tactile_resonance.contact.interfaces import Mount
+        from tactile_resonance.contact.samples import Pose
         from tactile_resonance.simulation.library import read_tissues
         from tactile_resonance.simulation.parameters import read_sensor
-        from tactile_resonance.simulation.plant_process import BenchSetup, Tabletop
+        from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
+        from tactile_resonance.simulation.scene import read_scene
 
+        library = read_tissues()
+        laid = None
+        if options.scene is not None:
+            table = Pose.from_vector(np.array(options.table))
+            laid = LaidScene(read_scene(library, options.scene), table)
         setup = BenchSetup(
-            tissue=options.tissue,
+            tissue=options.tissue or BenchSetup.tissue,
             surface_height_m=options.surface_height,
             tilt_rad=math.radians(options.tilt),
             rigid_tip=options.rigid_tip,
             mount=Mount(options.mount),
         )
-        self.tabletop = Tabletop(setup, read_tissues(), read_sensor())
+        self.tabletop = Tabletop(setup, library, read_sensor(), laid)
         self._options = options
 
     def attach(self, robot: SimulatedRobot) -> None:
@@ -152,5 +175,7 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"control-port: {options.control_port}, expected 1024 to 65535")
     if not 0 <= options.priority <= 99:
         raise ValueError(f"priority: {options.priority}, expected 0 to 99")
+    if options.tissue is not None and options.scene is not None:
+        raise ValueError("tissue, scene: both given, expected one of them")
     if options.seed < 0:
         raise ValueError(f"seed: {options.seed}, expected at least 0")

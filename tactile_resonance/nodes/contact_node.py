@@ -23,7 +23,6 @@ from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.machine import ContactGoal, State
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
+from tactile_resonance.commands.simulate_ur import TABLE_IN_BASE
 from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.multisine import Excitation
@@ -20,18 +22,23 @@ from tactile_resonance.nodes.conversions import (
     contact_from_message,
     excitation_from_message,
     poles_to_message,
+    pose_to_message,
     record_to_message,
     time_from_message,
     truth_to_response,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Parameter, pose_of, values
+from tactile_resonance.nodes.plant_child import PlantChild
 from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM, run_node
-from tactile_resonance.record import Channel, Origin, Record
+from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
+from tactile_resonance.simulation.bimorph import CoupledBimorph
+from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.truth import truth_of
@@ -44,6 +51,19 @@ PARAMETERS = (
         "What lies on the table: a file, absolute or in the package's share folder.",
         read_only=True,
     ),
+    Parameter(
+        "robot_host",
+        "",
+        "Address 127.x.y.z at which a simulated robot with its load cell is started too; the tip is then "
+        "where that robot holds it. Empty: ideal contact wherever tcp_pose says.",
+        read_only=True,
+    ),
+    Parameter(
+        "table_in_base",
+        [*TABLE_IN_BASE],
+        "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
+        read_only=True,
+    ),
     Parameter("speed", 1.0, "Signal time over real time; 0: as fast as possible.", 0.0, 1e3),
     Parameter("seed", 1, "Seed of the simulated noise.", 1, 2**62),
     Parameter("noise", True, "Sensor noise."),
@@ -54,14 +74,64 @@ PARAMETERS = (
 
 
 ACKNOWLEDGED_WITHIN_S = 5.0
+PLANT_CHECK_S = 0.5
+LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
+
+
+@dataclass(frozen=True)
+class Tip:
+    """What the tip is in contact with.
+
+    Attributes
+    ----------
+    tissue : Tissue or None
+        None: air.
+    force_n : float
+    since_s : float
+        How long the force has been held [s].
+    creeping : bool
+        The contact grows on while it is measured; else it stays as it is after `since_s`.
+    """
+
+    tissue: Tissue | None
+    force_n: float
+    since_s: float
+    creeping: bool = False
+
+    def coupled(self, bench: SimulatedBench) -> CoupledBimorph:
+        """The linear sensor on it."""
+        return bench.coupled(self.tissue, force_n=self.force_n or None, hold_time_s=self.since_s)
+
+    def start(
+        self, bench: SimulatedBench, duration_s: float, seed: int, effects: BenchEffects
+    ) -> BenchRun:
+        """A run from rest, the tissue creeping meanwhile; the nonlinearity takes the contact as fixed."""
+        if self.tissue is None or not self.creeping or effects.nonlinearity:
+            return bench.start(
+                self.tissue,
+                force_n=self.force_n or None,
+                hold_time_s=self.since_s,
+                seed=seed,
+                effects=effects,
+            )
+        history = ContactHistory.under_force(
+            self.tissue,
+            bench.sensor.tip.radius_m,
+            bench.contact,
+            force_n=self.force_n,
+            since_s=self.since_s,
+            duration_s=duration_s,
+        )
+        return bench.start_varying(history, seed=seed, effects=effects)
 
 
 class FakeHardwareNode(ManagedNode):
     """Serves `bench/play`, `bench/stop` and `bench/get_truth`, hands out `bench/block`.
 
-    The tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there is tissue: the
-    force comes back on `wrench`, and what the simulation knows of the poles on `bench/truth` (latched, all
-    modes), both with the stamp of the pose they belong to.
+    Without a robot the tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there
+    is tissue; the force comes back on `wrench`. With one the tip is where the robot holds it, and the
+    contact that of the plant as an excitation begins: its force held from then on, the tissue creeping.
+    What the simulation knows of the poles is on `bench/truth` (latched, all modes).
     """
 
     def __init__(self) -> None:
@@ -73,14 +143,24 @@ class FakeHardwareNode(ManagedNode):
         """Read the scene and make the sensor."""
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
-        self._scene = read_scene(read_tissues(), path if path.is_absolute() else share_path(scene))
+        scene_path = path if path.is_absolute() else share_path(scene)
+        self._scene = read_scene(read_tissues(), scene_path)
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
-        self._tissue: Tissue | None = None
+        self._tip = Tip(None, 0.0, 1.0)
+        self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self._truth = self.publish_on(msg.Poles, "bench/truth", LATCHED)
-        self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-        self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        host, table, seed = values(self, "robot_host", "table_in_base", "seed")
+        if host:
+            pose = pose_of(table, "table_in_base")
+            self._laid = LaidScene(self._scene, pose)
+            self._plant = PlantChild(host, scene_path, table, seed)
+            self.resources.callback(self._plant.close)
+            self.every(PLANT_CHECK_S, self._check_plant)
+        else:
+            self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
+            self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.serve(Play, "bench/play", self._on_play)
         self.serve(Trigger, "bench/stop", self._on_stop)
         self.serve(Truth, "bench/get_truth", self._on_truth)
@@ -95,15 +175,18 @@ class FakeHardwareNode(ManagedNode):
             return
         self._pose = message
         position = message.pose.position
-        self._tissue = self._scene.tissue_at((position.x, position.y, position.z))
-        force_n = self._force_n()
+        tissue = self._scene.tissue_at((position.x, position.y, position.z))
+        self._tip = Tip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
         wrench = WrenchStamped()
         wrench.header.stamp = message.header.stamp
         wrench.header.frame_id = self._frame_id
-        wrench.wrench.force.z = force_n
+        wrench.wrench.force.z = self._tip.force_n
         self._wrench.publish(wrench)
-        run = self._bench.start(self._tissue, force_n=force_n or None)
-        modes = run.truth().modes
+        self._publish_truth(message)
+
+    def _publish_truth(self, pose: PoseStamped) -> None:
+        tip = self._tip
+        modes = truth_of(tip.coupled(self._bench), ()).modes
         truth = Poles(
             poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
             f0_hz=np.array([mode.f0_hz for mode in modes]),
@@ -114,17 +197,33 @@ class FakeHardwareNode(ManagedNode):
             message="exact poles of the simulated sensor on this tissue",
         )
         origin = Origin(
-            time_ns=time_from_message(message.header.stamp),
+            time_ns=time_from_message(pose.header.stamp),
             final=True,
             frame_id=self._frame_id,
-            label=self._tissue.name if self._tissue else "air",
+            label=tip.tissue.name if tip.tissue else "air",
             simulated=True,
-            contact=contact_from_message(message, force_n, 0.0),
+            contact=contact_from_message(pose, tip.force_n, 0.0),
         )
         self._truth.publish(poles_to_message(truth, origin))
 
-    def _force_n(self) -> float:
-        return self._scene.force_n if self._tissue else 0.0
+    def _check_plant(self) -> None:
+        if self._plant is not None and not self._plant.alive:
+            self.fail("the simulated robot has ended; starting it anew")
+
+    def _take_up_contact(self) -> None:
+        """With a robot: the contact as it is now, and its truth; raises ValueError."""
+        if self._plant is None:
+            return
+        try:
+            true = self._plant.truth()
+        except OSError as error:
+            raise ValueError(f"the simulated robot does not answer: {error}") from error
+        touching = true.force_n > 0
+        tissue = self._laid.tissue_at(true.tip_m) if touching else None
+        self._tip = Tip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
+        x, y, z = true.tip_m.tolist()
+        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=time.time_ns())
+        self._publish_truth(pose_to_message(place))
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         if not self.active:
@@ -144,11 +243,12 @@ class FakeHardwareNode(ManagedNode):
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
-            run = self._bench.start(
-                self._tissue,
-                force_n=self._force_n() or None,
-                seed=int(entropy.generate_state(1, np.uint64)[0]),
-                effects=effects,
+            self._take_up_contact()
+            run = self._tip.start(
+                self._bench,
+                excitation.periods * excitation.period_s,
+                int(entropy.generate_state(1, np.uint64)[0]),
+                effects,
             )
         except ValueError as error:
             response.message = str(error)
@@ -173,15 +273,19 @@ class FakeHardwareNode(ManagedNode):
         if not self.active:
             response.message = f"fake_hardware_node is {self.state_name()}"
             return response
-        tissue, place = self._tissue, request.position
+        place = request.position
         try:
-            if not request.here:
+            if request.here:
+                self._take_up_contact()
+                tip = self._tip
+            else:
                 tissue = self._scene.tissue_at((place.x, place.y, place.z))
-            coupled = self._bench.coupled(
-                tissue,
-                force_n=request.force_n or self._scene.force_n,
-                hold_time_s=request.hold_time_s or 1.0,
-            )
+                tip = Tip(tissue, self._scene.force_n, 1.0)
+            coupled = replace(
+                tip,
+                force_n=request.force_n or tip.force_n,
+                since_s=request.hold_time_s or tip.since_s,
+            ).coupled(self._bench)
             truth_to_response(truth_of(coupled, request.frequency_hz), response)
         except ValueError as error:
             response.message = str(error)

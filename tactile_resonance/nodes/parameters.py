@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -13,6 +14,8 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.node import Node
+
+from tactile_resonance.contact.samples import Pose
 
 
 @dataclass(frozen=True)
@@ -78,3 +81,11 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> None:
 def values(node: Node, *names: str) -> tuple:
     """Present values of several parameters."""
     return tuple(node.get_parameter(name).value for name in names)
+
+
+def pose_of(values: list[float], name: str) -> Pose:
+    """Pose of a parameter of six numbers."""
+    vector = np.array(values, dtype=float)
+    if vector.shape != (6,) or not np.all(np.isfinite(vector)):
+        raise ValueError(f"{name}: {list(values)}, expected 6 numbers")
+    return Pose.from_vector(vector)

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
@@ -215,9 +214,7 @@ class NodeHands:
             check()
             time.sleep(POLL_S)
 
-    def _send(
-        self, client: ActionClient, goal: Any, name: str, check: Check
-    ) -> ClientGoalHandle:
+    def _send(self, client: ActionClient, goal: Any, name: str, check: Check) -> ClientGoalHandle:
         """Goal that was accepted; waits for a node that is being brought back."""
         deadline = time.monotonic() + NODE_BACK_WITHIN_S
         while time.monotonic() < deadline:
@@ -259,11 +256,3 @@ class NodeHands:
         while not future.done() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         return future.done()
-
-
-def pose_of(values: list[float], name: str) -> Pose:
-    """Pose of a parameter of six numbers."""
-    vector = np.array(values, dtype=float)
-    if vector.shape != (6,) or not np.all(np.isfinite(vector)):
-        raise ValueError(f"{name}: {list(values)}, expected 6 numbers")
-    return Pose.from_vector(vector)

@@ -22,9 +22,9 @@ from tactile_resonance.action import Scan
 from tactile_resonance.configuration import PACKAGE_NAME, share_path
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import run_node
-from tactile_resonance.nodes.scan_hands import NodeHands, pose_of
+from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.scan.plan import Plan, make_plan
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
@@ -219,14 +219,16 @@ class ScanNode(ManagedNode):
             "name": scene.name,
             "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "seed": seed,
-            "versions": {name: _version(name) for name in (PACKAGE_NAME, "numpy", "scipy", "rosbags")},
+            "versions": {
+                name: _version(name) for name in (PACKAGE_NAME, "numpy", "scipy", "rosbags")
+            },
             "parameters": {
-                name: list(value) if isinstance(value, (list, tuple)) or hasattr(value, "tolist") else value
+                name: list(value)
+                if isinstance(value, (list, tuple)) or hasattr(value, "tolist")
+                else value
                 for name, value in parameters.items()
             },
-            "skipped": [
-                {"what": s.what, "why": s.why, "saved_s": s.saved_s} for s in plan.skipped
-            ],
+            "skipped": [{"what": s.what, "why": s.why, "saved_s": s.saved_s} for s in plan.skipped],
             "shortest_s": plan.shortest_s,
             "longest_s": plan.longest_s,
         }
@@ -254,7 +256,9 @@ def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
         place, turn = pose.position, pose.orientation
         quaternion = (turn.x, turn.y, turn.z, turn.w)
         if not 0.99 < math.hypot(*quaternion) < 1.01:
-            raise ValueError(f"poses[{index}]: orientation {quaternion}, expected a unit quaternion")
+            raise ValueError(
+                f"poses[{index}]: orientation {quaternion}, expected a unit quaternion"
+            )
         normal = Rotation.from_quat(quaternion).apply([0.0, 0.0, 1.0])
         points.append(
             ScanPoint(
@@ -286,10 +290,17 @@ def _feedback(progress: Progress) -> Scan.Feedback:
     feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
     poles = progress.poles
     if poles is not None and poles.f0_hz.size:
-        feedback.f0_hz, feedback.damping_ratio = float(poles.f0_hz[0]), float(poles.damping_ratio[0])
-        covariance = poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        feedback.f0_hz, feedback.damping_ratio = (
+            float(poles.f0_hz[0]),
+            float(poles.damping_ratio[0]),
+        )
+        covariance = (
+            poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        )
         if covariance is not None:
-            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(np.diag(covariance[0])).tolist()
+            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(
+                np.diag(covariance[0])
+            ).tolist()
     return feedback
 
 

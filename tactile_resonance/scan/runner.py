@@ -73,8 +73,10 @@ class Measured:
 
 
 class Hands(Protocol):
-    """Robot and sensor, as a scan uses them. All raise `PointFailed`, or `ScanEnded` where no other
-    point would fare better; while they wait they call `check`, which may raise `Interrupted`.
+    """Robot and sensor, as a scan uses them.
+
+    All raise `PointFailed`, or `ScanEnded` where no other point would fare better; while they wait they
+    call `check`, which may raise `Interrupted`.
     """
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
@@ -293,7 +295,9 @@ class ScanRunner:
                 outcome, reason = Outcome.FAILED, str(error)
             except Interrupted:
                 request = self._controls.take()
-                if request is not Request.SKIP:  # cancelled or to be repeated: nothing is kept of it
+                if (
+                    request is not Request.SKIP
+                ):  # cancelled or to be repeated: nothing is kept of it
                     self._hands.retract()
                     return
                 outcome, reason = Outcome.SKIPPED, "skipped on request"
@@ -367,7 +371,9 @@ class ScanRunner:
 
     def _with_poles(self, result: PointResult, poles: Poles) -> PointResult:
         pole = poles.poles_rad_s[0]
-        covariance = poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        covariance = (
+            poles.total_covariance if poles.total_covariance is not None else poles.covariance
+        )
         spread = np.full((2, 2), np.nan) if covariance is None else covariance[0]
         result = replace(
             result,

@@ -156,6 +156,12 @@ class Plant:
         Whether the tissue pushes on the ball.
     touches : int
         How often contact has begun.
+    contact_s : float
+        How long this contact has lasted [s]; 0 out of contact.
+    tip_m : (3,) array
+        Place of the frame `tip` in the base [m].
+    normal_force_n : float
+        True force along the normal [N], compression positive.
     """
 
     def __init__(
@@ -179,6 +185,9 @@ class Plant:
         self.depth_m = 0.0
         self.in_contact = False
         self.touches = 0
+        self.contact_s = 0.0
+        self.tip_m = np.zeros(3)
+        self.normal_force_n = 0.0
         self._tip = tip
         self._on: TipOnTissue | None = None
         self._site: FloatArray | None = None  # where the tissue was last asked for
@@ -210,6 +219,8 @@ class Plant:
         touching = pushed > 0
         self.touches += touching and not self.in_contact
         self.in_contact = touching
+        self.contact_s = self.contact_s + dt_s if touching else 0.0
+        self.tip_m, self.normal_force_n = place, pushed
         way = np.zeros(3) if before is None else place - before.position_m
         along = self._friction(way, normal, pushed)
         self.force_n = pushed * normal + along

@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
@@ -19,8 +20,11 @@ from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.socketcand import SocketcandServer
 from tactile_resonance.simulation.tissue import Tissue
+
+FloatArray = NDArray[np.float64]
 
 TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
 """Where the tip sits: 0.12 m before the flange, its z against the flange's."""
@@ -58,6 +62,34 @@ class BenchSetup:
         require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
 
 
+@dataclass(frozen=True)
+class LaidScene:
+    """A scene on the table: its surface, at height 0, and what lies where.
+
+    Attributes
+    ----------
+    scene : PhantomScene
+    table : Pose
+        Frame of the scene in the robot's base.
+    """
+
+    scene: PhantomScene
+    table: Pose
+
+    def surface(self) -> Plane:
+        """The undisturbed surface in the base."""
+        return Plane(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+
+    def on_table(self, position_m: FloatArray) -> FloatArray:
+        """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
+        place = self.table.rotation.inv().apply(position_m - self.table.position_m)
+        return np.array([place[0], place[1], 0.0])
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        """What the tip touches under a place (3,) in the base."""
+        return self.scene.tissue_at(self.on_table(position_m))
+
+
 class Tabletop:
     """The plant with what can be exchanged on it while it runs.
 
@@ -67,9 +99,16 @@ class Tabletop:
         What the controller's tool touches.
     """
 
-    def __init__(self, setup: BenchSetup, library: TissueLibrary, sensor: SensorParameters) -> None:
+    def __init__(
+        self,
+        setup: BenchSetup,
+        library: TissueLibrary,
+        sensor: SensorParameters,
+        laid: LaidScene | None = None,
+    ) -> None:
         self._library = library
         self._tissue: Tissue | None = library[setup.tissue]
+        self._scene = laid
         modes, radius_m = sensor_modes(sensor), sensor.tip.radius_m
 
         def tip(tissue: Tissue) -> TipOnTissue:
@@ -81,8 +120,10 @@ class Tabletop:
             )
 
         self.plant = Plant(
-            Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
-            lambda _: self._tissue,
+            laid.surface()
+            if laid
+            else Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
+            self._tissue_at,
             tip,
             tip_radius_m=radius_m,
             mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
@@ -102,14 +143,21 @@ class Tabletop:
         """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
         name = fields.get("name")
         self._tissue = None if name is None else self._library[str(name)]
+        self._scene = None
         return {}
+
+    def _tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        return self._tissue if self._scene is None else self._scene.tissue_at(position_m)
 
     def truth(self, _: dict) -> dict:
         """Control port: what no instrument tells."""
         plant = self.plant
         return {
             "time_s": plant.time_s,
+            "tip_m": plant.tip_m.tolist(),
             "force_n": plant.force_n.tolist(),
+            "normal_force_n": plant.normal_force_n,
+            "contact_s": plant.contact_s,
             "depth_m": plant.depth_m,
             "in_contact": plant.in_contact,
             "touches": plant.touches,

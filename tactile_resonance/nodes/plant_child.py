@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated robot with tissue and load cell, as a process that ends with its owner."""
+
+from __future__ import annotations
+
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.commands.simulate_ur import READY
+from tactile_resonance.processes import end_with_parent
+from tactile_resonance.simulation.robot.control_port import order
+
+START_WITHIN_S = 30.0
+END_WITHIN_S = 3.0
+
+
+@dataclass(frozen=True)
+class TrueContact:
+    """What the plant knows of the tip at one moment.
+
+    Attributes
+    ----------
+    tip_m : (3,) array
+        In the robot's base.
+    force_n : float
+        Along the normal; 0 out of contact.
+    since_s : float
+        How long the contact has lasted.
+    """
+
+    tip_m: NDArray[np.float64]
+    force_n: float
+    since_s: float
+
+
+class PlantChild:
+    """Starts `tactile_resonance simulate-ur` and asks it for the truth.
+
+    Parameters
+    ----------
+    host : str
+        Address of the robot, 127.x.y.z.
+    scene : Path
+    table_in_base : six numbers
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If it does not come up; with what it printed.
+    """
+
+    def __init__(self, host: str, scene: Path, table_in_base: Sequence[float], seed: int) -> None:
+        self._host = host
+        self._process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
+                *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
+                *(str(float(value)) for value in table_in_base),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        )
+        assert self._process.stdout is not None
+        deadline = time.monotonic() + START_WITHIN_S
+        said = []
+        while time.monotonic() < deadline:
+            ready, _, _ = select.select([self._process.stdout], [], [], 0.1)
+            line = self._process.stdout.readline() if ready else ""
+            if line.startswith(READY):
+                return
+            if line.strip():
+                said.append(line.strip())
+            elif self._process.poll() is not None:
+                break
+        self.close()
+        raise ValueError(
+            f"robot_host: no simulated robot at {host}: {' '.join(said) or 'no output'}"
+        )
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    def truth(self) -> TrueContact:
+        """What is true now.
+
+        Raises
+        ------
+        OSError
+            If the plant does not answer.
+        """
+        answer = order(self._host, "truth", timeout_s=1.0)
+        return TrueContact(
+            np.array(answer["tip_m"]), float(answer["normal_force_n"]), float(answer["contact_s"])
+        )
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        try:
+            self._process.wait(END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
