@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,11 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController, ContactGoal, State
+from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
 from tactile_resonance.simulation.parameters import read_sensor
@@ -30,6 +33,14 @@ from tactile_resonance.simulation.virtual import (
 
 FORCE_N, POISSON_RATIO, RELAXATION = 0.01, 0.49, 0.6
 TOOL_KG = 0.03
+TOOL = {
+    "carried_kg": TOOL_KG,
+    "cell_noise_n": 1.6e-3,
+    "acceleration_m_s2": 0.3,
+    "approach_speed_m_s": 3e-3,
+}
+"""A tool on the cell: its inertia is known, it shakes with the robot, and it is started gently."""
+
 DEEPEST_M = 4.5e-3
 """The softest tissue creeps deeper than the default limit allows, and the beam bends."""
 
@@ -122,11 +133,15 @@ class Rig:
             seed=case.seed,
         )
         self.arm = VirtualArm(self.bench)
-        self.cell = VirtualCell(
-            self.bench, CellParameters(noise_rms_n=setup.noise_n), seed=case.seed
-        )
+        parameters = replace(CellParameters.from_yaml(), force_noise_rms_n=setup.noise_n)
+        self.cell = VirtualCell(self.bench, parameters, seed=case.seed)
+        payload = None
+        if setup.mount is Mount.TOOL:  # the cell's frame lies in the frame tip
+            payload = Payload(TOOL_KG, np.array(centre))
+        frame = self.plant.mounting.frame
+        self.force = TipForce(self.cell, Mounting(setup.mount, frame, payload), self.arm.state)
         self.arm.connect()
-        self.cell.start()
+        self.force.start()
         self.force_n: list[float] = []
         self.bench.on_step.append(lambda: self.force_n.append(float(self.plant.force_n[2])))
 
@@ -158,10 +173,10 @@ def run_controller(
     if parameters is None:
         parameters = ContactParameters(
             beam_stiffness_n_per_m=MODES.static_stiffness_n_per_m if setup.beam else 0.0,
-            carried_kg=TOOL_KG if setup.mount is Mount.TOOL else 0.0,
+            **(TOOL if setup.mount is Mount.TOOL else {}),
         )
     controller = ContactController(parameters, Limits(depth_m=DEEPEST_M))
-    loop = ContactLoop(rig.arm, rig.cell, rig.bench, controller, listener)
+    loop = ContactLoop(rig.arm, rig.force, rig.bench, controller, listener)
     loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
