@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,20 +16,22 @@ from tactile_resonance.contact.machine import ContactController, ContactGoal, St
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
+from tactile_resonance.simulation.plant import Plane
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
-from tactile_resonance.simulation.virtual import (
-    CellParameters,
-    VirtualArm,
-    VirtualBench,
-    VirtualCell,
-)
+from tactile_resonance.simulation.transducer import CellParameters
 
-FORCE_N, POISSON_RATIO, RELAXATION = 0.01, 0.49, 0.6
-TOOL_KG = 0.03
+FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03
+TOOL = {
+    "carried_kg": TOOL_KG,
+    "cell_noise_n": 1.6e-3,
+    "acceleration_m_s2": 0.3,
+    "approach_speed_m_s": 3e-3,
+}
+"""A tool on the cell: its inertia is known, it shakes with the robot, and it is started gently."""
+
 DEEPEST_M = 4.5e-3
 """The softest tissue creeps deeper than the default limit allows, and the beam bends."""
 
@@ -81,8 +83,9 @@ class Outcome:
         Share of the force: largest force until 1 s after ready; mean over that second.
     bounces : int
     cause : str
-    stated_std : float
-        Stated standard deviation of the mean force, as a share; NaN for simple laws.
+    stated_std, stated_error : float
+        Stated standard deviation of the mean force, as a share, and the error of the stated mean in
+        such deviations; NaN for simple laws.
     """
 
     ready_s: float
@@ -90,60 +93,53 @@ class Outcome:
     mean_error: float
     bounces: int
     cause: str
-    stated_std: float
+    stated_std: float = np.nan
+    stated_error: float = np.nan
 
 
 class Rig:
-    """Bench, arm and cell of one case, and the record of its true force."""
+    """Bench of one case, and the record of its true force."""
 
     def __init__(self, case: Case, setup: Setup) -> None:
-        radius = case.radius_m
-
-        def tip(tissue: Tissue) -> TipOnTissue:
-            ball = Indenter(tissue, tip_radius_m=radius, poisson_ratio=POISSON_RATIO)
-            return SprungIndenter.on_beam(ball, MODES) if setup.beam else RigidTip(ball)
-
-        tissue = case.tissue()
-        carried = TOOL_KG if setup.mount is Mount.TOOL else 0.2
-        centre = [-0.03, 0, 0.01] if setup.mount is Mount.TOOL else [0, 0, -0.01]
-        self.plant = Plant(
+        self.touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], case.radius_m)
+        bench = self.bench = ContactBench(
+            case.tissue(),
             Plane.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
-            lambda _: tissue,
-            tip,
-            tip_radius_m=radius,
-            mounting=CellMounting(setup.mount, carried_kg=carried, centre_m=np.array(centre)),
-        )
-        self.touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], radius)
-        start = Pose(self.touch.position_m + [0, 0, 3e-3], self.touch.rotation_rad)
-        self.bench = VirtualBench(
-            self.plant,
-            start,
+            Pose(self.touch.position_m + [0, 0, STANDOFF_M], self.touch.rotation_rad),
+            tip=Tip(case.radius_m, MODES if setup.beam else None),
+            mount=setup.mount,
+            tool_kg=TOOL_KG,
             tracking=TrackingParameters(jitter_rms_m=setup.jitter_m),
+            cell_parameters=replace(CellParameters.from_yaml(), force_noise_rms_n=setup.noise_n),
             seed=case.seed,
         )
-        self.arm = VirtualArm(self.bench)
-        self.cell = VirtualCell(
-            self.bench, CellParameters(noise_rms_n=setup.noise_n), seed=case.seed
-        )
-        self.arm.connect()
-        self.cell.start()
         self.force_n: list[float] = []
-        self.bench.on_step.append(lambda: self.force_n.append(float(self.plant.force_n[2])))
+        bench.clock.on_step.append(lambda: self.force_n.append(float(bench.plant.force_n[2])))
 
-    def outcome(self, ready_n: int | None, cause: str, stated_std: float) -> Outcome:
-        """Judge the record; `ready_n` periods after the start the contact was called ready."""
-        force, dt = np.array(self.force_n), self.bench.motion.period_s
+    def outcome(
+        self, ready_n: int | None, cause: str, stated: tuple[float, float] | None = None
+    ) -> Outcome:
+        """Judge the record; `ready_n` periods after the start the contact was called ready.
+
+        `stated` is the mean force over the second after that, and its deviation, as reported.
+        """
+        force, dt = np.array(self.force_n), self.bench.clock.motion.period_s
         touched = int(np.argmax(force > 0)) if (force > 0).any() else 0
         if ready_n is None:
-            return Outcome(np.inf, force.max() / FORCE_N - 1, np.nan, 0, cause, stated_std)
+            return Outcome(np.inf, force.max() / FORCE_N - 1, np.nan, 0, cause)
         second = force[ready_n : ready_n + round(1 / dt)]
+        mean = float(second.mean())
+        std, error = np.nan, np.nan
+        if stated is not None:
+            std, error = stated[1] / FORCE_N, (stated[0] - mean) / stated[1]
         return Outcome(
             ready_s=(ready_n - touched) * dt,
             overshoot=force[: ready_n + round(1 / dt)].max() / FORCE_N - 1,
-            mean_error=abs(second.mean() / FORCE_N - 1),
-            bounces=self.plant.touches - 1,
+            mean_error=abs(mean / FORCE_N - 1),
+            bounces=self.bench.plant.touches - 1,
             cause=cause,
-            stated_std=stated_std,
+            stated_std=std,
+            stated_error=error,
         )
 
 
@@ -155,18 +151,21 @@ def run_controller(
 ) -> Outcome:
     """Run our controller, told what is on the robot but nothing of the tissue."""
     rig = Rig(case, setup)
+    bench = rig.bench
     if parameters is None:
         parameters = ContactParameters(
             beam_stiffness_n_per_m=MODES.static_stiffness_n_per_m if setup.beam else 0.0,
-            carried_kg=TOOL_KG if setup.mount is Mount.TOOL else 0.0,
+            **(TOOL if setup.mount is Mount.TOOL else {}),
         )
     controller = ContactController(parameters, Limits(depth_m=DEEPEST_M))
-    loop = ContactLoop(rig.arm, rig.cell, rig.bench, controller, listener)
+    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller, listener)
     loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
     loop.run_while(lambda: controller.state is State.HOLD, 1.0)
     result = controller.result
     assert result is not None
-    std = np.nan if result.force_std_n is None else result.force_std_n / FORCE_N
-    return rig.outcome(ready, result.cause.value, std)
+    stated = None
+    if ready is not None and result.force_n is not None and result.force_std_n is not None:
+        stated = result.force_n, result.force_std_n
+    return rig.outcome(ready, result.cause.value, stated)

@@ -114,7 +114,7 @@ class ContactLoop:
             fault = fault or error
         try:
             wrenches = self._force.read()
-        except ForceError as error:
+        except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
         command = self.controller.step(now, arm, wrenches, fault)
         try:

@@ -327,7 +327,7 @@ class ContactController:
     def _taring(self, now_ns: int, arm: ArmSample) -> FloatArray | None:
         speed = float(np.linalg.norm(arm.tip_velocity[:3]))
         observer = self._observer
-        if observer.tare is None:
+        if not observer.taring:
             if speed > STILL_M_S:
                 self._still_ns = -1
             elif self._still_ns < 0:

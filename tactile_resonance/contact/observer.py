@@ -11,12 +11,15 @@ from tactile_resonance.contact.arm_model import ArmModel
 from tactile_resonance.contact.estimator import ContactFilter, TouchDetector
 from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import ContactParameters
-from tactile_resonance.contact.result import Breach
+from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.contact.tare import Tare
+from tactile_resonance.contact.tare import TareError, TareLimits, tare
 
 WINDOW_SAMPLES = 60
 """Forces kept for the first estimate of the contact: 120 ms at 500 Hz."""
+
+LEAST_NOISE_N = 2e-5
+"""The filter takes a force for no more certain than this [N]."""
 
 LONGEST_GUESS_S = 0.02
 """So far beyond the newest state of the arm its height is continued [s]."""
@@ -31,8 +34,8 @@ class Observer:
     arm_model : ArmModel
     model : ContactFilter or None
         From the touch on.
-    tare : Tare or None
-        While one is taken.
+    taring : bool
+        Whether forces are collected for a tare.
     noise_n, bias_std_n : float
         Of one force and of the bias, from the last tare [N].
     """
@@ -44,7 +47,8 @@ class Observer:
             dead_time_s=p.arm_dead_time_s, lag_s=p.arm_lag_s, period_s=p.period_s
         )
         self.model: ContactFilter | None = None
-        self.tare: Tare | None = None
+        self.taring = False
+        self._unloaded: list[WrenchSample] = []
         self.noise_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
         self._accelerations: deque[tuple[int, float]] = deque(maxlen=50)  # middle of period, m/s2
@@ -55,18 +59,23 @@ class Observer:
 
     def begin_tare(self) -> None:
         """Collect forces for the bias from now on."""
-        self.tare = Tare(self._parameters.tare_noise_n)
+        self.taring = True
+        self._unloaded.clear()
 
     def end_tare(self) -> Breach | None:
         """Take the bias and look for the touch from now on; what is wrong with it is returned."""
-        tare, self.tare = self.tare, None
-        assert tare is not None
-        breach = tare.judge()
-        if breach is None:
-            self.watch.set_bias(tare.bias_n)
-            self.noise_n, self.bias_std_n = tare.noise_n, tare.bias_std_n
-            self.seek_touch()
-        return breach
+        self.taring = False
+        p = self._parameters
+        limits = TareLimits(p.cell_noise_n, std_n=p.tare_std_n, drift_n_per_s=p.tare_drift_n_per_s)
+        try:
+            zero = tare(self._unloaded, limits)
+        except TareError as error:
+            return Breach(Cause.TARE, str(error))
+        self.watch.set_bias(zero.force_n)
+        self.noise_n = max(LEAST_NOISE_N, float(zero.noise_rms_n[2]))
+        self.bias_std_n = float(zero.force_std_n[2])
+        self.seek_touch()
+        return None
 
     def seek_touch(self) -> None:
         """Forget the contact and look for a touch."""
@@ -101,8 +110,8 @@ class Observer:
             breach = self.watch.add(sample, inertia)
             if breach is not None:
                 return breach
-            if self.tare is not None:
-                self.tare.add(sample.force_n)
+            if self.taring:
+                self._unloaded.append(sample)
                 continue
             height = _between(self._heights, sample.time_ns, self.arm_model.speed_m_s)
             force = float(self.watch.force_n[2])

@@ -27,7 +27,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "search_m": (0.0, 0.02),
     "early_m": (0.0, 0.02),
     "tare_s": (0.05, 5.0),
-    "tare_noise_n": (1e-5, 1.0),
+    "tare_std_n": (1e-6, 1.0),
+    "tare_drift_n_per_s": (1e-6, 10.0),
+    "cell_noise_n": (1e-5, 1.0),
     "tolerance": (0.005, 0.5),
     "settle_s": (0.0, 2.0),
     "time_constant_s": (0.01, 1.0),
@@ -60,8 +62,11 @@ class ContactParameters:
         Height above the expected surface where the approach begins [m].
     search_m, early_m : float
         How far below or above its place the surface may be found [m].
-    tare_s, tare_noise_n : float
-        Length of the tare [s]; noise above which it is refused [N rms].
+    tare_s, tare_std_n, tare_drift_n_per_s : float
+        Length of the tare [s]; uncertainty [N] and drift [N/s] of the zero with which it is refused.
+    cell_noise_n : float
+        Of one force as the source states it, the shaking of a tool on it included [N rms]; with
+        half as much again the tare is refused.
     tolerance : float
         Error of the force at which the contact is ready, as a share of the force.
     settle_s : float
@@ -92,7 +97,9 @@ class ContactParameters:
     search_m: float = 2e-3
     early_m: float = 2e-3
     tare_s: float = 0.4
-    tare_noise_n: float = 3e-3
+    tare_std_n: float = 3e-4
+    tare_drift_n_per_s: float = 2e-3
+    cell_noise_n: float = 1e-3
     tolerance: float = 0.05
     settle_s: float = 0.05
     time_constant_s: float = 0.03

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.indenter import Indenter
@@ -27,8 +28,6 @@ FloatArray = NDArray[np.float64]
 
 NEAR_M = 0.005
 """Below this height the tip is stepped on its tissue: a beam that swings before it touches."""
-
-GRAVITY_M_S2 = np.array([0.0, 0.0, -9.80665])  # standard gravity, in the robot's base
 
 
 class Surface(Protocol):

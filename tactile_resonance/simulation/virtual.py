@@ -7,9 +7,7 @@ it takes to compute.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +18,16 @@ from tactile_resonance.contact.interfaces import (
     ForceError,
     ForceFault,
     ForceInfo,
-    Mount,
 )
-from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
-from tactile_resonance.simulation.fields import require
-from tactile_resonance.simulation.plant import GRAVITY_M_S2, Plant
+from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
+from tactile_resonance.simulation.plant import Plant
 from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
+from tactile_resonance.simulation.transducer import (
+    NO_NUMBER,
+    CellFaults,
+    CellParameters,
+    Transducer,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -223,84 +225,47 @@ class VirtualArm:
             raise ArmError(fault, f"simulated fault: {fault.value}")
 
 
-@dataclass(frozen=True)
-class CellParameters:
-    """What the simulated load cell adds to the true wrench.
-
-    Attributes
-    ----------
-    noise_rms_n, resolution_n, range_n : float
-        White noise of one force, smallest step, largest force [N].
-    noise_rms_nm : float
-        White noise of one torque [N m].
-    bias_n : tuple of three float
-        What it shows without load [N].
-    delay_s : float
-        From the measurement to its arrival [s].
-    """
-
-    noise_rms_n: float = 1e-3
-    resolution_n: float = 2e-4
-    range_n: float = 2.0
-    noise_rms_nm: float = 2e-5
-    bias_n: tuple[float, ...] = (0.05, -0.03, 0.12)
-    delay_s: float = 0.001
-
-    def __post_init__(self) -> None:
-        for name in ("noise_rms_n", "resolution_n", "noise_rms_nm", "delay_s"):
-            value = getattr(self, name)
-            require(0 <= value < math.inf, name, value, "a number, 0 or above")
-        require(0 < self.range_n < math.inf, "range_n", self.range_n, "a number above 0")
-        require(len(self.bias_n) == 3, "bias_n", self.bias_n, "three numbers")
-
-
-@dataclass
-class CellFaults:
-    """What is wrong with the cell now; exchange the fields at any time.
-
-    Attributes
-    ----------
-    error : ForceFault or None
-        Raised by `read`, as the driver of a real cell does when it finds a fault.
-    silent, stuck, invalid, overload : bool
-        No samples; the last one again and again; no numbers; beyond the range.
-    sign : float
-        -1: flipped.
-    bias_n : (3,) array
-        Added to the force [N].
-    lose : int
-        Of the next samples so many are lost.
-    """
-
-    error: ForceFault | None = None
-    silent: bool = False
-    stuck: bool = False
-    invalid: bool = False
-    overload: bool = False
-    sign: float = 1.0
-    bias_n: FloatArray = field(default_factory=lambda: np.zeros(3))
-    lose: int = 0
-
-
 class VirtualCell:
-    """A `ForceSource` on the bench: one wrench per period of the robot, weight taken away.
+    """A `Cell` on the bench: one wrench per period of the robot.
 
-    The inertia of a tool beyond a tool-mounted cell stays in what it shows.
+    With `TipForce` around it, it is a `ForceSource`.
+
+    Parameters
+    ----------
+    bench : VirtualBench
+    parameters : CellParameters, optional
+        By default those of ``config/load_cells/fine.yaml``.
+    delay_s : float
+        From a measurement to its arrival [s].
+    seed : int
 
     Attributes
     ----------
     faults : CellFaults
+        Of the cell itself.
+    error : ForceFault or None
+        What `read` and `start` raise, as the driver of a cell does that finds a fault.
     """
 
     def __init__(
-        self, bench: VirtualBench, parameters: CellParameters | None = None, *, seed: int = 0
+        self,
+        bench: VirtualBench,
+        parameters: CellParameters | None = None,
+        *,
+        delay_s: float = 0.001,
+        seed: int = 0,
     ) -> None:
-        self.faults = CellFaults()
+        self.error: ForceFault | None = None
         self._bench = bench
-        self._parameters = parameters or CellParameters()
-        self._rng = np.random.default_rng([seed, 1])
-        self._waiting: list[WrenchSample] = []
-        self._last: WrenchSample | None = None
+        self._parameters = CellParameters.from_yaml() if parameters is None else parameters
+        self._transducer = Transducer(self._parameters, seed)
+        self.faults: CellFaults = self._transducer.faults
+        self._scale = np.repeat(
+            [1 / self._parameters.force_divisor, 1 / self._parameters.torque_divisor], 3
+        )
+        self._delay_ns = round(1e9 * delay_s)
+        self._waiting: list[CellSample] = []
+        self._count = 0
         bench.on_step.append(self._measure)
 
     @property
@@ -308,25 +273,23 @@ class VirtualCell:
         """What it can do."""
         p = self._parameters
         return ForceInfo(
-            name="simulated load cell",
+            name=p.name,
             rate_hz=1 / self._bench.motion.period_s,
-            noise_rms_n=p.noise_rms_n,
-            resolution_n=p.resolution_n,
-            range_n=p.range_n,
+            noise_rms_n=p.force_noise_rms_n,
+            resolution_n=1 / p.force_divisor,
+            range_n=p.force_range_n,
             mount=self._bench.plant.mounting.mount,
         )
 
     def start(self) -> None:
         """Begin to stream anew."""
-        if self.faults.error is not None:
-            raise ForceError(self.faults.error, f"simulated fault: {self.faults.error.value}")
+        self._raise_if_broken()
         self._waiting.clear()
 
-    def read(self) -> list[WrenchSample]:
+    def read(self) -> list[CellSample]:
         """Wrenches that have arrived since the last call."""
-        if self.faults.error is not None:
-            raise ForceError(self.faults.error, f"simulated fault: {self.faults.error.value}")
-        until = self._bench.time_ns - round(1e9 * self._parameters.delay_s)
+        self._raise_if_broken()
+        until = self._bench.time_ns - self._delay_ns
         count = sum(sample.time_ns <= until for sample in self._waiting)
         arrived, self._waiting = self._waiting[:count], self._waiting[count:]
         return arrived
@@ -335,52 +298,16 @@ class VirtualCell:
         """Stop to stream."""
         self._waiting.clear()
 
+    def _raise_if_broken(self) -> None:
+        if self.error is not None:
+            raise ForceError(self.error, f"simulated fault: {self.error.value}")
+
     def _measure(self) -> None:
-        faults = self.faults
-        noise = self._rng.standard_normal(6)
-        if faults.silent:
+        counts, bits = self._transducer.convert(np.concatenate(self._bench.plant.wrench_at_cell()))
+        self._count += 1
+        every = self.faults.lose_second_every
+        if self.faults.silent or (every and self._count % every == 0):
             return
-        if faults.lose > 0:
-            faults.lose -= 1
-            return
-        time_ns = self._bench.time_ns
-        if faults.stuck and self._last is not None:
-            last = self._last
-            self._waiting.append(WrenchSample(time_ns, last.force_n, last.torque_nm))
-            return
-        self._last = self._sample(time_ns, noise)
-        self._waiting.append(self._last)
-
-    def _sample(self, time_ns: int, noise: FloatArray) -> WrenchSample:
-        p, plant, faults = self._parameters, self._bench.plant, self.faults
-        force, torque = plant.wrench_at_cell()
-        force = force + np.asarray(p.bias_n) + p.noise_rms_n * noise[:3]
-        if p.resolution_n > 0:
-            force = np.round(force / p.resolution_n) * p.resolution_n
-        torque = torque + p.noise_rms_nm * noise[3:]
-        overload = faults.overload or bool(np.abs(force).max() > p.range_n)
-        force = np.clip(force, -p.range_n, p.range_n)
-        force, torque = self._at_tip(force, torque)
-        force = faults.sign * force + faults.bias_n
-        if faults.invalid:
-            force = np.full(3, np.nan)
-        return WrenchSample(time_ns, force, torque, overload)
-
-    def _at_tip(self, force: FloatArray, torque: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From the cell's frame to the frame `tip`, without the weight the cell carries."""
-        plant = self._bench.plant
-        mounting, pose = plant.mounting, self._bench.motion.reported
-        turn = pose.rotation
-        if mounting.mount is Mount.TABLE:
-            cell, origin, centre, sign = (
-                mounting.frame.rotation, mounting.frame.position_m, mounting.centre_m, -1.0,
-            )  # fmt: skip
-        else:
-            cell, sign = turn * mounting.frame.rotation, 1.0
-            origin = pose.position_m + turn.apply(mounting.frame.position_m)
-            centre = pose.position_m + turn.apply(mounting.centre_m)
-        weight = mounting.carried_kg * GRAVITY_M_S2
-        force = sign * (cell.apply(force) - weight)
-        torque = sign * (cell.apply(torque) - np.cross(centre - origin, weight))
-        torque = torque - np.cross(pose.position_m - origin, force)
-        return turn.inv().apply(force), turn.inv().apply(torque)
+        wrench = self._scale * counts
+        wrench[np.equal(counts, NO_NUMBER)] = np.nan
+        self._waiting.append(CellSample(self._bench.time_ns, wrench, bits != 0))
