@@ -37,7 +37,7 @@ def movej(target: Target, goal: FloatArray, acceleration: float, speed: float) -
     """
     _require_positive("movej", acceleration=acceleration, speed=speed)
     yield from stopj(target, acceleration)
-    start = target.q
+    start, goal = target.q, np.array(goal, dtype=float)
     difference = goal - start
     length = float(np.abs(difference).max())
     if length == 0.0:

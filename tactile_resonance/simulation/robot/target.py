@@ -109,8 +109,8 @@ class Target:
             self.brake(self.limits.brake_rad_s2)
         self.qdd = (self.qd - self._cycle_qd) / CYCLE_S
 
-    def command(self, q: FloatArray, qd: FloatArray) -> None:
-        """Set target angles and speeds (6,) for this cycle.
+    def command(self, q: FloatArray, qd: FloatArray, frames: FloatArray | None = None) -> None:
+        """Set target angles and speeds (6,) for this cycle; `frames` where they are known.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Target:
             raise ScriptError("another thread is already controlling the robot")
         self._check(q, qd, (q - self.q) / CYCLE_S)
         self.commanded = True
-        self._set(q, qd)
+        self._set(q, qd, frames)
 
     def command_tool(self, tool: FloatArray, twist: FloatArray) -> None:
         """Set the target TCP (4, 4) and its twist (6,) for this cycle; raises as `command`."""
@@ -134,7 +134,7 @@ class Target:
             qd = np.linalg.solve(jacobian(frames, point[:3]), twist).astype(float, copy=False)
         except np.linalg.LinAlgError:
             raise ProtectiveStop("the path leads through a singularity") from None
-        self.command(q, qd)
+        self.command(q, qd, frames)
 
     def shift(self, shift_m: FloatArray, turn_rad: FloatArray) -> None:
         """Move the target TCP aside by a compliance, beside what the program commands."""
@@ -186,6 +186,6 @@ class Target:
                     f"above its limit of {limits.joint_speed_rad_s:.2f} rad/s"
                 )
 
-    def _set(self, q: FloatArray, qd: FloatArray) -> None:
+    def _set(self, q: FloatArray, qd: FloatArray, frames: FloatArray | None = None) -> None:
         self.q, self.qd = q, qd
-        self.frames = link_frames(q)
+        self.frames = link_frames(q) if frames is None else frames
