@@ -98,6 +98,9 @@ class ArmSample:
         Powered, in normal safety mode and its program running.
     message : str
         Why it may not move; empty where it may.
+    tool_wrench : (6,) array or None
+        What the robot's own sensor says the environment exerts on the tip, force [N] and torque about
+        it [N m], along the axes of the base; None where it has no such sensor.
     """
 
     time_ns: int
@@ -106,3 +109,4 @@ class ArmSample:
     tip_velocity: NDArray[np.float64]
     moving_allowed: bool = True
     message: str = ""
+    tool_wrench: NDArray[np.float64] | None = None
