@@ -19,6 +19,8 @@ from tactile_resonance.simulation.fields import require
 
 FloatArray = npt.NDArray[np.float64]
 LEAST_POINTS = 5
+# Length and size are fitted to so many points, evenly picked: the cost grows with the third power.
+FIT_POINTS = 100
 # Of the variance of the process; below it neighbours are too much alike to invert their covariance.
 _JITTER = 1e-10
 
@@ -105,6 +107,8 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
     if scale == 0:
         return KrigedSurface(xy, y, noise, extent, 0.0, float(y[0]))
     # starts over the lengths that the points can tell: a likelihood may have several maxima
+    picked = np.unique(np.linspace(0, len(y) - 1, min(len(y), FIT_POINTS)).astype(int))
+    picked_distances = distances[np.ix_(picked, picked)]
     nearest = float(np.median(apart.min(axis=1)))
     lowest, highest = np.log(0.3 * nearest), np.log(10 * extent)
     best = min(
@@ -112,7 +116,7 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
             minimize(
                 _cost,
                 np.array([start, np.log(scale)]),
-                args=(distances, y, noise),
+                args=(picked_distances, y[picked], noise[picked]),
                 method="L-BFGS-B",
                 bounds=[(lowest, highest), (np.log(1e-4 * scale), np.log(100 * scale))],
             )

@@ -18,6 +18,7 @@ from tactile_resonance.nodes import (
     fake_hardware_node,
     frf_node,
     manager_node,
+    pole_map_node,
     poles_node,
 )
 from tactile_resonance.processes import free_domain_id
@@ -28,6 +29,7 @@ NODES = {
     "poles_node": poles_node.PolesNode,
     "fake_hardware_node": fake_hardware_node.FakeHardwareNode,
     "manager_node": manager_node.ManagerNode,
+    "pole_map_node": pole_map_node.PoleMapNode,
 }
 DECLARED = {
     "excitation_node": excitation_node.PARAMETERS,
@@ -35,6 +37,7 @@ DECLARED = {
     "poles_node": poles_node.PARAMETERS,
     "fake_hardware_node": fake_hardware_node.PARAMETERS,
     "manager_node": manager_node.PARAMETERS,
+    "pole_map_node": pole_map_node.PARAMETERS,
 }
 
 

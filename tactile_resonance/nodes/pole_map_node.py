@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles -> map for rviz."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from tactile_resonance import msg
+from tactile_resonance.nodes.conversions import poles_from_message
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.pole_map_messages import (
+    cloud_message,
+    header_message,
+    legend_message,
+    marker_message,
+    surface_message,
+)
+from tactile_resonance.nodes.running import LATCHED, RESULTS, run_node
+from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, map_point
+from tactile_resonance.tissue.classify import TissueClass
+from tactile_resonance.tissue.references import read_classes
+
+PARAMETERS = (
+    Parameter(
+        "frame_id",
+        "",
+        "Frame of the map; poles in another one are left out. Empty: that of the first poles.",
+        read_only=True,
+    ),
+    Parameter(
+        "classes_file",
+        "",
+        "YAML file with tissue_classes, a scene for example; empty: no tissue is called.",
+        read_only=True,
+    ),
+    Parameter(
+        "unknown_level",
+        0.01,
+        "A pole farther from every class than this share of its members is unknown.",
+        1e-9,
+        0.5,
+    ),
+    Parameter(
+        "ellipse_probability",
+        0.95,
+        "How often an ellipse holds the true pole.",
+        0.1,
+        0.9999,
+    ),
+    Parameter(
+        "ellipse_m_per_hz",
+        0.0,
+        "Length of 1 Hz of f0 in an ellipse [m]; 0: as fits the map.",
+        0.0,
+        1e3,
+    ),
+    Parameter(
+        "ellipse_m_per_damping",
+        0.0,
+        "Length of 1 of the damping ratio in an ellipse [m]; 0: as fits the map.",
+        0.0,
+        1e6,
+    ),
+    Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
+)
+
+# Poles may come faster than anybody looks.
+PUBLISH_PERIOD_S = 0.2
+
+
+class PoleMapNode(ManagedNode):
+    """Keeps the latest poles of every place, and shows them to whoever looks.
+
+    `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses and failures), `pole_map/legend` and
+    `pole_map/surface` (PointCloud2) are latched; each is made when there is something new and somebody
+    subscribed, at the latest when somebody does.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("pole_map_node", PARAMETERS)
+
+    def configure(self) -> None:
+        """Topics, classes and an empty map."""
+        (self._frame_id, classes_file) = values(self, "frame_id", "classes_file")
+        self._classes: tuple[TissueClass, ...] = ()
+        if classes_file:
+            self._classes = read_classes(Path(classes_file))
+        self._map = PoleMap()
+        self._left_out = 0
+        kinds = {"": PointCloud2, "/markers": MarkerArray}
+        kinds |= {"/legend": MarkerArray, "/surface": PointCloud2}
+        self._publishers_of = {
+            name: self.publish_on(kind, f"pole_map{name}", LATCHED) for name, kind in kinds.items()
+        }
+        self._old: set[str] = set()  # outputs that show less than is known
+        self.listen(msg.Poles, "poles", self._on_poles, RESULTS)
+        self.serve(Trigger, "pole_map/clear", self._on_clear)
+        self.every(PUBLISH_PERIOD_S, self._publish)
+
+    def details(self) -> Mapping[str, str]:
+        """For the diagnostics."""
+        return {
+            "points": str(len(self._map.estimated)),
+            "failures": str(len(self._map.failures)),
+            "left out": str(self._left_out),
+        }
+
+    def _on_poles(self, message: msg.Poles) -> None:
+        try:
+            poles, origin = poles_from_message(message)
+            (level,) = values(self, "unknown_level")
+            point = map_point(poles, origin, self._classes, level)
+            frame_id = origin.contact.frame_id
+            if not self._frame_id:
+                self._frame_id = frame_id
+            if frame_id != self._frame_id:
+                raise ValueError(
+                    f"frame of tip_pose: got {frame_id!r}; accepted is {self._frame_id!r}"
+                )
+        except ValueError as error:
+            self._left_out += 1
+            self.health.error(f"poles of measurement {message.measurement_id}: {error}")
+            return
+        self._map = self._map.with_point(point)
+        self._old = set(self._publishers_of)
+
+    def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = f"{len(self._map.points)} points cleared"
+        response.success = True
+        self._map = PoleMap()
+        self._old = set(self._publishers_of)
+        return response
+
+    def _publish(self) -> None:
+        wanted = {
+            name for name in self._old if self._publishers_of[name].get_subscription_count() > 0
+        }
+        if not wanted:
+            return
+        (probability, cells) = values(self, "ellipse_probability", "surface_cells")
+        header = header_message(self._frame_id, self.get_clock().now().to_msg())
+        scale = self._scale(probability)
+        names = tuple(tissue.name for tissue in self._classes)
+        makers: dict[str, Callable[[], PointCloud2 | MarkerArray]] = {
+            "": lambda: cloud_message(self._map, names, header),
+            "/markers": lambda: marker_message(self._map, scale, probability, header),
+            "/legend": lambda: legend_message(self._map, scale, probability, names, header),
+            "/surface": lambda: surface_message(self._map.surface(cells), header),
+        }
+        for name in wanted:
+            self._publishers_of[name].publish(makers[name]())
+            self._old.discard(name)
+
+    def _scale(self, probability: float) -> EllipseScale:
+        m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
+        fitting = self._map.ellipse_scale(probability)
+        return EllipseScale(m_per_hz or fitting.m_per_hz, m_per_damping or fitting.m_per_damping)
+
+
+def main() -> None:
+    """Console script."""
+    run_node(PoleMapNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map: poles over the places where they were measured, with uncertainty and tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import griddata
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.record import Origin
+from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
+from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
+
+FloatArray = npt.NDArray[np.float64]
+SAME_PLACE_M = 1e-4
+_SEGMENTS = 36  # of an ellipse
+
+
+@dataclass(frozen=True, eq=False)
+class MapPoint:
+    """One place of the map.
+
+    Attributes
+    ----------
+    position_m : (3,) float
+        Of the tip [m].
+    normal : (3,) float
+        Outward normal: the tip's +z.
+    estimate : (2,) float
+        f0 [Hz] and damping ratio; NaN where the point failed.
+    covariance : (2, 2) float
+        Of the estimate, total where known, else from noise; NaN where neither is.
+    force_n : float
+    tissue_class : str
+        Empty where no classes are given.
+    tissue_probability : float
+    status : PolesStatus
+    reason : str
+        Why there is no estimate, or why it is to be used with care.
+    label : str
+    measurement_id : int
+    simulated : bool
+    """
+
+    position_m: FloatArray
+    normal: FloatArray
+    estimate: FloatArray
+    covariance: FloatArray
+    force_n: float = float("nan")
+    tissue_class: str = ""
+    tissue_probability: float = float("nan")
+    status: PolesStatus = PolesStatus.OK
+    reason: str = ""
+    label: str = ""
+    measurement_id: int = 0
+    simulated: bool = False
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no pole."""
+        return bool(np.isnan(self.estimate[0]))
+
+    @property
+    def std(self) -> FloatArray:
+        """(2,) of f0 [Hz] and damping ratio."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def map_point(
+    poles: Poles, origin: Origin, classes: Sequence[TissueClass] = (), unknown_level: float = 0.01
+) -> MapPoint:
+    """Point of identified poles; of several modes the one with the highest peak.
+
+    Raises
+    ------
+    ValueError
+        If it is not known where the tip was.
+    """
+    contact = origin.contact
+    if contact.position_m is None:
+        raise ValueError(
+            f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
+        )
+    estimate, covariance = np.full(2, np.nan), np.full((2, 2), np.nan)
+    if poles.f0_hz.size:
+        # height of a mode's peak: |residue| / |Re pole|
+        k = int(np.argmax(np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)))
+        estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
+        for known in (poles.covariance, poles.total_covariance):
+            if known is not None and np.all(np.isfinite(known[k])):
+                covariance = known[k]
+    name, probability = "", float("nan")
+    if classes and np.isfinite(estimate[0]):
+        call = classify(estimate, covariance, classes, unknown_level)
+        name, probability = call.name, call.probability
+    return MapPoint(
+        position_m=np.array(contact.position_m),
+        normal=Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2],
+        estimate=estimate,
+        covariance=covariance,
+        force_n=contact.force_n,
+        tissue_class=name,
+        tissue_probability=probability,
+        status=poles.status,
+        reason=poles.message,
+        label=origin.label,
+        measurement_id=origin.measurement_id,
+        simulated=origin.simulated,
+    )
+
+
+def point_of_result(result: PointResult) -> MapPoint:
+    """Point of a finished scan point, from a run."""
+    failed = result.outcome is not Outcome.DONE or np.isnan(result.f0_hz)
+    names = {status.value: status for status in PolesStatus}
+    return MapPoint(
+        position_m=result.position_m,
+        normal=np.array([result.normal_x, result.normal_y, result.normal_z]),
+        estimate=np.full(2, np.nan) if failed else result.estimate,
+        covariance=result.covariance,
+        force_n=result.force_n,
+        tissue_class=result.tissue_class,
+        tissue_probability=result.tissue_probability,
+        status=PolesStatus.FAILED if failed else names.get(result.poles_status, PolesStatus.OK),
+        reason=result.reason,
+        label=result.label,
+        measurement_id=result.measurement_id,
+        simulated=result.simulated,
+    )
+
+
+@dataclass(frozen=True)
+class EllipseScale:
+    """How long a deviation of the pole is drawn in space."""
+
+    m_per_hz: float
+    m_per_damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class MapSurface:
+    """Natural frequency between the points.
+
+    Attributes
+    ----------
+    position_m : (r, c, 3) float
+    f0_hz, f0_std_hz : (r, c) float
+    """
+
+    position_m: FloatArray
+    f0_hz: FloatArray
+    f0_std_hz: FloatArray
+
+
+@dataclass(frozen=True)
+class PoleMap:
+    """All points, each place once."""
+
+    points: tuple[MapPoint, ...] = ()
+
+    def with_point(self, point: MapPoint) -> PoleMap:
+        """The same with one point more; it replaces what its own measurement or place had before."""
+        kept = tuple(
+            p
+            for p in self.points
+            if p.measurement_id != point.measurement_id
+            and np.linalg.norm(p.position_m - point.position_m) > SAME_PLACE_M
+        )
+        return replace(self, points=(*kept, point))
+
+    @cached_property
+    def estimated(self) -> tuple[MapPoint, ...]:
+        """Points with a pole."""
+        return tuple(point for point in self.points if not point.failed)
+
+    @cached_property
+    def failures(self) -> tuple[MapPoint, ...]:
+        """Points without."""
+        return tuple(point for point in self.points if point.failed)
+
+    @cached_property
+    def f0_hz(self) -> FloatArray:
+        """(n,) of the points with a pole [Hz]."""
+        return np.array([point.estimate[0] for point in self.estimated])
+
+    @cached_property
+    def positions_m(self) -> FloatArray:
+        """(n, 3) of all points [m]."""
+        return np.array([point.position_m for point in self.points]).reshape(-1, 3)
+
+    @cached_property
+    def spacing_m(self) -> float:
+        """Typical distance to the next point [m]; NaN with fewer than two points."""
+        if len(self.points) < 2:
+            return float("nan")
+        distances, _ = cKDTree(self.positions_m).query(self.positions_m, k=2)
+        return float(np.median(distances[:, 1]))
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any point is from a simulation."""
+        return any(point.simulated for point in self.points)
+
+    def classes(self) -> tuple[str, ...]:
+        """Tissue classes that were called, by name, `UNKNOWN` last."""
+        names = {point.tissue_class for point in self.estimated if point.tissue_class}
+        return tuple(sorted(names, key=lambda name: (name == UNKNOWN, name)))
+
+    def ellipse_scale(self, probability: float = 0.95) -> EllipseScale:
+        """Scale at which nine of ten ellipses stay within 0.4 of the spacing, rounded to 1, 2 or 5."""
+        stds = np.array([p.std for p in self.estimated if np.all(np.isfinite(p.std))])
+        spacing_m = self.spacing_m if np.isfinite(self.spacing_m) else 0.005
+        if not len(stds):
+            return EllipseScale(spacing_m, spacing_m)
+        largest = _radius(probability) * np.quantile(stds, 0.9, axis=0)
+        wanted = 0.4 * spacing_m / np.maximum(largest, 1e-12)
+        return EllipseScale(_round_down(wanted[0]), _round_down(wanted[1]))
+
+    def ellipses(self, scale: EllipseScale, probability: float = 0.95) -> FloatArray:
+        """(e, segments, 2, 3) lines of the ellipse of each point with a covariance [m].
+
+        A pole's plane is not space: the ellipse is drawn about the point in the plane that touches the
+        surface, deviations of f0 along the frame's x axis (its projection), those of the damping ratio
+        across it, at the scale given. Points come in the order of `estimated`; those without a covariance
+        are left out.
+        """
+        angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+        circle = _radius(probability) * np.stack(
+            [np.cos(angle), np.sin(angle)]
+        )  # (2, segments + 1)
+        stretch = np.array([scale.m_per_hz, scale.m_per_damping])
+        lines = []
+        for point in self.with_ellipse:
+            covariance = point.covariance * np.outer(stretch, stretch)
+            values, vectors = np.linalg.eigh(covariance)
+            flat = vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
+            loop = point.position_m + flat.T @ tangent_axes(point.normal)  # (segments + 1, 3)
+            lines.append(np.stack([loop[:-1], loop[1:]], axis=1))
+        return np.array(lines).reshape(-1, _SEGMENTS, 2, 3)
+
+    @cached_property
+    def with_ellipse(self) -> tuple[MapPoint, ...]:
+        """Points with a pole and its covariance."""
+        return tuple(p for p in self.estimated if np.all(np.isfinite(p.covariance)))
+
+    def krige(self) -> KrigedSurface | None:
+        """Natural frequency over x, y; None with too few points with a covariance to tell."""
+        points = self.with_ellipse
+        if len(points) < LEAST_POINTS:
+            return None
+        xy = np.array([p.position_m[:2] for p in points])
+        if np.linalg.matrix_rank(xy - xy.mean(axis=0), tol=SAME_PLACE_M) < 2:
+            return None  # on one line: nothing is known beside it
+        return krige(xy, [p.estimate[0] for p in points], [p.std[0] for p in points])
+
+    def surface(self, cells: int = 40) -> MapSurface | None:
+        """Kriged natural frequency on a grid over the points, `cells` along its longer side."""
+        kriged = self.krige()
+        if kriged is None:
+            return None
+        low, high = kriged.xy_m.min(axis=0), kriged.xy_m.max(axis=0)
+        step = float(np.max(high - low)) / cells
+        x, y = (np.arange(low[k], high[k] + 1e-9 + step / 2, step) for k in range(2))
+        xy = np.stack(np.meshgrid(x, y), axis=-1)  # (r, c, 2)
+        value, std = kriged.predict(xy)
+        heights = np.array([p.position_m[2] for p in self.with_ellipse])
+        z = griddata(kriged.xy_m, heights, xy, method="linear")
+        z = np.where(np.isnan(z), griddata(kriged.xy_m, heights, xy, method="nearest"), z)
+        return MapSurface(np.concatenate([xy, z[..., None]], axis=-1), value, std)
+
+
+def tangent_axes(normal: FloatArray) -> FloatArray:
+    """(2, 3) axes of the plane across a normal (3,): the projection of x, and across it."""
+    if not np.all(np.isfinite(normal)):
+        normal = np.array([0.0, 0.0, 1.0])
+    start = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
+    first = start - (start @ normal) * normal
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+def _radius(probability: float) -> float:
+    """Of the ellipse that holds the truth with this probability, in standard deviations."""
+    return float(np.sqrt(-2 * np.log1p(-probability)))  # chi-square, two degrees of freedom
+
+
+def _round_down(value: float) -> float:
+    """Largest 1, 2 or 5 times a power of ten that is not above."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)))

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map: which mode, which place, and where its ellipses lie."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.plan import tip_orientation
+from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.pole_map import (
+    EllipseScale,
+    MapPoint,
+    PoleMap,
+    map_point,
+    point_of_result,
+)
+from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
+
+COVARIANCE = np.array([[0.02**2, 0.5 * 0.02 * 8e-5], [0.5 * 0.02 * 8e-5, 8e-5**2]])
+SOFT = TissueClass("soft", np.array([250.0, 0.03]), np.diag([0.5**2, 0.001**2]))
+FIRM = TissueClass("firm", np.array([256.0, 0.036]), np.diag([0.5**2, 0.001**2]))
+
+
+def poles(f0_hz=(250.0,), residues=None, total=None, **values):
+    f0 = np.array(f0_hz)
+    damping = np.full(f0.size, 0.03)
+    w = 2 * np.pi * f0
+    return Poles(
+        poles_rad_s=-damping * w + 1j * w * np.sqrt(1 - damping**2),
+        f0_hz=f0,
+        damping_ratio=damping,
+        residues=np.ones(f0.size, complex) if residues is None else np.array(residues, complex),
+        covariance=np.tile(COVARIANCE, (f0.size, 1, 1)),
+        total_covariance=total,
+        **{"status": PolesStatus.OK, **values},
+    )
+
+
+def origin(x=0.0, y=0.0, z=0.0, key=1, normal=(0.0, 0.0, 1.0)):
+    turn = tuple(tip_orientation(np.array(normal) / np.linalg.norm(normal), 0.3))
+    contact = Contact(0.0101, 1e-4, (x, y, z), turn, "table", 5)
+    return Origin(measurement_id=key, label="here", contact=contact)
+
+
+def grid_map(count=5, spacing=0.004, f0=lambda x, y: 250 + 300 * x, **values):
+    result = PoleMap()
+    for i in range(count):
+        for j in range(count):
+            x, y = spacing * i, spacing * j
+            point = map_point(poles((f0(x, y),), **values), origin(x, y, key=1 + count * i + j))
+            result = result.with_point(point)
+    return result
+
+
+def test_a_point_takes_the_strongest_mode_and_the_fullest_covariance():
+    two = poles((240.0, 260.0), residues=(1.0, -3.0j))
+    assert map_point(two, origin()).estimate[0] == 260.0
+    total = 4 * np.tile(COVARIANCE, (1, 1, 1))
+    np.testing.assert_array_equal(map_point(poles(total=total), origin()).covariance, total[0])
+    unknown = np.full((1, 2, 2), np.nan)
+    np.testing.assert_array_equal(map_point(poles(total=unknown), origin()).covariance, COVARIANCE)
+
+
+def test_tissue_is_called_where_there_are_classes():
+    called = [map_point(poles((f0,)), origin(), (SOFT, FIRM)).tissue_class for f0 in (250.2, 262.0)]
+    assert called == ["soft", UNKNOWN]
+    assert map_point(poles(), origin()).tissue_class == ""
+
+
+def test_each_place_once_whatever_comes():
+    block_1 = map_point(poles((250.0,)), origin(key=7))
+    block_2 = map_point(poles((250.5,)), origin(x=0.00002, key=7))
+    repeated = map_point(poles((251.0,)), origin(y=0.00005, key=8))
+    elsewhere = map_point(poles((252.0,)), origin(x=0.004, key=9))
+    found = PoleMap().with_point(block_1).with_point(block_2)
+    assert [p.estimate[0] for p in found.points] == [250.5]
+    found = found.with_point(repeated).with_point(elsewhere)
+    assert [p.estimate[0] for p in found.points] == [251.0, 252.0]
+
+
+def test_no_pose_is_refused_and_no_pole_is_a_failure():
+    with pytest.raises(ValueError, match="tip_pose of measurement 3: got none"):
+        map_point(poles(), Origin(measurement_id=3))
+    failed = map_point(Poles(status=PolesStatus.NO_RESONANCE, message="none in band"), origin())
+    found = grid_map(2).with_point(replace(failed, measurement_id=99, position_m=np.ones(3)))
+    assert failed.failed
+    assert (len(found.estimated), len(found.failures)) == (4, 1)
+    assert found.failures[0].reason == "none in band"
+    assert np.isfinite(found.f0_hz).all()
+
+
+def test_ellipses_hold_what_they_say_in_the_plane_of_the_surface():
+    normal = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    point = map_point(poles(), origin(0.01, 0.02, 0.03, normal=normal))
+    found = PoleMap((point,))
+    scale = EllipseScale(0.1, 20.0)
+    (lines,) = found.ellipses(scale, 0.95)
+    assert lines.shape == (36, 2, 3)
+    np.testing.assert_allclose(lines[1:, 0], lines[:-1, 1])  # closed, without gaps
+    np.testing.assert_allclose(lines[0, 0], lines[-1, 1], atol=1e-12)
+    offset = lines[:, 0] - point.position_m
+    np.testing.assert_allclose(offset @ normal, 0, atol=1e-12)
+    along = np.array([1, 0, 0]) - normal[0] * normal
+    along /= np.linalg.norm(along)
+    pole = np.stack([offset @ along / 0.1, offset @ np.cross(normal, along) / 20.0], axis=1)
+    distance2 = np.einsum("si,ij,sj->s", pole, np.linalg.inv(COVARIANCE), pole)
+    np.testing.assert_allclose(distance2, chi2.ppf(0.95, 2))
+
+
+def test_the_scale_keeps_ellipses_apart_in_round_numbers():
+    found = grid_map()
+    scale = found.ellipse_scale()
+    reach = np.abs(found.ellipses(scale)[..., :2] - found.positions_m[:, None, None, :2])
+    assert 0.1 * 0.004 < reach.max() <= 0.4 * 0.004
+    for value in (scale.m_per_hz, scale.m_per_damping):
+        assert f"{value:.0e}"[0] in "125"
+        assert float(f"{value:.0e}") == pytest.approx(value)
+    # one point that is far less certain does not make the others invisible
+    wild = replace(found.points[0], covariance=1e4 * COVARIANCE)
+    assert PoleMap((wild, *found.points[1:])).ellipse_scale() == scale
+    # and one point alone, or none with a covariance, has a scale too
+    assert PoleMap(found.points[:1]).ellipse_scale().m_per_hz > 0
+    bare = MapPoint(
+        np.zeros(3), np.array([0, 0, 1.0]), np.array([250, 0.03]), np.full((2, 2), np.nan)
+    )
+    assert PoleMap((bare,)).ellipse_scale().m_per_hz > 0
+    assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
+
+
+def test_surface_follows_the_points_and_their_plane():
+    found = grid_map(f0=lambda x, y: 250 + 300 * x - 100 * y)
+    surface = found.surface(16)
+    x, y, z = np.moveaxis(surface.position_m, -1, 0)
+    assert x.min() == 0
+    assert x.max() == pytest.approx(0.016)
+    np.testing.assert_array_equal(z, 0)
+    error = surface.f0_hz - (250 + 300 * x - 100 * y)
+    assert np.max(np.abs(error)) < 0.05
+    assert surface.f0_std_hz.max() < 0.2
+    assert grid_map(2).surface() is None  # too few
+    line = PoleMap(tuple(p for p in found.points if p.position_m[1] == 0))
+    assert line.surface() is None  # on one line
+
+
+def test_a_run_s_results_make_the_same_point():
+    point = map_point(poles(), origin(0.01, 0.02))
+    result = PointResult(
+        0,
+        x_m=0.01,
+        y_m=0.02,
+        z_m=0.0,
+        normal_x=0.0,
+        normal_y=0.0,
+        normal_z=1.0,
+        f0_hz=250.0,
+        damping_ratio=0.03,
+        f0_std_hz=0.02,
+        damping_ratio_std=8e-5,
+        f0_damping_covariance_hz=COVARIANCE[0, 1],
+        poles_status="model error",
+    )
+    again = point_of_result(result)
+    np.testing.assert_allclose(again.covariance, point.covariance)
+    np.testing.assert_allclose(again.position_m, point.position_m)
+    assert again.status is PolesStatus.MODEL_ERROR
+    failed = point_of_result(replace(result, outcome=Outcome.FAILED, reason="contact lost"))
+    assert failed.failed
+    assert failed.reason == "contact lost"
