@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.identification.noise_level import FALSE_ALARM, KINDS, model_variance
+from tactile_resonance.identification.noise_level import FALSE_ALARM, KINDS, is_flat, model_variance
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -155,9 +155,9 @@ def _pieces(values: ComplexArray, bands: NoiseBands, factor: float) -> tuple[Flo
         return mean, np.zeros(values.shape[0], np.int64)
     power = values.real**2 + values.imag**2
     sample = np.add.reduceat(power, bands.starts, axis=-1) / bands.counts
+    if is_flat(sample, BINS_PER_BAND):
+        return mean, np.zeros(values.shape[0], np.int64)
     model = model_variance(sample * factor, BINS_PER_BAND)
-    if not model.kind.any():
-        return mean, model.kind
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
 
 

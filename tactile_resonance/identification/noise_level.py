@@ -163,6 +163,14 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     return VarianceModel(model, lines, dof, kind)
 
 
+def is_flat(variance: FloatArray, dof: int) -> bool:
+    """Whether the test of `model_variance` finds every point of (batch, F) variances flat."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = np.log(variance.mean(axis=-1)) - np.log(variance).mean(axis=-1)
+    limit = _bartlett_limit(np.array(variance.shape[-1]), dof, 1)
+    return bool((spread <= limit).all())  # NaN, where a variance is not positive, is not flat
+
+
 def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> FloatArray:
     """Largest ``log mean - mean log`` of variance ratios that passes the test."""
     real_dof = 2 * dof

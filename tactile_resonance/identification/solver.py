@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData, BinGroup
+from tactile_resonance.identification.one_point import OnePoint, StackedBasis, solve_one
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -88,6 +89,11 @@ class Problem:
             if group.transient is not None:
                 terms[2] = group.transient.shape[1]
         return terms[0], terms[1], terms[2]
+
+    @cached_property
+    def stacked(self) -> StackedBasis:
+        """Basis for one point at a time."""
+        return StackedBasis.of(self.groups, self.sizes)
 
     @property
     def chunk(self) -> int:
@@ -161,10 +167,21 @@ class Problem:
 
     def rough(self, data: Sequence[BinData]) -> FloatArray:
         """(batch, n) start values and one Gauss-Newton step: residuals are then all but noise."""
-        theta = self.start(data)
-        _, gradient, normal = self.linearise(data, theta)
+        if data[0].y.shape[0] == 1:
+            point = OnePoint(self.stacked, data)
+            theta = point.start(START_ITERATIONS)
+            _, gradient, normal = point.linearise(theta)
+        else:
+            theta = self.start(data)
+            _, gradient, normal = self.linearise(data, theta)
         moved = theta - solve_scaled(normal.sum(axis=1), gradient)[0]
         return np.where(np.isfinite(moved).all(axis=-1, keepdims=True), moved, theta)
+
+    def first(self, data: Sequence[BinData]) -> FloatArray:
+        """(batch, n) start values."""
+        if data[0].y.shape[0] == 1:
+            return OnePoint(self.stacked, data).start(START_ITERATIONS)
+        return self.start(data)
 
     def start(self, data: Sequence[BinData], iterations: int = START_ITERATIONS) -> FloatArray:
         """(batch, n) coefficients by Sanathanan-Koerner iterations."""
@@ -221,6 +238,10 @@ def solve_scaled(
 ) -> tuple[FloatArray, FloatArray]:
     """``(N + damping diag N)^-1 gradient`` (batch, n), and the gradient times it (batch,)."""
     n = normal.shape[-1]
+    if normal.shape[0] == 1:
+        one = solve_one(normal[0], gradient[0], float(np.ravel(damping)[0]))
+        if np.isfinite(one).all():
+            return one[None], np.array([gradient[0] @ one])
     diagonal = np.einsum("...ii->...i", normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.where(diagonal > 0, 1 / np.sqrt(diagonal), 1.0)
@@ -265,7 +286,7 @@ def minimise(
         for first in range(0, max(batch, 1), chunk):
             rows = slice(first, first + chunk)
             part = [values.rows(rows) for values in data] if batch > chunk else list(data)
-            begin = problem.start(part) if start is None else start[rows]
+            begin = problem.first(part) if start is None else start[rows]
             parts.append(_minimise_chunk(problem, part, begin, max_iterations))
     if len(parts) == 1:
         return parts[0]
@@ -282,7 +303,14 @@ def _minimise_chunk(
     floor = ROUNDING**2 * sum(
         np.sum((v.y.real**2 + v.y.imag**2) / v.variance_y, axis=-1) for v in data
     )
-    group_cost, gradient, normal = problem.linearise(data, theta)
+    point = OnePoint(problem.stacked, data) if batch == 1 else None
+
+    def linearise(
+        points: list[BinData], at: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return problem.linearise(points, at) if point is None else point.linearise(at)
+
+    group_cost, gradient, normal = linearise(data, theta)
     theta = theta.copy()
     cost = group_cost.sum(axis=-1)
     damping = np.zeros(batch)
@@ -308,7 +336,7 @@ def _minimise_chunk(
             active, step = active[keep], step[keep]
             work = [values.rows(active) for values in data]
         trial = theta[active] - step
-        trial_cost, trial_gradient, trial_normal = problem.linearise(work, trial)
+        trial_cost, trial_gradient, trial_normal = linearise(work, trial)
         total = trial_cost.sum(axis=-1)
         iterations[active] += 1
         # rounding of the cost itself must not count as an increase
