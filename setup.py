@@ -14,7 +14,6 @@ from setuptools import find_namespace_packages, setup
 NAME = "tactile_resonance"
 HERE = Path(__file__).resolve().parent
 NODES = (
-NODES = (
     "excitation_node",
     "frf_node",
     "poles_node",
@@ -23,7 +22,6 @@ NODES = (
     "pole_map_node",
     "fake_hardware_node",
     "manager_node",
-)
 )
 BUILT_FOR_ROS = "TACTILE_RESONANCE_BUILT_FOR_ROS" in os.environ  # set by CMakeLists.txt
 

@@ -37,13 +37,13 @@ class ForceWatch:
         self._equal = 1
         self._last: WrenchSample | None = None
         self._recent: deque[tuple[int, float]] = deque()  # time, force along z
-        self._bias_n = np.zeros(3)
+        self.bias_n = np.zeros(3)
         self.force_n: NDArray[np.float64] = np.zeros(3)
         self.peak_n = 0.0
 
     def set_bias(self, bias_n: NDArray[np.float64]) -> None:
         """Take what the sensor shows out of contact (3,) as 0; forget what came before."""
-        self._bias_n = bias_n
+        self.bias_n = bias_n
         self._recent.clear()
         self.force_n = np.zeros(3)
         self.peak_n = 0.0
@@ -77,7 +77,7 @@ class ForceWatch:
         if self._equal >= self._stuck_samples:
             text = f"{self._equal} equal forces in a row: the sensor is stuck"
             return Breach(Cause.FORCE_STUCK, text)
-        self.force_n = sample.force_n - self._bias_n
+        self.force_n = sample.force_n - self.bias_n
         self.force_n[2] -= inertia_n
         z = float(self.force_n[2])
         self.peak_n = max(self.peak_n, z)

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tactile_resonance.contact.interfaces import Arm, ArmError, ForceError, ForceSource
 from tactile_resonance.contact.machine import ContactController, ContactGoal, State
 from tactile_resonance.contact.result import ContactResult
@@ -37,6 +40,8 @@ class Cycle:
     wrenches: list[WrenchSample]
     state: State
     late_s: float
+    bias_n: NDArray[np.float64]  # (3,) of the last tare, not taken off the wrenches
+    fault: ArmError | ForceError | None  # what a device raised in this cycle
 
 
 class ContactLoop:
@@ -131,4 +136,5 @@ class ContactLoop:
             self._stopped_ns = None
         if self._listener is not None:
             state = self.controller.state
-            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9))
+            bias_n = self.controller.bias_n
+            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, bias_n, fault))

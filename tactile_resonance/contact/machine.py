@@ -137,6 +137,11 @@ class ContactController:
         model = self._observer.model
         return None if model is None else model.estimate(self._height_m)
 
+    @property
+    def bias_n(self) -> FloatArray:
+        """Force (3,) of the last tare [N], of the frame `tip`; zeros before it."""
+        return self._observer.watch.bias_n
+
     # requests
 
     def configure(self, parameters: ContactParameters, limits: Limits) -> None:

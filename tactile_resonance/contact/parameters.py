@@ -191,6 +191,7 @@ class Limits:
     near_speed_m_s, contact_speed_m_s, lateral_speed_m_s, free_speed_m_s : float
         Speed near the surface, in contact, along the surface in contact, elsewhere [m/s].
     angular_speed_rad_s : float
+        Of turns anywhere [rad/s].
     tilt_rad : float
         Between +z of the tip and the vertical [rad].
     misalignment_rad : float
@@ -237,6 +238,24 @@ class Limits:
         check_ranges(self, LIMIT_RANGES)
         least = self.abort_force_n
         require(self.hard_force_n > least, "hard_force_n", self.hard_force_n, f"above {least}")
+
+    def lowered(self, abort_force_n: float | None, depth_m: float | None) -> Limits:
+        """Return limits in which these two are lower, for one contact; None leaves one as it is.
+
+        Raises
+        ------
+        ValueError
+            If one would be raised.
+        """
+        for name, value in (("abort_force_n", abort_force_n), ("depth_m", depth_m)):
+            limit = getattr(self, name)
+            good = value is None or 0 < value <= limit
+            require(good, name, value, f"above 0, at most the limit {limit:g}")
+        return replace(
+            self,
+            abort_force_n=self.abort_force_n if abort_force_n is None else abort_force_n,
+            depth_m=self.depth_m if depth_m is None else depth_m,
+        )
 
     def check(self, parameters: ContactParameters) -> None:
         """Raise ``ValueError`` where parameters ask for more than the limits allow."""

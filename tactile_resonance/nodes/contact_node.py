@@ -22,6 +22,7 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.machine import ContactGoal, State
 from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
@@ -63,7 +64,7 @@ class ContactNode(ManagedNode):
     def configure(self) -> None:
         """Connect arm and force source."""
         self._frame_id, self._base_frame = values(self, "frame_id", "base_frame")
-        self._parameters, self._limits = read_parameters(self)
+        self._settings, self._limits = read_parameters(self)
         self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = self.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._state = self.publish_on(msg.ContactState, "contact_state", STREAM)
@@ -92,7 +93,7 @@ class ContactNode(ManagedNode):
     def activate(self) -> None:
         """Start the loop."""
         self._thread = ContactThread(
-            self._arm, self._force, self._parameters, self._limits, self._on_cycle
+            self._arm, self._force, self._settings, self._limits, self._on_cycle
         )
 
     def deactivate(self) -> None:
@@ -126,7 +127,7 @@ class ContactNode(ManagedNode):
                 self._thread.configure(parameters, limits)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self._parameters, self._limits = parameters, limits
+        self._settings, self._limits = parameters, limits
         return SetParametersResult(successful=True)
 
     def _on_request(self, _: MakeContact.Goal) -> GoalResponse:
@@ -138,7 +139,7 @@ class ContactNode(ManagedNode):
             if self._thread is None:
                 raise ValueError("contact_node is not active")
             limits = self._goal_limits(goal.request)
-            self._thread.start(self._contact_goal(goal.request), self._parameters, limits)
+            self._thread.start(self._contact_goal(goal.request), self._settings, limits)
         except ValueError as error:
             result.message = str(error)
             self.health.error(f"refused: {error}")
@@ -175,6 +176,7 @@ class ContactNode(ManagedNode):
             raise ValueError(f"pose: in frame {frame!r}, accepted is {self._base_frame!r}")
         if request.hold not in _HOLDS:
             raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
+        require_fit(self._force.info, request.force_n)
         point, turn = request.pose.pose.position, request.pose.pose.orientation
         quaternion = [turn.x, turn.y, turn.z, turn.w]
         if not 0.99 < math.hypot(*quaternion) < 1.01:
@@ -203,7 +205,7 @@ class ContactNode(ManagedNode):
             return
         if self._dead > DEAD_CYCLES:
             self._finish(thread.controller.result)
-            self.fail("arm or force source dead for a second; connecting anew")
+            self.fail(f"{self._fault}; connecting anew")
             return
         goal, controller = self._goal, thread.controller
         if goal is None:
@@ -229,7 +231,8 @@ class ContactNode(ManagedNode):
     # each cycle, in the loop's thread
 
     def _on_cycle(self, cycle: Cycle) -> None:
-        self._dead = self._dead + 1 if cycle.dead else 0
+        self._dead = self._dead + 1 if cycle.fault is not None else 0
+        self._fault = cycle.fault
         if cycle.arm is not None and self._pose.get_subscription_count():
             self._pose.publish(self._pose_message(cycle))
         if cycle.wrenches and self._wrench.get_subscription_count():

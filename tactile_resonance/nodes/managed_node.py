@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -117,6 +118,7 @@ class ManagedNode(LifecycleNode):
             self.health.error(" ".join(str(error).split()))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
+            self.get_logger().error(traceback.format_exc())
             self.health.error(f"defect while configuring: {error!r}")
             raise
         return super().on_configure(state)

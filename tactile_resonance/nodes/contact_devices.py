@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which arm and which force source the contact controller drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rclpy.node import Node
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.interfaces import Cell
+from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.drivers.can_wrench import CanWrench
+from tactile_resonance.drivers.force_config import ForceConfig, read_force_config
+from tactile_resonance.drivers.rtde_wrench import RtdeWrench
+from tactile_resonance.drivers.ur_arm import UrArm
+from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.topic_wrench import TopicWrench
+from tactile_resonance.simulation.parameters import read_sensor
+
+PARAMETERS = (
+    Parameter(
+        "robot_config",
+        "config/devices/ur5e.yaml",
+        "The arm: a file, absolute or in the package's share folder.",
+        read_only=True,
+    ),
+    Parameter(
+        "robot_host",
+        "",
+        "Name or address of the robot; empty: that of robot_config.",
+        read_only=True,
+    ),
+    Parameter(
+        "force_config",
+        "can_simulated.yaml",
+        "The force source: a file of config/force, or an absolute path.",
+        read_only=True,
+    ),
+    Parameter(
+        "force_host",
+        "",
+        "Address of the socketcand server of a cell on CAN; empty: that of force_config.",
+        read_only=True,
+    ),
+    Parameter(
+        "sensor_config",
+        "config/sensors/bimorph.yaml",
+        "The sensor, for the radius of its tip.",
+        read_only=True,
+    ),
+)
+
+
+def make_arm(node: Node) -> UrArm:
+    """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
+    config, host = values(node, "robot_config", "robot_host")
+    arm = read_ur_config(_path(config))
+    return UrArm(replace(arm, host=host) if host else arm)
+
+
+def make_force_source(node: Node, arm: UrArm) -> TipForce:
+    """The force source that the parameters name, not started yet; ValueError where they are wrong."""
+    name, host = values(node, "force_config", "force_host")
+    config = read_force_config(Path(name).expanduser())
+    if host:
+        if config.can is None:
+            raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")
+        config = replace(config, can=replace(config.can, bus={**config.can.bus, "host": host}))
+    return TipForce(
+        _make_cell(node, config, arm), config.mounting, arm.state, config.inertia_window_s
+    )
+
+
+def tip_radius_m(node: Node) -> float:
+    """Radius of the sensor's ball [m]."""
+    (name,) = values(node, "sensor_config")
+    return read_sensor(_path(name)).tip.radius_m
+
+
+def _make_cell(node: Node, config: ForceConfig, arm: UrArm) -> Cell:
+    if config.kind == "can":
+        return CanWrench(config)
+    if config.kind == "rtde":
+        return RtdeWrench(config, arm.state, lambda: arm.clock_uncertainty_s)
+    return TopicWrench(node, config)
+
+
+def _path(name: str) -> Path:
+    path = Path(name).expanduser()
+    return path if path.is_absolute() else share_path(name)
