@@ -2,14 +2,17 @@
 """UrArm on the simulated robot: motion, time stamps, and every fault by its name."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import Pose
 
@@ -364,3 +367,18 @@ def test_nobody_there_and_not_connected(start_arm):
     assert error.value.fault is ArmFault.LINK_LOST
     arm.close()
     arm.close()
+
+
+def test_python_of_the_page(robot, module_arm, tmp_path, capsys):
+    module_arm.close()
+    page = Path(__file__).resolve().parents[3] / "docs" / "robot.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    own = tmp_path / "mine.yaml"
+    text = share_path("config/devices/ur5e.yaml").read_text(encoding="utf-8")
+    text = text.replace("host: 127.0.1.1", f"host: {robot.host}")
+    own.write_text(text.replace("max_state_age_s: 0.020", "max_state_age_s: 0.2"))
+    shipped = 'share_path("config/devices/ur5e.yaml")'
+    assert shipped in code
+    exec(compile(code.replace(shipped, "own"), page.name, "exec"), {"own": own})
+    moved_mm = float(re.search(r"moved ([\d.]+) mm", capsys.readouterr().out)[1])
+    assert 2 < moved_mm < 10  # 0.5 s and a little more at 5 mm/s, more where this machine is busy
