@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.simulation.plant import cross
 from tactile_resonance.simulation.robot.poses import moved_wrench
 from tactile_resonance.simulation.robot.target import CYCLE_S
 
@@ -71,7 +72,7 @@ class Payload:
             Acceleration of free fall in the base.
         """
         force = flange[:3, :3].T @ gravity_m_s2 * self.mass_kg
-        return np.concatenate([force, np.cross(self.cog_m, force)])
+        return np.concatenate([force, cross(self.cog_m, force)])
 
 
 class FtSensor:

@@ -112,6 +112,8 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "target_moment": ("VECTOR6D", lambda o: o.target_moment),
     "actual_q": ("VECTOR6D", lambda o: o.robot.machine.joints.q),
     "actual_qd": ("VECTOR6D", lambda o: o.robot.machine.joints.qd),
+    "actual_qdd": ("VECTOR6D", lambda o: o.robot.machine.joints.qdd),
+    "actual_moment": ("VECTOR6D", lambda o: o.actual_moment),
     "actual_current": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
     "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
     "joint_control_output": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
@@ -158,6 +160,9 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "payload_cog": ("VECTOR3D", lambda o: o.robot.machine.payload.cog_m),
     "payload_inertia": ("VECTOR6D", lambda o: o.robot.machine.payload.inertia_kg_m2),
     "tcp_offset": ("VECTOR6D", lambda o: pose_from_matrix(o.robot.machine.target.tcp)),
+    # no program of the model writes boolean registers
+    "output_bit_registers0_to_31": ("UINT32", lambda o: 0),
+    "output_bit_registers32_to_63": ("UINT32", lambda o: 0),
     "tcp_force_scalar": (
         "DOUBLE",
         lambda o: float(np.linalg.norm(o.robot.machine.tcp_force[:3])),

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.simulation.plant import cross
+
 FloatArray = NDArray[np.float64]
 
 
@@ -55,4 +57,4 @@ def moved_wrench(wrench: FloatArray, to_frame: FloatArray) -> FloatArray:
     """
     rotation, arm = to_frame[:3, :3], to_frame[:3, 3]
     force = rotation @ wrench[:3]
-    return np.concatenate([force, rotation @ wrench[3:] + np.cross(arm, force)])
+    return np.concatenate([force, rotation @ wrench[3:] + cross(arm, force)])

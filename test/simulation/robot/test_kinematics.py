@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""UR5e: forward and inverse against a product of exponentials made from the drawing's lengths."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.simulation.robot.dynamics import (
+    LINK_CENTRE_M,
+    LINK_MASS_KG,
+    gravity_torque,
+    momentum,
+)
+from tactile_resonance.simulation.robot.ft_sensor import Payload
+from tactile_resonance.simulation.robot.kinematics import (
+    forward,
+    inverse,
+    jacobian,
+    link_frames,
+    nearest_inverse,
+)
+from tactile_resonance.simulation.robot.poses import matrix_from_pose, pose_from_matrix
+
+# The arm stretched along -x, all angles 0: axes and points on them, from the maker's lengths.
+UPPER, FORE, HEIGHT, OFFSET, WRIST_2, WRIST_3 = 0.425, 0.3922, 0.1625, 0.1333, 0.0997, 0.0996
+REACH = -(UPPER + FORE)
+SCREWS = [
+    ((0, 0, 1), (0, 0, 0)),
+    ((0, -1, 0), (0, 0, HEIGHT)),
+    ((0, -1, 0), (-UPPER, 0, HEIGHT)),
+    ((0, -1, 0), (REACH, 0, HEIGHT)),
+    ((0, 0, -1), (REACH, -OFFSET, HEIGHT)),
+    ((0, -1, 0), (REACH, -OFFSET, HEIGHT - WRIST_2)),
+]
+HOME = np.eye(4)
+HOME[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+HOME[:3, 3] = (REACH, -OFFSET - WRIST_3, HEIGHT - WRIST_2)
+
+
+def product_of_exponentials(q: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    for angle, (axis, point) in zip(q, SCREWS, strict=True):
+        twist = np.zeros((4, 4))
+        twist[:3, :3] = np.cross(np.eye(3), axis)
+        twist[:3, 3] = -np.cross(axis, point)
+        pose = pose @ expm(twist * angle)
+    return pose @ HOME
+
+
+@pytest.fixture(scope="module")
+def postures() -> np.ndarray:
+    return np.random.default_rng(7).uniform(-np.pi, np.pi, (300, 6))
+
+
+def test_forward_agrees_with_a_product_of_exponentials(postures):
+    for q in postures:
+        np.testing.assert_allclose(forward(q), product_of_exponentials(q), atol=1e-12)
+
+
+def test_every_inverse_solution_reaches_the_pose_and_one_is_the_posture(postures):
+    counts = set()
+    for q in postures:
+        wanted = product_of_exponentials(q)
+        solutions = inverse(wanted)
+        counts.add(len(solutions))
+        for solution in solutions:
+            np.testing.assert_allclose(forward(np.array(solution)), wanted, atol=1e-9)
+        away = [np.abs(np.exp(1j * np.array(s)) - np.exp(1j * q)).max() for s in solutions]
+        assert min(away) < 1e-6
+    assert 8 in counts
+
+
+def test_nearest_inverse_keeps_whole_turns_within_the_joints_range(postures):
+    rng = np.random.default_rng(8)
+    for q in postures[:100]:
+        turned = q + 2 * np.pi * rng.integers(-1, 2, 6)
+        turned = np.where(np.abs(turned) > 2 * np.pi, q, turned)
+        found = nearest_inverse(forward(turned), turned)
+        np.testing.assert_allclose(found, turned, atol=1e-6)
+
+
+def test_a_path_through_whole_turns_stays_continuous():
+    q = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.0])
+    for angle in np.arange(0.0, 6.2, 0.01):
+        wanted = q.copy()
+        wanted[5] = angle
+        found = nearest_inverse(forward(wanted), np.where(np.arange(6) == 5, angle - 0.01, q))
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+def test_parallel_wrist_axes_take_the_wrist_angle_given():
+    q = np.array([0.3, -1.2, 1.4, -1.7, 0.0, 0.8])
+    found = nearest_inverse(forward(q), q)
+    np.testing.assert_allclose(found, q, atol=1e-7)
+    np.testing.assert_allclose(forward(found), forward(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("position", [(1.2, 0, 0.3), (0, 0, 1.3), (0.05, 0.0, 0.3)])
+def test_out_of_reach_has_no_solution(position):
+    flange = np.eye(4)
+    flange[:3, 3] = position
+    assert inverse(flange) == []
+    assert nearest_inverse(flange, np.zeros(6)) is None
+
+
+def test_jacobian_is_the_derivative_of_a_tool_point(postures):
+    tool = matrix_from_pose([0.02, -0.05, 0.13, 0.4, 0.1, -0.2])
+    for q in postures[:50]:
+        frames = link_frames(q)
+        columns = jacobian(frames, (frames[-1] @ tool)[:3, 3])
+        step = 1e-6
+        for joint in range(6):
+            shift = step * np.eye(6)[joint]
+            ahead, behind = forward(q + shift) @ tool, forward(q - shift) @ tool
+            velocity = (ahead - behind)[:3, 3] / (2 * step)
+            turn = Rotation.from_matrix(ahead[:3, :3] @ behind[:3, :3].T).as_rotvec() / (2 * step)
+            np.testing.assert_allclose(columns[:, joint], [*velocity, *turn], atol=1e-8)
+
+
+def test_poses_and_transforms_are_inverse_to_each_other(postures):
+    for q in postures[:50]:
+        transform = forward(q)
+        np.testing.assert_allclose(
+            matrix_from_pose(pose_from_matrix(transform)), transform, atol=1e-12
+        )
+
+
+def test_gravity_torque_is_the_gradient_of_potential_energy(postures):
+    payload = Payload(1.3, np.array([0.01, -0.02, 0.06]))
+    gravity = np.array([0.0, 1.0, -9.7])
+
+    def energy(q):
+        frames = link_frames(q)
+        total = 0.0
+        masses = [*LINK_MASS_KG, payload.mass_kg]
+        centres = [*LINK_CENTRE_M, payload.cog_m]
+        for mass, centre, frame in zip(masses, centres, [*frames[1:], frames[-1]], strict=True):
+            total -= mass * gravity @ (frame @ [*centre, 1.0])[:3]
+        return total
+
+    for q in postures[:20]:
+        slope = [(energy(q + d) - energy(q - d)) / 2e-6 for d in 1e-6 * np.eye(6)]
+        torque = gravity_torque(link_frames(q), gravity, payload)
+        np.testing.assert_allclose(torque, slope, atol=1e-6)
+
+
+def test_momentum_of_an_arm_that_turns_about_its_base():
+    q = np.array([0.0, -0.4, 0.7, -0.3, 1.0, 0.2])
+    frames = link_frames(q)
+    first_moment = np.zeros(2)
+    for mass, centre, frame in zip(LINK_MASS_KG, LINK_CENTRE_M, frames[1:], strict=True):
+        first_moment += mass * (frame @ [*centre, 1.0])[:2]
+    expected = 0.5 * np.linalg.norm(first_moment)
+    assert momentum(frames, np.array([0.5, 0, 0, 0, 0, 0]), Payload()) == pytest.approx(expected)
