@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import threading
 import time
@@ -20,7 +21,7 @@ from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, Command
 from tactile_resonance.drivers.force_config import ForceConfig
 
-OPEN_WITHIN_S = 2.0
+OPEN_WITHIN_S = 3.5  # serial adapters are given two seconds to wake up
 ANSWER_WITHIN_S = 0.25
 QUIET_S = 0.02
 KEPT_SAMPLES = 10000
@@ -146,7 +147,10 @@ class CanWrench:
         return ClockTracker(self._can.shortest_delay_s, self._can.delay_std_s)
 
     def _new_assembler(self) -> Assembler:
-        return Assembler(self._can.description.frame_ids, 0.5 / self._config.info.rate_hz)
+        # times of arrival scatter by more than a period: there only the order pairs frames
+        adapter = self._can.stamps == "adapter"
+        within_s = 0.5 / self._config.info.rate_hz if adapter else math.inf
+        return Assembler(self._can.description.frame_ids, within_s)
 
     def _clock_uncertainty_s(self) -> float:
         if self._can.stamps == "arrival":

@@ -37,7 +37,7 @@ class CellProcess:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.port = int(self._process.stdout.readline().split(":")[2].split()[0])
+        self.port = int(self._process.stdout.readline().rsplit(":", 1)[1])
 
     def say(self, line):
         self._process.stdin.write(line + "\n")
