@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a stream of wrenches shows of its sensor's health, sample by sample."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+
+FALSE_ALARM = 1e-12
+"""Accepted probability that noise alone repeats a sample so often that it is called stuck."""
+LOST_WITHIN = 100
+
+
+@dataclass(frozen=True)
+class CellLimits:
+    """When a sensor is called faulty.
+
+    Attributes
+    ----------
+    silent_s : float
+        Nothing has come for so long.
+    stuck_samples : int or None
+        So many samples on end are equal on all axes; None: as many as noise does not explain.
+    jump_n : float
+        Largest step of a force between samples that a contact makes.
+    overload_samples : int
+        So many samples on end are beyond the range.
+    lost_tolerated : int
+        Wrenches lost among the last hundred.
+    """
+
+    silent_s: float = 0.010
+    stuck_samples: int | None = None
+    jump_n: float = math.inf
+    overload_samples: int = 3
+    lost_tolerated: int = 3
+
+    def __post_init__(self) -> None:
+        if not 0 < self.silent_s <= 1:
+            raise ValueError(f"silent_s: {self.silent_s!r}, expected above 0 to 1 s")
+        if self.stuck_samples is not None and self.stuck_samples < 2:
+            raise ValueError(f"stuck_samples: {self.stuck_samples!r}, expected 2 or more")
+        if not self.jump_n > 0:
+            raise ValueError(f"jump_n: {self.jump_n!r}, expected a number above 0")
+        if self.overload_samples < 1:
+            raise ValueError(f"overload_samples: {self.overload_samples!r}, expected 1 or more")
+        if not 0 <= self.lost_tolerated < LOST_WITHIN:
+            raise ValueError(f"lost_tolerated: {self.lost_tolerated!r}, expected 0 to 99")
+
+
+def repeat_probability(noise_rms_n: float, resolution_n: float) -> float:
+    """Probability that two readings of white noise fall on one count, at the worst place between counts."""
+    if noise_rms_n <= 0:
+        return 1.0
+    if resolution_n <= 0:
+        return 0.0
+    step = resolution_n / noise_rms_n
+    edges = (np.arange(-math.ceil(8 / step) - 1, math.ceil(8 / step) + 2) + 0.5) * step
+    cumulative = [0.5 * math.erfc(-edge / math.sqrt(2)) for edge in edges]
+    return float(np.sum(np.diff(cumulative) ** 2))
+
+
+def samples_until_stuck(info: ForceInfo) -> int | None:
+    """So many equal samples noise does not explain; None where it explains a second of them.
+
+    From the three axes of force, white noise; never below ten samples, since sensors filter.
+    """
+    chance = repeat_probability(info.noise_rms_n, info.resolution_n) ** 3
+    if chance >= 1:
+        return None
+    pairs = 1.0 if chance <= 0 else math.log(FALSE_ALARM) / math.log(chance)
+    samples = max(10, 1 + math.ceil(pairs))
+    return samples if samples <= info.rate_hz else None
+
+
+class CellChecks:
+    """The checks of one stream.
+
+    Parameters
+    ----------
+    info : ForceInfo
+    range_nm : float
+        Largest torque of the sensor [N m].
+    limits : CellLimits
+    """
+
+    def __init__(self, info: ForceInfo, range_nm: float, limits: CellLimits) -> None:
+        self._limits = limits
+        self._range = np.repeat([info.range_n, range_nm], 3)
+        self._stuck_at = limits.stuck_samples or samples_until_stuck(info)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was seen."""
+        self._last: NDArray[np.float64] | None = None
+        self._equal = self._over = 0
+        self._recent: deque[bool] = deque(maxlen=LOST_WITHIN)
+
+    def lost(self) -> None:
+        """One wrench did not arrive whole. Raises `ForceError` where that comes too often."""
+        self._recent.append(True)
+        if sum(self._recent) > self._limits.lost_tolerated:
+            raise ForceError(
+                ForceFault.INCOMPLETE,
+                f"{sum(self._recent)} of the last {len(self._recent)} wrenches lost, "
+                f"accepted are {self._limits.lost_tolerated}",
+            )
+
+    def check(self, wrench: NDArray[np.float64], overload: bool = False) -> bool:
+        """Look at the next wrench (6,) of the sensor.
+
+        Returns
+        -------
+        bool
+            Whether a channel is beyond its range.
+
+        Raises
+        ------
+        ForceError
+            Invalid, overload, stuck or jump.
+        """
+        self._recent.append(False)
+        if not np.all(np.isfinite(wrench)):
+            axis = int(np.flatnonzero(~np.isfinite(wrench))[0])
+            raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is no number")
+        over = overload or bool(np.any(np.abs(wrench) > self._range))
+        self._over = self._over + 1 if over else 0
+        if self._over >= self._limits.overload_samples:
+            axis = int(np.argmax(np.abs(wrench) / self._range))
+            raise ForceError(
+                ForceFault.OVERLOAD,
+                f"{self._over} samples beyond the range; {_AXES[axis]} is {wrench[axis]:.4g}, "
+                f"range {self._range[axis]:.4g}",
+            )
+        last, self._last = self._last, wrench
+        if last is None:
+            return over
+        step = wrench - last
+        self._equal = 0 if step.any() else self._equal + 1
+        if self._stuck_at is not None and self._equal + 1 >= self._stuck_at:
+            raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
+        largest = float(np.abs(step[:3]).max())
+        if largest > self._limits.jump_n and not over:
+            raise ForceError(
+                ForceFault.JUMP,
+                f"a step of {largest * 1e3:.4g} mN between two samples, "
+                f"at most {self._limits.jump_n * 1e3:.4g} mN are from a contact",
+            )
+        return over
+
+
+_AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's own force/torque sensor, as its state brings it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_resonance.contact.cell_checks import CellChecks
+from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.samples import ArmSample, CellSample
+from tactile_resonance.drivers.force_config import ForceConfig
+
+
+class RtdeWrench:
+    """Wrenches of the robot's sensor in the frame `tip` (a `contact.interfaces.Cell`).
+
+    The controller has taken the payload off and moved the wrench to the tool centre point, which is the
+    tip: so the mounting is the identity, and the payload is set at the robot.
+
+    Parameters
+    ----------
+    config : ForceConfig
+        Of kind rtde.
+    arm_state : callable
+        Newest state of the arm, without waiting; may raise `ArmError`.
+    clock_std_s : callable or None
+        Standard deviation of the states' times on this machine's clock at present [s].
+    """
+
+    def __init__(
+        self,
+        config: ForceConfig,
+        arm_state: Callable[[], ArmSample],
+        clock_std_s: Callable[[], float] | None = None,
+    ) -> None:
+        if config.kind != "rtde":
+            raise ValueError(f"kind: {config.kind!r}, expected rtde")
+        mounting = config.mounting
+        if mounting.frame.vector.any() or mounting.payload is not None:
+            raise ValueError("frame, payload: expected zeros and none, the controller knows both")
+        self._config, self._arm_state, self._clock_std_s = config, arm_state, clock_std_s
+        self._checks = CellChecks(config.info, config.range_nm, config.limits)
+        self._robot_time_s = -np.inf
+        self._new_s = 0.0
+
+    @property
+    def info(self) -> ForceInfo:
+        """What the sensor can do."""
+        std_s = 0.0 if self._clock_std_s is None else self._clock_std_s()
+        return replace(self._config.info, clock_uncertainty_s=std_s)
+
+    def start(self) -> None:
+        """Begin anew; the arm is connected by its owner. Raises `ForceError`."""
+        self._checks.restart()
+        state = self._state()
+        self._robot_time_s, self._new_s = state.robot_time_s, time.monotonic()
+
+    def read(self) -> list[CellSample]:
+        """The newest wrench where there is a new one. Raises `ForceError`."""
+        state = self._state()
+        now_s = time.monotonic()
+        if state.robot_time_s == self._robot_time_s:
+            if now_s - self._new_s > self._config.limits.silent_s:
+                text = f"{self.info.name}: no new state for {(now_s - self._new_s) * 1e3:.0f} ms"
+                raise ForceError(ForceFault.SILENT, text)
+            return []
+        self._robot_time_s, self._new_s = state.robot_time_s, now_s
+        assert state.tool_wrench is not None
+        turn = state.tip.rotation
+        wrench = np.concatenate(
+            [turn.inv().apply(state.tool_wrench[:3]), turn.inv().apply(state.tool_wrench[3:])]
+        )
+        overload = self._checks.check(wrench)
+        stamp_ns = state.time_ns - round(self._config.latency_s * 1e9)
+        return [CellSample(stamp_ns, wrench, overload)]
+
+    def close(self) -> None:
+        """Nothing is to be let go: the arm belongs to someone else."""
+
+    def _state(self) -> ArmSample:
+        try:
+            state = self._arm_state()
+        except ArmError as error:
+            raise ForceError(ForceFault.LINK_LOST, f"{self._config.info.name}: {error}") from error
+        if state.tool_wrench is None:
+            text = f"{self._config.info.name}: the arm brings no wrench"
+            raise ForceError(ForceFault.REFUSED, text)
+        return state

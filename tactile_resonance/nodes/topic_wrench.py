@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A force sensor of any ROS 2 driver: its geometry_msgs/WrenchStamped."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from tactile_resonance.contact.cell_checks import CellChecks
+from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.samples import CellSample
+from tactile_resonance.drivers.force_config import ForceConfig
+from tactile_resonance.nodes.conversions import time_from_message
+
+SENSOR = QoSProfile(
+    depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+EARLIEST_S = 0.005
+LATEST_S = 0.5
+FIRST_WITHIN_S = 2.0
+
+
+class TopicWrench:
+    """Wrenches from a topic, in the sensor's frame (a `contact.interfaces.Cell`).
+
+    Takes reliable and best-effort publishers. Needs a node that spins in another thread.
+
+    Parameters
+    ----------
+    node : Node
+    config : ForceConfig
+        Of kind topic.
+    """
+
+    def __init__(self, node: Node, config: ForceConfig) -> None:
+        if config.kind != "topic":
+            raise ValueError(f"kind: {config.kind!r}, expected topic")
+        self._node, self._config = node, config
+        self._checks = CellChecks(config.info, config.range_nm, config.limits)
+        self._samples: deque[CellSample] = deque(maxlen=10000)
+        self._fault: ForceError | None = None
+        self._last_s = 0.0
+        self._last_stamp_ns = 0
+        self._listening = False
+        self._subscription = None
+
+    @property
+    def info(self) -> ForceInfo:
+        """What the sensor can do, as configured; its clock is taken to be this machine's."""
+        return self._config.info
+
+    def start(self) -> None:
+        """Listen anew and wait for the first wrench.
+
+        Raises
+        ------
+        ForceError
+            `SILENT` where none comes within two seconds, or what is wrong with the first.
+        """
+        self._listening = False
+        self._samples.clear()
+        self._checks.restart()
+        self._fault, self._last_stamp_ns = None, 0
+        self._listening = True
+        if self._subscription is None:
+            self._subscription = self._node.create_subscription(
+                WrenchStamped,
+                self._config.topic,
+                self._on_wrench,
+                SENSOR,
+                callback_group=MutuallyExclusiveCallbackGroup(),
+            )
+        deadline_s = time.monotonic() + FIRST_WITHIN_S
+        while not self._samples and self._fault is None:
+            if time.monotonic() > deadline_s:
+                self._listening = False
+                text = f"topic {self._config.topic}: no wrench within {FIRST_WITHIN_S:g} s"
+                raise ForceError(ForceFault.SILENT, text)
+            time.sleep(0.002)
+        if self._fault is not None:
+            raise self._fault
+
+    def read(self) -> list[CellSample]:
+        """Wrenches since the last call, oldest first, without waiting. Raises `ForceError`."""
+        if not self._listening:
+            raise ForceError(ForceFault.LINK_LOST, f"topic {self._config.topic}: not started")
+        if self._fault is not None:
+            raise self._fault
+        samples = []
+        while self._samples:
+            samples.append(self._samples.popleft())
+        since_s = time.monotonic() - self._last_s
+        if not samples and since_s > self._config.limits.silent_s:
+            text = f"topic {self._config.topic}: silent for {since_s * 1e3:.0f} ms"
+            self._fault = ForceError(ForceFault.SILENT, text)
+            raise self._fault
+        return samples
+
+    def close(self) -> None:
+        """Listen no longer; the subscription ends with its node.
+
+        An executor that spins in another thread may hold it at this moment.
+        """
+        self._listening = False
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        if not self._listening or self._fault is not None:
+            return
+        force, torque = message.wrench.force, message.wrench.torque
+        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        stamp_ns = time_from_message(message.header.stamp)
+        try:
+            self._check_stamp(stamp_ns)
+            overload = self._checks.check(wrench)
+        except ForceError as error:
+            self._fault = error
+            return
+        self._last_stamp_ns, self._last_s = stamp_ns, time.monotonic()
+        latency_ns = round(self._config.latency_s * 1e9)
+        self._samples.append(CellSample(stamp_ns - latency_ns, wrench, overload))
+
+    def _check_stamp(self, stamp_ns: int) -> None:
+        topic = self._config.topic
+        age_s = (time.time_ns() - stamp_ns) * 1e-9
+        if stamp_ns == 0:
+            raise ForceError(ForceFault.INVALID, f"topic {topic}: its messages have no time stamp")
+        if not -EARLIEST_S <= age_s <= LATEST_S:
+            text = (
+                f"topic {topic}: its time stamp is {age_s:.3g} s old, accepted are {-EARLIEST_S:g} to "
+                f"{LATEST_S:g} s: are the clocks of both machines synchronised?"
+            )
+            raise ForceError(ForceFault.INVALID, text)
+        if stamp_ns <= self._last_stamp_ns:
+            raise ForceError(ForceFault.INVALID, f"topic {topic}: time stamps do not increase")
