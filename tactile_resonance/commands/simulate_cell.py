@@ -7,23 +7,31 @@ import argparse
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tactile_resonance.simulation.cell_loop import CellLoop
 from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.slcan import SlcanServer
 from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.transducer import CellParameters
+
+BUSES: dict[str, Callable[[str, int], TcpBus]] = {
+    "socketcand": SocketcandServer,
+    "slcan": SlcanServer,
+}
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
     parser = commands.add_parser(
         "simulate-cell",
-        help="a simulated load cell on CAN (socketcand)",
-        description="Serve a simulated six-axis load cell with the frames of Robotous on a CAN bus over TCP "
-        "(socketcand), until interrupted. Lines on standard input change it: 'force 0.01' presses 10 mN on "
+        help="a simulated load cell on CAN",
+        description="Serve a simulated six-axis load cell with the frames of Robotous on a CAN bus over TCP, "
+        "until interrupted. Lines on standard input change it: 'force 0.01' presses 10 mN on "
         "its z axis; 'silent 1', 'stuck 1', 'lose_second_every 2', 'invalid 1', 'saturated 1', 'flipped 1', "
         "'bias_step_n 0.02' make it faulty, and 0 ends the fault.",
     )
@@ -31,6 +39,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--host", default="127.0.1.1", help="address to listen on (default: 127.0.1.1)"
     )
     parser.add_argument("--port", type=int, default=29536, help="0: a free one (default: 29536)")
+    parser.add_argument(
+        "--bus",
+        choices=tuple(BUSES),
+        default="socketcand",
+        help="how it is served over TCP: as a socketcand with the bus can0, or as a serial adapter at "
+        "socket://HOST:PORT (default: socketcand)",
+    )
     parser.add_argument(
         "--cell",
         type=Path,
@@ -49,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"--seed: {options.seed}, expected 0 or above")
     cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed)
     try:
-        bus = SocketcandServer(options.host, options.port)
+        bus = BUSES[options.bus](options.host, options.port)
     except OSError as error:
         raise ValueError(f"{options.host}:{options.port}: {error.strerror or error}") from error
     ended = threading.Event()
@@ -58,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
     wrench = np.zeros(6)
     threading.Thread(target=_listen, args=(cell, wrench), daemon=True).start()
     loop = CellLoop(cell, bus, lambda _: wrench)
-    print(f"load cell: socketcand {options.host}:{bus.port} can0", flush=True)
+    print(f"load cell: {options.bus} {options.host}:{bus.port}", flush=True)
     try:
         loop.run(ended.is_set)
     finally:

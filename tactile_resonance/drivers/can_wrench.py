@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-import socket
+import math
 import threading
 import time
 from collections import deque
@@ -17,10 +17,10 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
+from tactile_resonance.drivers.can_bus import Flow, one_line, open_bus
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, Command
 from tactile_resonance.drivers.force_config import ForceConfig
 
-OPEN_WITHIN_S = 2.0
 ANSWER_WITHIN_S = 0.25
 QUIET_S = 0.02
 KEPT_SAMPLES = 10000
@@ -85,7 +85,7 @@ class CanWrench:
         self._clock = self._new_clock()
         self._assembler = self._new_assembler()
         self.received = 0
-        self._bus = self._open()
+        self._bus = open_bus(self._can.bus, self._where)
         try:
             self._set_up()
         except ForceError:
@@ -93,7 +93,7 @@ class CanWrench:
             raise
         except (can.CanError, OSError) as error:
             self.close()
-            raise ForceError(ForceFault.LINK_LOST, f"{self._where}: {_one_line(error)}") from error
+            raise ForceError(ForceFault.LINK_LOST, f"{self._where}: {one_line(error)}") from error
         self._ended.clear()
         self._alive_s = time.monotonic()
         self._thread = threading.Thread(target=self._receive, name="can_wrench", daemon=True)
@@ -146,7 +146,10 @@ class CanWrench:
         return ClockTracker(self._can.shortest_delay_s, self._can.delay_std_s)
 
     def _new_assembler(self) -> Assembler:
-        return Assembler(self._can.description.frame_ids, 0.5 / self._config.info.rate_hz)
+        # times of arrival scatter by more than a period: there only the order pairs frames
+        adapter = self._can.stamps == "adapter"
+        within_s = 0.5 / self._config.info.rate_hz if adapter else math.inf
+        return Assembler(self._can.description.frame_ids, within_s)
 
     def _clock_uncertainty_s(self) -> float:
         if self._can.stamps == "arrival":
@@ -155,43 +158,6 @@ class CanWrench:
             return self._clock.relation().uncertainty_s
         except ValueError:
             return float("nan")
-
-    def _open(self) -> can.BusABC:
-        """Open the bus within a time: some interfaces try for long, or wait for ever."""
-        settings = self._can.bus
-        if settings["interface"] == "socketcand":
-            # python-can would try for ten seconds, without a pause
-            address = (settings.get("host"), settings.get("port"))
-            try:
-                socket.create_connection(address, OPEN_WITHIN_S).close()
-            except OSError as error:
-                text = f"{self._where}: {_one_line(error)}"
-                raise ForceError(ForceFault.LINK_LOST, text) from error
-        opened: list[can.BusABC] = []
-        failed: list[Exception] = []
-        given_up = threading.Event()
-
-        def open_bus() -> None:
-            try:
-                bus = can.Bus(**settings)
-            except Exception as error:  # each interface has errors of its own
-                failed.append(error)
-                return
-            opened.append(bus)
-            if given_up.is_set():
-                bus.shutdown()
-
-        opener = threading.Thread(target=open_bus, name="can_open", daemon=True)
-        opener.start()
-        opener.join(OPEN_WITHIN_S)
-        if failed:
-            text = f"{self._where}: {_one_line(failed[0])}"
-            raise ForceError(ForceFault.LINK_LOST, text) from failed[0]
-        if not opened:
-            given_up.set()
-            text = f"{self._where}: not open after {OPEN_WITHIN_S:g} s"
-            raise ForceError(ForceFault.LINK_LOST, text)
-        return opened[0]
 
     def _send(self, bus: can.BusABC, data: bytes) -> None:
         description = self._can.description
@@ -258,6 +224,7 @@ class CanWrench:
         period_s = 1 / self._config.info.rate_hz
         wait_s = silent_s / 2 if request is None else min(silent_s / 2, period_s)
         last_s = due_s = time.monotonic()
+        flow = Flow(self._config.info.rate_hz, last_s)
         try:
             while not self._ended.is_set():
                 message = bus.recv(wait_s)
@@ -272,10 +239,15 @@ class CanWrench:
                     raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
                 elif self._take(message):
                     last_s = now_s
+                if request is None and flow.short(now_s, self.received + self.lost):
+                    text = (
+                        f"{self._where}: {flow.rate_hz:.0f} wrenches/s of {1 / period_s:.0f} arrive"
+                    )
+                    raise ForceError(ForceFault.INCOMPLETE, f"{text}: the interface is too slow")
         except ForceError as error:
             self._fault = error
         except Exception as error:  # each interface has errors of its own
-            text = f"{self._where}: {_one_line(error)}"
+            text = f"{self._where}: {one_line(error)}"
             self._fault = ForceError(ForceFault.LINK_LOST, text)
 
     def _silence(self, bus: can.BusABC, since_s: float) -> ForceError:
@@ -291,7 +263,7 @@ class CanWrench:
                     self._send(bus, stop.data)
                     time.sleep(0.002)
             except (can.CanError, OSError) as error:
-                return ForceError(ForceFault.LINK_LOST, f"{text}: {_one_line(error)}")
+                return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
     def _take(self, message: can.Message) -> bool:
@@ -321,7 +293,3 @@ class CanWrench:
         self._clock.add(message.timestamp, arrival_ns)
         stamp_ns = self._clock.relation().to_local_ns(message.timestamp)
         return stamp_ns - round(self._config.latency_s * 1e9)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -4,36 +4,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.simulation.load_cell import CanFrame, LoadCell
+from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S
 
 STALL_S = 0.010
-
-
-class CanBus(Protocol):
-    """What serves the bus to clients: `SocketcandServer`.
-
-    Attributes
-    ----------
-    epoch_s : float
-        UNIX time [s] at time 0 of the frames.
-    """
-
-    epoch_s: float
-
-    def poll(self) -> list[tuple[int, bytes]]:
-        """Identifier and data of each frame that clients have sent."""
-        ...
-
-    def send(self, frames: Iterable[CanFrame], /) -> None:
-        """Hand frames to all clients."""
-        ...
 
 
 class CellLoop:
@@ -42,7 +22,7 @@ class CellLoop:
     Parameters
     ----------
     cell : LoadCell
-    bus : CanBus
+    bus : TcpBus
     wrench_at : callable
         From the time since the start [s] to the wrench on the cell (6,) [N, N m].
 
@@ -54,7 +34,7 @@ class CellLoop:
     """
 
     def __init__(
-        self, cell: LoadCell, bus: CanBus, wrench_at: Callable[[float], NDArray[np.float64]]
+        self, cell: LoadCell, bus: TcpBus, wrench_at: Callable[[float], NDArray[np.float64]]
     ) -> None:
         self._cell, self._bus, self._wrench_at = cell, bus, wrench_at
         self.stalls = 0

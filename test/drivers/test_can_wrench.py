@@ -37,7 +37,7 @@ class CellProcess:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.port = int(self._process.stdout.readline().split(":")[2].split()[0])
+        self.port = int(self._process.stdout.readline().rsplit(":", 1)[1])
 
     def say(self, line):
         self._process.stdin.write(line + "\n")
@@ -299,3 +299,18 @@ def test_another_make_of_cell_is_a_description(tmp_path):
         ended.set()
         player.join()
         bus.shutdown()
+
+
+def test_wrenches_that_pile_up_are_told_by_their_rate(cell):
+    """A cell that sends half of what its configuration says looks to the driver like a slow interface."""
+    config = config_for(cell.port)
+    description = config.can.description
+    slow = replace(description, rates={1000: description.rates[500]})
+    source = CanWrench(config_for(cell.port, description=slow))
+    try:
+        source.start()
+        assert fault_of(source)[0] is ForceFault.INCOMPLETE
+        with pytest.raises(ForceError, match=r"[45]\d\d wrenches/s of 1000"):
+            source.read()
+    finally:
+        source.close()

@@ -64,29 +64,36 @@ class ForceMode:
         As set by ``force_mode_set_gain_scaling`` (0 to 2) and ``force_mode_set_damping`` (0 to 1).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, target: Target) -> None:
         self.task: ForceTask | None = None
+        self._target = target
         self.gain_scaling = 1.0
         self.damping = 0.005
         self._speed = np.zeros(6)
 
+    def begin(self, task: ForceTask) -> None:
+        """Enter force mode, or go on with another task."""
+        if self.task is None:
+            self._target.yield_began_q = self._target.yielded_q
+        self.task = task
+
     def end(self) -> None:
         """Leave force mode."""
         self.task = None
+        self._target.yield_began_q = None
         self._speed = np.zeros(6)
 
-    def step(self, target: Target, measured: FloatArray) -> None:
-        """Move the target aside for one cycle.
+    def step(self, measured: FloatArray) -> None:
+        """Move the target aside for one cycle; raises as `Target.command`.
 
         Parameters
         ----------
-        target : Target
         measured : (6,) array
             Wrench on the TCP from outside, along the axes of the base.
         """
         if self.task is None:
             return
-        task = self.task
+        task, target = self.task, self._target
         axes = self._axes(task, target)
         outside = np.concatenate([axes.T @ measured[:3], axes.T @ measured[3:]])
         # what the arm exerts is the opposite of what it feels

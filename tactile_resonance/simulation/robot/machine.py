@@ -19,7 +19,12 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     Payload,
 )
 from tactile_resonance.simulation.robot.joints import Joints
-from tactile_resonance.simulation.robot.kinematics import jacobian, link_frames, nearest_inverse
+from tactile_resonance.simulation.robot.kinematics import (
+    forward,
+    jacobian,
+    link_frames,
+    nearest_inverse,
+)
 from tactile_resonance.simulation.robot.poses import (
     inverse_transform,
     matrix_from_pose,
@@ -134,7 +139,7 @@ class Machine:
         self.target = Target(config.start_q, config.limits)
         self.joints = Joints(config.start_q, config.tracking, int(rng.integers(2**31)))
         self.sensor = FtSensor(config.ft, rng)
-        self.force_mode = ForceMode()
+        self.force_mode = ForceMode(self.target)
         self.payload = config.tool
         self.gravity_m_s2 = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
         self.external: ExternalSensor | None = None
@@ -172,7 +177,7 @@ class Machine:
 
     def comply(self) -> None:
         """Let force mode move the target aside; raises as `Target.command`."""
-        self.force_mode.step(self.target, self.tcp_force)
+        self.force_mode.step(self.tcp_force)
 
     def step(self, powered: bool) -> None:
         """Follow the target for one cycle and feel what the tool touches."""
@@ -203,7 +208,11 @@ class Machine:
 
     def within_limits(self, q: FloatArray | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
-        return q is not None and bool(np.abs(q).max() <= self.config.limits.joint_range_rad)
+        limits = self.config.limits
+        if q is None or np.abs(q).max() > limits.joint_range_rad:
+            return False
+        place = (forward(q) @ self.target.tcp)[:3, 3]
+        return all(plane.beyond(place) <= 0.0 for plane in limits.planes)
 
     def past_joints(self, steps: int) -> FloatArray:
         """Return the joint angles (6,) of some cycles ago.

@@ -53,13 +53,14 @@ def movej(target: Target, goal: FloatArray, acceleration: float, speed: float) -
     if tool_speed > 0.0:
         speed = min(speed, _SPEED_MARGIN * target.limits.tool_speed_m_s / tool_speed)
     profile = Trapezoid(length, speed, acceleration)
+    yielded = target.yielded_q
     time = 0.0
     while time < profile.duration:
         time += CYCLE_S * target.pace
         way, rate = profile.at(time)
         # exact at the end, whatever the rounding of the direction
         q = goal if way == length else start + direction * way
-        target.command(q, direction * (rate * target.pace))
+        target.command(q + (target.yielded_q - yielded), direction * (rate * target.pace))
         yield
 
 
@@ -79,15 +80,18 @@ def movel(target: Target, goal: FloatArray, acceleration: float, speed: float) -
         return
     profile = Trapezoid(length, min(speed, target.limits.tool_speed_m_s), acceleration)
     direction = np.concatenate([shift, turn]) / length
+    yielded_m, yielded_turn = target.yielded_m, target.yielded_turn
     time = 0.0
     while time < profile.duration:
         time += CYCLE_S * target.pace
         way, rate = profile.at(time)
         twist = direction * (rate * target.pace)
-        if way == length:
-            target.command_tool(goal, twist)
-        else:
-            target.command_tool(turned(start, direction[:3] * way, direction[3:] * way), twist)
+        tool = goal.copy()
+        if way < length:
+            tool = turned(start, direction[:3] * way, direction[3:] * way)
+        tool[:3, :3] = target.yielded_turn @ yielded_turn.T @ tool[:3, :3]
+        tool[:3, 3] += target.yielded_m - yielded_m
+        target.command_tool(tool, twist)
         yield
 
 
@@ -149,7 +153,7 @@ def stopj(target: Target, deceleration: float) -> Motion:
 
 
 def servoj(target: Target, goal: FloatArray, time_s: float, lookahead_s: float) -> Motion:
-    """Follow joint angles `goal` (6,) for a time.
+    """Follow joint angles `goal` (6,) for a time, beside them by what force mode has yielded.
 
     The model's choice: the joints approach the goal with the look-ahead time as time constant, under
     `SERVO_ACCELERATION_RAD_S2`; a demand for more than the joints' speed is a protective stop, as on
@@ -160,7 +164,7 @@ def servoj(target: Target, goal: FloatArray, time_s: float, lookahead_s: float) 
     if not time_s > 0.0:
         raise ScriptError(f"servoj: t {time_s:g}; accepted is above 0 s")
     for _ in range(max(1, round(time_s / CYCLE_S))):
-        wanted = (goal - target.q) / lookahead_s * target.pace
+        wanted = (goal + target.aside_q - target.q) / lookahead_s * target.pace
         _step_joints(target, wanted, SERVO_ACCELERATION_RAD_S2)
         yield
 

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.simulation.robot.registers import Registers
+from tactile_resonance.simulation.robot.target import ScriptError
 
 FloatArray = NDArray[np.float64]
 # Steps once in a cycle, until it is done.
@@ -66,13 +68,22 @@ class Script:
         return self._registers.input_int[number + self.offset]
 
     def double(self, number: int) -> float:
-        """Return a double input register."""
-        return self._registers.input_double[number + self.offset]
+        """Return a double input register; raises as `doubles`."""
+        return float(self.doubles(number, 1)[0])
 
     def doubles(self, number: int, count: int = 6) -> FloatArray:
-        """Return double input registers, shape (count,)."""
+        """Return double input registers, shape (count,).
+
+        Raises
+        ------
+        ScriptError
+            Where one of them is no finite number.
+        """
         first = number + self.offset
-        return np.array(self._registers.input_double[first : first + count], dtype=float)
+        values = self._registers.input_double[first : first + count]
+        if not all(map(isfinite, values)):
+            raise ScriptError(f"input_double_register_{first}...: {values}; accepted are numbers")
+        return np.array(values, dtype=float)
 
     def status(self, value: int) -> None:
         """Write the state of the command loop."""

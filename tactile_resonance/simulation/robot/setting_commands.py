@@ -33,9 +33,10 @@ class SettingCommands:
         """Give way along chosen axes until pressing with a wrench."""
         script = self._script
         selection = np.array([script.integer(2 + axis) == 1 for axis in range(6)])
-        self._machine.force_mode.task = ForceTask(
+        task = ForceTask(
             script.doubles(0), selection, script.doubles(6), script.integer(1), script.doubles(12)
         )
+        self._machine.force_mode.begin(task)
 
     def end_force_mode(self) -> Thread:
         """End force mode and stop."""

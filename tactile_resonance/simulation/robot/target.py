@@ -27,6 +27,26 @@ class ProtectiveStop(Exception):
 
 
 @dataclass(frozen=True)
+class SafetyPlane:
+    """A plane of the safety configuration that the TCP must not pass.
+
+    Attributes
+    ----------
+    point_m : (3,) array
+        A point of it in the base.
+    normal : (3,) array
+        Of length 1, to the side where the TCP may be.
+    """
+
+    point_m: FloatArray
+    normal: FloatArray
+
+    def beyond(self, place_m: FloatArray) -> float:
+        """How far a place (3,) is on the wrong side [m]; negative on the right one."""
+        return float(-self.normal @ (place_m - self.point_m))
+
+
+@dataclass(frozen=True)
 class MotionLimits:
     """Limits of the arm and of its safety configuration.
 
@@ -43,6 +63,8 @@ class MotionLimits:
         configuration.
     brake_rad_s2 : float
         Deceleration of stops that no program asks for (assumed).
+    planes : tuple of SafetyPlane
+        The model stops at a plane; a robot slows down before it.
     """
 
     joint_range_rad: float = math.tau
@@ -50,6 +72,7 @@ class MotionLimits:
     tool_speed_m_s: float = 1.5
     tool_force_n: float = 150.0
     brake_rad_s2: float = 10.0
+    planes: tuple[SafetyPlane, ...] = ()
 
 
 class Target:
@@ -65,6 +88,15 @@ class Target:
         Tool centre point in the flange, as the program set it.
     pace : float
         Speed slider: share of the programmed speed, above 0 to 1.
+    commanded : bool
+        Whether the program moved the arm in this cycle.
+    yielded_q : (6,) array
+    yielded_m : (3,) array
+    yielded_turn : (3, 3) array
+        All that force mode has moved the target aside so far, of the joints and of the TCP. A path
+        goes on beside itself by what was yielded since it began.
+    yield_began_q : (6,) array or None
+        `yielded_q` when force mode began; None without it.
     """
 
     def __init__(self, q: FloatArray, limits: MotionLimits) -> None:
@@ -77,6 +109,15 @@ class Target:
         self.frames = link_frames(self.q)
         self._cycle_qd = self.qd
         self.commanded = False
+        self.yielded_q = np.zeros(6)
+        self.yielded_m = np.zeros(3)
+        self.yielded_turn = np.eye(3)
+        self.yield_began_q: FloatArray | None = None
+
+    @property
+    def aside_q(self) -> FloatArray:
+        """How far force mode has moved the joints aside since it began (6,); 0 without it."""
+        return np.zeros(6) if self.yield_began_q is None else self.yielded_q - self.yield_began_q
 
     @property
     def tool(self) -> FloatArray:
@@ -121,7 +162,9 @@ class Target:
         """
         if self.commanded:
             raise ScriptError("another thread is already controlling the robot")
-        self._check(q, qd, (q - self.q) / CYCLE_S)
+        if frames is None:
+            frames = link_frames(q)
+        self._check(q, frames, qd, (q - self.q) / CYCLE_S)
         self.commanded = True
         self._set(q, qd, frames)
 
@@ -138,10 +181,15 @@ class Target:
 
     def shift(self, shift_m: FloatArray, turn_rad: FloatArray) -> None:
         """Move the target TCP aside by a compliance, beside what the program commands."""
-        q = self.solved(turned(self.tool, shift_m, turn_rad), self.q)
-        aside = (q - self.q) / CYCLE_S
-        self._check(q, aside, aside)
-        self._set(q, self.qd)
+        before = self.tool
+        aside = turned(before, shift_m, turn_rad)
+        q = self.solved(aside, self.q)
+        frames = link_frames(q)
+        self._check(q, frames, (q - self.q) / CYCLE_S)
+        self.yielded_q = self.yielded_q + (q - self.q)
+        self.yielded_m = self.yielded_m + shift_m
+        self.yielded_turn = aside[:3, :3] @ before[:3, :3].T @ self.yielded_turn
+        self._set(q, self.qd, frames)
 
     def brake(self, deceleration_rad_s2: float) -> None:
         """Brake by one cycle, all joints in proportion."""
@@ -172,8 +220,13 @@ class Target:
             raise ProtectiveStop(f"no joint angles reach the position {np.round(tool[:3, 3], 4)} m")
         return q
 
-    def _check(self, q: FloatArray, *speeds: FloatArray) -> None:
+    def _check(self, q: FloatArray, frames: FloatArray, *speeds: FloatArray) -> None:
         limits = self.limits
+        for plane in limits.planes:
+            here = plane.beyond(self.tool[:3, 3])
+            # a TCP found beyond, as after a change of TCP, may only come back
+            if plane.beyond((frames[-1] @ self.tcp)[:3, 3]) > max(0.0, here):
+                raise ProtectiveStop("the tool would pass a safety plane")
         reached = float(np.abs(q).max())
         if reached > limits.joint_range_rad:
             raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")

@@ -4,8 +4,10 @@
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -60,6 +62,43 @@ class Robot:
     def order(self, command, **fields):
         return order(self.host, command, **fields)
 
+    def dashboard(self, line):
+        with socket.create_connection((self.host, 29999), 5) as channel:
+            lines = channel.makefile()
+            lines.readline()
+            channel.sendall(line.encode() + b"\n")
+            return lines.readline().strip()
+
+    def until(self, **wanted):
+        """Wait until the control port's state is as wanted."""
+        end = time.monotonic() + 10
+        while any(self.order("state")[name] != value for name, value in wanted.items()):
+            assert time.monotonic() < end, f"{self.order('state')} is never {wanted}"
+            time.sleep(0.02)
+
+    def unlock(self):
+        end = time.monotonic() + 10
+        while self.dashboard("unlock protective stop") != "Protective stop releasing":
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+    def power_up(self):
+        self.dashboard("power on")
+        self.until(robot_mode="IDLE")
+        self.dashboard("brake release")
+        self.until(robot_mode="RUNNING")
+
+    def recover(self):
+        """End every fault that a failed test may have left."""
+        self.order("release_emergency_stop")
+        for name, value in (("remote_control", True), ("script_starts", True)):
+            self.order(name, value=value)
+        self.order("registers_in_use", value=False)
+        if self.order("state")["safety_mode"] == "PROTECTIVE_STOP":
+            self.unlock()
+        if self.order("state")["robot_mode"] != "RUNNING":
+            self.power_up()
+
     def end(self):
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
@@ -84,8 +123,15 @@ def start_robots():
         robot.end()
 
 
+@pytest.fixture
+def robot(module_robot):
+    """A robot without faults, shared by the tests of a module."""
+    module_robot.recover()
+    return module_robot
+
+
 @pytest.fixture(scope="module")
-def robot():
+def module_robot():
     """One robot for the tests of a module."""
     robot = Robot(f"{RUN}.200", "--tissue", "gel12")
     try:
@@ -95,6 +141,20 @@ def robot():
         robot.end()
 
 
+def config(host, **fields):
+    given = {"max_state_age_s": 0.1, "realtime_priority": max(0, PRIORITY - 1), **fields}
+    return UrArmConfig(host, TIP_IN_FLANGE, **given)
+
+
+@pytest.fixture(scope="module")
+def module_arm(module_robot):
+    """One arm for the tests of a module, not yet connected."""
+    need_ur_rtde()
+    arm = UrArm(config(module_robot.host))
+    yield arm
+    arm.close()
+
+
 @pytest.fixture
 def start_arm():
     """Make an arm; all are closed after the test."""
@@ -102,8 +162,7 @@ def start_arm():
     arms = []
 
     def start(host, **fields):
-        given = {"max_state_age_s": 0.1, "realtime_priority": max(0, PRIORITY - 1), **fields}
-        arms.append(UrArm(UrArmConfig(host, TIP_IN_FLANGE, **given)))
+        arms.append(UrArm(config(host, **fields)))
         return arms[-1]
 
     yield start

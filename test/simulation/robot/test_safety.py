@@ -6,6 +6,7 @@ import pytest
 
 from tactile_resonance.simulation.robot.controller import RuntimeState, UrController
 from tactile_resonance.simulation.robot.safety import RefusedError, RobotMode, SafetyMode
+from tactile_resonance.simulation.robot.target import MotionLimits, SafetyPlane
 
 PROGRAM = """def rtde_control():
   global reg_offset_int = 0
@@ -107,7 +108,7 @@ def test_a_singular_path_is_a_protective_stop_of_the_robot(make_client):
     start = client.output("target_TCP_pose")
     client.write(3, [*(start + [-0.6, 0, 0, 0, 0, 0]), 0.25, 0.5])
     fastest = 0.0
-    while client.controller.program_running:
+    for _ in range(2000):
         client.controller.step()
         fastest = max(fastest, np.abs(client.output("target_qd")).max())
     assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
@@ -209,3 +210,70 @@ def test_same_seed_same_robot():
         run(controller, 0.05)
     assert one.outputs("ft_raw_wrench") == two.outputs("ft_raw_wrench")
     assert one.outputs("ft_raw_wrench") != other.outputs("ft_raw_wrench")
+
+
+def test_a_safety_plane_stops_the_tool_and_is_known_to_the_queries(make_client):
+    height = 0.4
+    plane = SafetyPlane(np.array([0.0, 0.0, height]), np.array([0.0, 0.0, 1.0]))
+    client = make_client(limits=MotionLimits(planes=(plane,)))
+    pose = client.output("target_TCP_pose")
+    assert pose[2] > height
+    below = [*pose[:2], height - 0.001, *pose[3:]]
+    client.call(36, below)
+    assert client.answer == 0
+    client.call(36, [*pose[:2], height + 0.001, *pose[3:]])
+    assert client.answer == 1
+    client.stream(3, [*below, 0.05, 0.5])
+    client.run((pose[2] - height) / 0.05 + 0.5)
+    assert not client.controller.program_running
+    assert "safety plane" in client.controller.safety.reason
+    # it brakes within tenths of a millimetre
+    assert client.output("target_TCP_pose")[2] == pytest.approx(height, abs=3e-4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("command", [1, 2, 3, 6, 9, 10, 11, 24, 29, 46])
+def test_numbers_that_are_none_end_the_program_and_move_nothing(make_client, command, value):
+    client = make_client()
+    before = client.output("target_q")
+    client.write(command, [0.1, value, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.1, 0.1, 300])
+    client.run(0.02)
+    assert not client.controller.program_running
+    assert "accepted are numbers" in client.controller.log[-1]
+    assert np.array_equal(client.output("target_q"), before)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_limits_hold_whatever_a_client_sends(make_client, seed):
+    rng = np.random.default_rng(seed)
+    client = make_client(seed=seed)
+    controller, limits = client.controller, client.controller.machine.config.limits
+    travelled = 0.0
+    for _ in range(25):
+        command = int(rng.choice([1, 2, 3, 4, 6, 7, 9, 10, 11, 15, 16, 24, 29, 33, 34, 51]))
+        values = rng.normal(0, 1, 18) * rng.choice([0.01, 0.3, 2.0])
+        if command in (1, 4, 11):
+            values[:6] += client.output("target_q")
+        if command in (2, 3, 24):
+            values[:6] = client.output("target_TCP_pose") + 0.2 * values[:6]
+        values[6:11] = [*np.abs(values[6:10]), 300.0]
+        client.write(command, values, [int(rng.integers(2)), *rng.integers(0, 2, 6)])
+        for _ in range(int(rng.integers(5, 200))):
+            before = client.output("target_q")
+            controller.step()
+            speed = np.abs(client.output("target_qd")).max()
+            assert speed <= limits.joint_speed_rad_s * (1 + 1e-6)
+            assert np.abs(client.output("target_q")).max() <= limits.joint_range_rad
+            way = np.abs(client.output("target_q") - before).max()
+            travelled += way
+            # what the program commands and what force mode adds, each within the limit
+            assert way <= 2 * limits.joint_speed_rad_s * 0.002 * (1 + 1e-6)
+        client.write(0)
+        controller.step()
+        if not controller.program_running:
+            client.run(5.2)
+            assert not client.output("target_qd").any()
+            controller.unlock_protective_stop()
+            controller.start_program(PROGRAM)
+            controller.step()
+    assert travelled > 0.5

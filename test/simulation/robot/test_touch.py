@@ -166,3 +166,30 @@ def test_the_tip_trembles_where_the_encoders_stand_still(make_client, plant):
     assert np.array_equal(client.output("actual_q"), q)
     # 3 micrometres rms over 6 s, some hundred correlation times
     assert np.std(heights) == pytest.approx(3e-6, rel=0.25)
+
+
+@pytest.mark.parametrize("move", ["movel", "movej", "servoj"])
+def test_force_mode_keeps_its_force_beside_a_path(touching, move):
+    limits = [0.05] * 6
+    touching.stream(6, [*[0] * 6, 0, 0, -8.0, 0, 0, 0, *limits], [2, 0, 0, 1, 0, 0, 0])
+    touching.run(1.5)
+    start, q = touching.output("target_TCP_pose"), touching.output("target_q")
+    pressed = depth(touching)
+    if move == "movel":
+        # 2 cm aside and 1 mm up, which the force takes back
+        touching.call(3, [*(start + [0.02, 0, 0.001, 0, 0, 0]), 0.02, 0.2])
+        assert touching.output("target_TCP_pose")[0] - start[0] == pytest.approx(0.02, abs=1e-9)
+    else:
+        # the base turns: the tip stays in its plane
+        goal = q + [0.05, 0, 0, 0, 0, 0]
+        if move == "movej":
+            touching.call(1, [*goal, 0.05, 0.2])
+        else:
+            # angles without what force mode yielded, as a client plans them
+            planned = goal - touching.controller.machine.target.aside_q
+            touching.stream(11, [*planned, 0, 0, 0.002, 0.1, 300])
+            touching.run(1.0)
+        assert touching.output("target_q")[0] - q[0] == pytest.approx(0.05, abs=1e-4)
+    touching.run(1.0)
+    assert depth(touching) == pytest.approx(pressed, abs=3e-6)
+    assert touching.output("actual_TCP_force")[2] == pytest.approx(8.0, rel=0.01)

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The link to the arm: command to motion, rate and gaps of states, processor time of each process.
+
+Runs the simulated robot as a process and `UrArm` on it, over the unmodified ur_rtde.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.interfaces import ArmError
+from tactile_resonance.drivers.ur_arm import UrArm
+from tactile_resonance.drivers.ur_config import UrArmConfig
+from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
+from tactile_resonance.simulation.robot.control_port import order
+
+FloatArray = NDArray[np.float64]
+
+HOST = "127.0.77.1"
+SPEED_M_S, ACCELERATION_M_S2 = 0.02, 2.0
+MOVED_M_S = 0.0005
+PERIOD_S = 0.004  # of the loop that commands
+
+
+@dataclass(frozen=True)
+class LinkResult:
+    """One run.
+
+    Attributes
+    ----------
+    commands_s, motions_s : (n,) arrays
+        Seconds from `speed` to the state that shows motion: until it is seen here, and by the time
+        stamps of the robot's states on this machine's clock.
+    arrivals_s : (m,) array
+        Age at first sight of each state.
+    gaps_s : (m - 1,) array
+        Between the robot's time stamps of states seen one after the other.
+    rate_hz : float
+        States that the client process received in the last second, as it counts them.
+    cpu : dict
+        Share of one core by process.
+    clock_uncertainty_s : float
+    stalls : int
+        Of the simulation, longer than 10 ms.
+    """
+
+    commands_s: FloatArray
+    motions_s: FloatArray
+    arrivals_s: FloatArray
+    gaps_s: FloatArray
+    rate_hz: float
+    cpu: dict[str, float]
+    clock_uncertainty_s: float
+    stalls: int
+
+
+def run(output: Path, quick: bool) -> str:
+    """Measure, write ``robot.md`` and ``robot.png`` into `output`, and return the table.
+
+    Raises
+    ------
+    ValueError
+        Where ur_rtde is not installed or the simulated robot does not start.
+    """
+    if find_spec("rtde_control") is None:
+        raise ValueError("benchmark robot: ur_rtde is not installed (no wheel for Python 3.13)")
+    seconds, repetitions = (3.0, 8) if quick else (20.0, 60)
+    results = {}
+    for name, priority in (("normal priority", 0), ("SCHED_FIFO", 2)):
+        if priority and not _may_take(priority):
+            continue
+        for attempt in range(2):  # a stall of the simulation makes a run invalid; once more then
+            result = measure(seconds, repetitions, priority)
+            if result.stalls == 0 or attempt == 1:
+                break
+        results[name] = result
+    text = _report(results, seconds)
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "robot.md").write_text(text, encoding="utf-8")
+    _draw(results, output / "robot.png")
+    return text
+
+
+def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
+    """Start robot and arm, command speeds back and forth, then watch the states."""
+    with _simulated_robot(priority) as robot:
+        arm = UrArm(
+            UrArmConfig(
+                HOST,
+                TIP_IN_FLANGE,
+                max_state_age_s=0.5,
+                max_acceleration_m_s2=ACCELERATION_M_S2,
+                realtime_priority=max(0, priority - 1),
+            )
+        )
+        try:
+            arm.connect()
+            _rest(arm, 1.5)  # the clocks are related meanwhile
+            stalls = order(HOST, "state")["stalls"]
+            pairs = [_respond(arm, (-1) ** k) for k in range(repetitions)]
+            assert arm._process is not None
+            pids = {"simulated robot": robot.pid, "client": arm._process.pid, "owner": os.getpid()}
+            before = {name: _cpu_s(pid) for name, pid in pids.items()}
+            start_s = time.monotonic()
+            arrivals, stamps = _watch(arm, seconds)
+            took_s = time.monotonic() - start_s
+            cpu = {name: (_cpu_s(pid) - before[name]) / took_s for name, pid in pids.items()}
+            return LinkResult(
+                commands_s=np.array([seen for seen, _ in pairs]),
+                motions_s=np.array([stamped for _, stamped in pairs]),
+                arrivals_s=arrivals,
+                gaps_s=np.diff(stamps),
+                rate_hz=arm.rate_hz,
+                cpu=cpu,
+                clock_uncertainty_s=arm.clock_uncertainty_s,
+                stalls=order(HOST, "state")["stalls"] - stalls,
+            )
+        finally:
+            arm.close()
+
+
+def _respond(arm: UrArm, sign: int) -> tuple[float, float]:
+    """Seconds from a command to motion: seen, and by the state's own time."""
+    commanded_ns = time.time_ns()
+    arm.speed(np.array([0, 0, sign * SPEED_M_S, 0, 0, 0]), ACCELERATION_M_S2)
+    while True:
+        sample = arm.state()
+        if abs(sample.tip_velocity[2]) > MOVED_M_S:
+            break
+        time.sleep(0.0001)
+    seen_ns = time.time_ns()
+    _rest(arm, 0.05)
+    arm.stop(ACCELERATION_M_S2)
+    _rest(arm, 0.15 + 0.02 * np.random.default_rng(seen_ns).random())
+    return (seen_ns - commanded_ns) * 1e-9, (sample.time_ns - commanded_ns) * 1e-9
+
+
+def _rest(arm: UrArm, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        with contextlib.suppress(ArmError):
+            arm.state()
+        time.sleep(PERIOD_S)
+
+
+def _watch(arm: UrArm, seconds: float) -> tuple[FloatArray, FloatArray]:
+    """Age at first sight and robot time of every state seen while a speed is commanded."""
+    ages: list[float] = []
+    stamps: list[float] = []
+    end_s = time.monotonic() + seconds
+    next_s = 0.0
+    while (now_s := time.monotonic()) < end_s:
+        if now_s >= next_s:
+            # back and forth: the tip stays within some millimetres
+            direction = 1 if int(now_s) % 2 else -1
+            arm.speed(np.array([0, 0, direction * 0.002, 0, 0, 0]), ACCELERATION_M_S2)
+            next_s = now_s + PERIOD_S
+        sample = arm.state()
+        if not stamps or sample.robot_time_s > stamps[-1]:
+            ages.append((time.time_ns() - sample.time_ns) * 1e-9)
+            stamps.append(sample.robot_time_s)
+        time.sleep(0.0003)
+    arm.stop(ACCELERATION_M_S2)
+    return np.array(ages), np.array(stamps)
+
+
+@contextlib.contextmanager
+def _simulated_robot(priority: int) -> Iterator[subprocess.Popen]:
+    robot = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
+            *("--tissue", "gel12", "--priority", str(priority)),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        assert robot.stdout is not None
+        ready, _, _ = select.select([robot.stdout], [], [], 30)
+        line = robot.stdout.readline() if ready else "no answer within 30 s"
+        if "ready at" not in line:
+            raise ValueError(f"benchmark robot: the simulated robot does not start: {line.strip()}")
+        yield robot
+    finally:
+        robot.send_signal(signal.SIGTERM)
+        robot.communicate(timeout=10)
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time of a process so far [s] (proc(5), fields 14 and 15 of stat)."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _may_take(priority: int) -> bool:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def _report(results: dict[str, LinkResult], seconds: float) -> str:
+    rows = [
+        "# The link to the arm",
+        "",
+        "`tactile_resonance benchmark robot`. The robot is simulated (`simulate-ur`, with tissue and load",
+        "cell), the client the unmodified ur_rtde 1.6.5, all on one machine over loopback: these are figures",
+        "of the software, not of a robot, whose network and controller add their own. The simulated arm",
+        "follows with 4 ms dead time and a lag of 10 ms, which are part of the time to motion; motion is",
+        f"{MOVED_M_S * 1e3:g} mm/s of {SPEED_M_S * 1e3:g} mm/s asked for, {ACCELERATION_M_S2:g} m/s2. "
+        f"States are watched for {seconds:g} s while a",
+        f"velocity is commanded every {PERIOD_S * 1e3:g} ms. Two cores; shares are of one core.",
+        "",
+        "| | " + " | ".join(results) + " |",
+        "|---|" + "---|" * len(results),
+    ]
+
+    def row(name: str, cells: list[str]) -> None:
+        rows.append(f"| {name} | " + " | ".join(cells) + " |")
+
+    def spread(values: FloatArray) -> str:
+        low, middle, high = np.quantile(values, [0.5, 0.99, 1.0]) * 1e3
+        return f"{low:.1f} / {middle:.1f} / {high:.1f}"
+
+    each = list(results.values())
+    row(
+        "command to motion, seen by its owner: median / 99 % / max [ms]",
+        [spread(r.commands_s) for r in each],
+    )
+    row("the same by the robot's time stamp [ms]", [spread(r.motions_s) for r in each])
+    row(
+        "age of a state at first sight: median / 99 % / max [ms]",
+        [spread(r.arrivals_s) for r in each],
+    )
+    row("states a second, received by the client", [f"{r.rate_hz:.0f}" for r in each])
+    row("states a second, seen by the owner", [f"{1 / r.gaps_s.mean():.0f}" for r in each])
+    row("longest gap between states seen [ms]", [f"{r.gaps_s.max() * 1e3:.0f}" for r in each])
+    row(
+        "clock of the robot known to, 1 sigma [ms]",
+        [f"{r.clock_uncertainty_s * 1e3:.2f}" for r in each],
+    )
+    for name in each[0].cpu:
+        row(f"processor, {name} [%]", [f"{100 * r.cpu[name]:.0f}" for r in each])
+    row("stalls of the simulation beyond 10 ms", [str(r.stalls) for r in each])
+    return "\n".join(rows) + "\n"
+
+
+def _draw(results: dict[str, LinkResult], path: Path) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    for name, result in results.items():
+        for axes, values in ((left, result.commands_s), (right, result.arrivals_s)):
+            ordered = np.sort(values) * 1e3
+            axes.step(ordered, 1 - np.arange(len(ordered)) / len(ordered), where="post", label=name)
+    left.set_xlabel("command to motion, seen by its owner [ms]")
+    right.set_xlabel("age of a state at first sight [ms]")
+    for axes in (left, right):
+        axes.set_yscale("log")
+        axes.set_ylabel("share of values above")
+        axes.legend()
+    figure.suptitle("Link to the arm (simulated robot on loopback)")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

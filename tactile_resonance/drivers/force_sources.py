@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The force source that a configuration asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tactile_resonance.contact.interfaces import Cell
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.drivers.force_config import ForceConfig
+from tactile_resonance.drivers.rtde_wrench import RtdeWrench
+
+
+def force_source(
+    config: ForceConfig,
+    arm_state: Callable[[], ArmSample],
+    *,
+    arm_clock_std_s: Callable[[], float] | None = None,
+    topic: Callable[[ForceConfig], Cell] | None = None,
+) -> TipForce:
+    """Make the source; nothing is opened before its `start`.
+
+    Parameters
+    ----------
+    config : ForceConfig
+    arm_state : callable
+        Newest state of the arm, without waiting.
+    arm_clock_std_s : callable or None
+        How well the arm's times are known [s].
+    topic : callable or None
+        Makes the cell of a topic; only a node can.
+
+    Raises
+    ------
+    ValueError
+        If python-can is not installed, or a topic is asked for outside of a node.
+    """
+    cell: Cell
+    if config.kind == "can":
+        try:
+            from tactile_resonance.drivers.can_wrench import CanWrench
+        except ImportError as error:
+            raise ValueError("kind: can needs python-can: pip install python-can") from error
+        cell = CanWrench(config)
+    elif config.kind == "rtde":
+        cell = RtdeWrench(config, arm_state, arm_clock_std_s)
+    elif topic is None:
+        raise ValueError("kind: topic is for nodes only")
+    else:
+        cell = topic(config)
+    return TipForce(cell, config.mounting, arm_state, config.inertia_window_s)
