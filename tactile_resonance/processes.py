@@ -115,6 +115,17 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
     raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
 
 
+def may_take_priority(priority: int) -> bool:
+    """Whether this process may run under SCHED_FIFO with a priority; tried, and left as it was."""
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(0, *before)
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
 def take_priority(priority: int) -> None:
     """Run this process under SCHED_FIFO.
 

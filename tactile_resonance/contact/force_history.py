@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 
 import numpy as np
@@ -12,7 +13,7 @@ LEAST_SAMPLES = 4 * BATCHES
 
 
 class ForceHistory:
-    """Normal forces of the last seconds.
+    """Normal forces of the last seconds; one thread may add while another asks.
 
     Parameters
     ----------
@@ -23,14 +24,16 @@ class ForceHistory:
     def __init__(self, length_s: float = 60.0) -> None:
         self._length_ns = round(length_s * 1e9)
         self._samples: deque[tuple[int, float]] = deque()
+        self._lock = threading.Lock()
 
     def add(self, time_ns: int, force_n: float) -> None:
         """Take one force [N]; one older than the newest is of a clock set back: all before is forgotten."""
-        if self._samples and time_ns < self._samples[-1][0]:
-            self._samples.clear()
-        self._samples.append((time_ns, force_n))
-        while self._samples[0][0] < time_ns - self._length_ns:
-            self._samples.popleft()
+        with self._lock:
+            if self._samples and time_ns < self._samples[-1][0]:
+                self._samples.clear()
+            self._samples.append((time_ns, force_n))
+            while self._samples[0][0] < time_ns - self._length_ns:
+                self._samples.popleft()
 
     def mean(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Mean force from `start_ns` to `end_ns` [N] and its standard deviation.
@@ -45,7 +48,8 @@ class ForceHistory:
             NaN, NaN where nothing was heard in that time; a standard deviation of NaN where fewer than
             32 samples were.
         """
-        forces = np.array([f for t, f in self._samples if start_ns <= t <= end_ns])
+        with self._lock:
+            forces = np.array([f for t, f in self._samples if start_ns <= t <= end_ns])
         if forces.size == 0:
             return float("nan"), float("nan")
         if forces.size < LEAST_SAMPLES:
@@ -55,4 +59,5 @@ class ForceHistory:
 
     def newest(self) -> tuple[int, float]:
         """Time [ns] and force [N] heard last; 0 and NaN before the first."""
-        return self._samples[-1] if self._samples else (0, float("nan"))
+        with self._lock:
+            return self._samples[-1] if self._samples else (0, float("nan"))

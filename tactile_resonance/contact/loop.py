@@ -101,8 +101,16 @@ class ContactLoop:
 
     def cycle(self) -> None:
         """Wait for the next period and run it."""
-        period_ns = round(1e9 * self.controller.parameters.period_s)
+        self.wait()
+        self.run_period()
+
+    def wait(self) -> None:
+        """Wait for the next period; requests may be made meanwhile."""
         self._clock.wait_until(self._next_ns)
+
+    def run_period(self) -> None:
+        """Read both devices, decide, command."""
+        period_ns = round(1e9 * self.controller.parameters.period_s)
         now = self._clock.now_ns()
         late_ns = now - self._next_ns
         self.cycles += 1

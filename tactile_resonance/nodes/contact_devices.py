@@ -18,6 +18,7 @@ from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
+from tactile_resonance.processes import may_take_priority, take_priority
 from tactile_resonance.simulation.parameters import read_sensor
 
 PARAMETERS = (
@@ -46,6 +47,15 @@ PARAMETERS = (
         read_only=True,
     ),
     Parameter(
+        "realtime_priority",
+        20,
+        "Priority (SCHED_FIFO) of the control loop and of the robot's client, where the system permits it; "
+        "0: none.",
+        0,
+        99,
+        read_only=True,
+    ),
+    Parameter(
         "sensor_config",
         "config/sensors/bimorph.yaml",
         "The sensor, for the radius of its tip.",
@@ -54,11 +64,26 @@ PARAMETERS = (
 )
 
 
-def make_arm(node: Node) -> UrArm:
+def take_realtime(node: Node) -> int:
+    """Priority that this thread, and those it starts, has from now on; 0 where it is not permitted."""
+    (priority,) = values(node, "realtime_priority")
+    if priority and may_take_priority(priority):
+        take_priority(priority)
+        return priority
+    if priority:
+        node.get_logger().warning(
+            f"realtime_priority: {priority} is not permitted here (rtprio limit); on a busy machine the "
+            "control loop will be late, and stop"
+        )
+    return 0
+
+
+def make_arm(node: Node, priority: int) -> UrArm:
     """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
-    config, host = values(node, "robot_config", "robot_host")
-    arm = read_ur_config(_path(config))
-    return UrArm(replace(arm, host=host) if host else arm)
+    name, host = values(node, "robot_config", "robot_host")
+    config = read_ur_config(_path(name))
+    config = replace(config, host=host or config.host)
+    return UrArm(replace(config, realtime_priority=config.realtime_priority or priority))
 
 
 def make_force_source(node: Node, arm: UrArm) -> TipForce:

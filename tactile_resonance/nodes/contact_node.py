@@ -68,7 +68,8 @@ class ContactNode(ManagedNode):
         self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = self.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._state = self.publish_on(msg.ContactState, "contact_state", STREAM)
-        self._arm = contact_devices.make_arm(self)
+        self._priority = contact_devices.take_realtime(self)
+        self._arm = contact_devices.make_arm(self, self._priority)
         self.resources.callback(self._arm.close)
         self._force = contact_devices.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
@@ -112,6 +113,7 @@ class ContactNode(ManagedNode):
             "cycles": str(loop.cycles),
             "overruns": str(loop.overruns),
             "force source": self._force.info.name,
+            "real-time priority": str(self._priority or "none"),
         }
 
     # requests, in the executor's thread

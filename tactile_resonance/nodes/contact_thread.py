@@ -87,8 +87,8 @@ class ContactThread:
     def _run(self) -> None:
         try:
             while self._running:
-                # the wait for the next period is in the cycle: requests come in between two
+                self.loop.wait()
                 with self._lock:
-                    self.loop.cycle()
+                    self.loop.run_period()
         except Exception as error:
             self.error = error

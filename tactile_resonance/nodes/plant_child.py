@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.commands.simulate_ur import READY
-from tactile_resonance.processes import end_with_parent
+from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.simulation.robot.control_port import order
 
 START_WITHIN_S = 30.0
 END_WITHIN_S = 3.0
+PRIORITY = 20  # of the simulated controller, as a real one has hardware of its own
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class PlantChild:
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
                 *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
                 *(str(float(value)) for value in table_in_base),
+                *("--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

@@ -21,7 +21,7 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.running import NEWEST, STREAM
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.record import Contact
 from tactile_resonance.scan.measurement import MeasurementDesign
@@ -41,6 +41,7 @@ POLL_S = 0.005
 NODE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
 RETRACT_WITHIN_S = 15.0
+STATE_WITHIN_S = 1.0
 PLACE_FOR_S = 0.2
 
 
@@ -74,7 +75,10 @@ class NodeHands:
         node.resources.callback(self._measure.destroy)
         self._contact: ActionClient | None = None
         self._touching = False
+        self._state: msg.ContactState | None = None
         if with_robot:
+            # the newest only: the recorder's may have to wait behind what else is recorded
+            node.listen(msg.ContactState, "contact_state", self._on_state, NEWEST)
             self._contact = ActionClient(node, MakeContact, "make_contact")
             node.resources.callback(self._contact.destroy)
             self._retract = node.create_client(Trigger, "retract")
@@ -95,6 +99,12 @@ class NodeHands:
         result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
         if not result.reached:
             raise PointFailed(f"contact: {result.cause}: {result.message}")
+        deadline = time.monotonic() + STATE_WITHIN_S
+        while self._state is None or self._state.state != msg.ContactState.STATE_HOLD:
+            if time.monotonic() > deadline:
+                self._check_contact()
+            check()
+            time.sleep(POLL_S)
 
     def measure(
         self,
@@ -152,7 +162,7 @@ class NodeHands:
         deadline = time.monotonic() + RETRACT_WITHIN_S
         asked_s = float("-inf")
         while time.monotonic() < deadline:
-            state = self._recorder.contact_state
+            state = self._state
             since_s = time.monotonic() - asked_s
             if state is not None and state.state == state.STATE_IDLE and since_s < float("inf"):
                 self._touching = False
@@ -187,9 +197,12 @@ class NodeHands:
             time.sleep(PLACE_FOR_S / 10)
 
     def _check_contact(self) -> None:
-        state = self._recorder.contact_state
+        state = self._state
         if self._touching and state is not None and state.state != state.STATE_HOLD:
             raise PointFailed(f"contact: {state.cause}: {state.message}")
+
+    def _on_state(self, message: msg.ContactState) -> None:
+        self._state = message
 
     def _new_poles(self) -> list[msg.Poles]:
         messages = []

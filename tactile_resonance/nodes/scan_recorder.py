@@ -49,13 +49,10 @@ class ScanRecorder:
     ----------
     poles : queue of Poles messages
         In the order of their arrival, for the scan's own thread.
-    contact_state : ContactState or None
-        The newest.
     """
 
     def __init__(self, node: ManagedNode) -> None:
         self.poles: queue.SimpleQueue[msg.Poles] = queue.SimpleQueue()
-        self.contact_state: msg.ContactState | None = None
         self._lock = threading.Lock()
         self._recording: Recording | None = None
         self._counts: Counter[tuple[str, int]] = Counter()
@@ -86,12 +83,9 @@ class ScanRecorder:
             with self._lock:
                 if self._recording is not None:
                     self._recording.write(full, name, time.time_ns(), cdr, recorded.latched)
-                if not recorded.counted and topic != "contact_state":
+                if not recorded.counted:
                     return
                 message = deserialize_message(cdr, recorded.kind)
-                if topic == "contact_state":
-                    self.contact_state = message
-                    return
                 self._counts[(topic, message.measurement_id)] += 1
             if topic == "poles":
                 self.poles.put(message)

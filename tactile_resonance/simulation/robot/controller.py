@@ -77,6 +77,8 @@ class UrController:
         Digital and analogue outputs, speed slider.
     program : Program or None
         The program that runs.
+    stood_still_s : float
+        What the time stamps are ahead of robot time [s]: how long the simulation stood still.
     runtime_state : RuntimeState
     remote_control : bool
         Whether a network client may start programs.
@@ -109,6 +111,7 @@ class UrController:
         self.script_starts = True
         self.popup: str | None = None
         self.log: deque[str] = deque(maxlen=_LOG_LINES)
+        self.stood_still_s = 0.0
         self._cycles = 0
         self._refreshed_s = 0.0
         self._outputs = Outputs(self)

@@ -41,6 +41,8 @@ class Robot(Protocol):
     registers: Registers
     ports: Ports
 
+    stood_still_s: float
+
     @property
     def time_s(self) -> float:
         """Robot time [s]."""
@@ -104,7 +106,7 @@ class Outputs:
 Reader = Callable[[Outputs], FloatArray | OutputValue]
 
 _OUTPUTS: dict[str, tuple[str, Reader]] = {
-    "timestamp": ("DOUBLE", lambda o: o.robot.time_s),
+    "timestamp": ("DOUBLE", lambda o: o.robot.time_s + o.robot.stood_still_s),
     "target_q": ("VECTOR6D", lambda o: o.robot.machine.target.q),
     "target_qd": ("VECTOR6D", lambda o: o.robot.machine.target.qd),
     "target_qdd": ("VECTOR6D", lambda o: o.robot.machine.target.qdd),

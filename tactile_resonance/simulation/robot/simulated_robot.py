@@ -133,8 +133,9 @@ class SimulatedRobot:
     def _next(self, due_ns: int, now_ns: int) -> int:
         """When the step after the one that is due begins.
 
-        Short delays are made up for, so that robot time keeps to wall time. After a stall robot time
-        is behind for good: steps in quick succession would show clients what no robot does.
+        Short delays are made up for, so that robot time keeps to wall time. After a stall they are not:
+        steps in quick succession would show clients what no robot does. The robot's time stamps go on
+        with the wall clock, as if packets had been lost.
         """
         late_ns = now_ns - due_ns
         if late_ns <= STALL_S * 1e9:
@@ -145,4 +146,5 @@ class SimulatedRobot:
         else:
             self.pace.stalls += 1
             self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
+            self.controller.stood_still_s += late_ns * 1e-9
         return now_ns + self._cycle_ns
