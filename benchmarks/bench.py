@@ -270,6 +270,6 @@ def _draw(timing: dict, spectra: dict, path: Path) -> None:
     right.set_xlabel("frequency [Hz]")
     right.set_ylabel("level [V] per line")
     right.set_title("Distortion at 4 V rms and its error (simulated)")
-    right.legend(fontsize=8, markerscale=5)
+    right.legend(fontsize=8, markerscale=5, loc="lower left", bbox_to_anchor=(0.0, 0.2))
     figure.savefig(path, dpi=130)
     plt.close(figure)

@@ -13,6 +13,7 @@ from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.beam import mode_shape, sensor_modes
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
+from tactile_resonance.simulation.indentation import Indentation, indent
 from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.scene import PhantomScene
@@ -68,10 +69,12 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     cycle, relaxation, adhesion, sprung = figure.subplots(2, 2).ravel()
     for k, name in enumerate(names):
         tissue, colour = library[name], f"C{k}"
-        depth, force = _cycle(bench, tissue, 0.0)
-        cycle.plot(1e3 * depth, force / force.max(), color=colour, label=tissue.label)
-        time, force = _relaxation(bench, tissue)
-        relaxation.semilogx(time, 100 * force / force.max(), color=colour, label=tissue.label)
+        test = _cycle(bench, tissue, 0.0)
+        share = test.force_n / test.force_n.max()
+        cycle.plot(1e3 * test.depth_m, share, color=colour, label=tissue.label)
+        test = _relaxation(bench, tissue)
+        share = 100 * test.force_n / test.force_n.max()
+        relaxation.semilogx(test.time_s, share, color=colour, label=tissue.label)
         time, at_base, tip = _approach(bench, tissue)
         sprung.plot(time, 1e3 * at_base, color=colour, label=tissue.label)
         sprung.plot(time, 1e3 * tip, ":", color=colour)
@@ -87,8 +90,8 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     )
     relaxation.axhline(40, color="grey", lw=0.7, ls=":")
     for work in (0.0, 0.01, 0.03):
-        depth, force = _cycle(bench, library["gel10"], work)
-        adhesion.plot(1e3 * depth, 1e3 * force, label=f"{1e3 * work:g} mJ/m2")
+        test = _cycle(bench, library["gel10"], work)
+        adhesion.plot(1e3 * test.depth_m, 1e3 * test.force_n, label=f"{1e3 * work:g} mJ/m2")
     adhesion.axhline(0, color="grey", lw=0.7)
     adhesion.set(
         xlabel="depth [mm]",
@@ -107,38 +110,39 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     return figure
 
 
-def _indenter(bench: SimulatedBench, tissue: Tissue, work: float = 0.0) -> Indenter:
-    return Indenter(
+def _cycle(bench: SimulatedBench, tissue: Tissue, work: float) -> Indentation:
+    """Twice 0.5 mm in and 0.2 mm above the surface, at 1 mm/s."""
+    turns = np.array([0.0, 5e-4, -2e-4, 5e-4, -2e-4])
+    way = np.concatenate([[0.0], np.abs(np.diff(turns)).cumsum()])
+    time = np.arange(0, way[-1] / 1e-3, 1e-3)
+    return _indent(bench, tissue, time, np.interp(1e-3 * time, way, turns), work)
+
+
+def _relaxation(bench: SimulatedBench, tissue: Tissue) -> Indentation:
+    time = np.concatenate([np.linspace(0, 0.2, 101), np.geomspace(0.201, 180, 300)])
+    return _indent(bench, tissue, time, 1e-3 * np.minimum(time / 0.2, 1), 0.0)
+
+
+def _indent(
+    bench: SimulatedBench, tissue: Tissue, time: FloatArray, depth: FloatArray, work: float
+) -> Indentation:
+    return indent(
         tissue,
+        time,
+        depth,
         tip_radius_m=bench.sensor.tip.radius_m,
         poisson_ratio=bench.contact.poisson_ratio,
         adhesion_j_per_m2=work,
     )
 
 
-def _cycle(bench: SimulatedBench, tissue: Tissue, work: float) -> tuple[FloatArray, FloatArray]:
-    turns = np.array([0.0, 5e-4, -2e-4, 5e-4, -2e-4])
-    parts = [np.linspace(*ends, 700)[1:] for ends in zip(turns, turns[1:], strict=False)]
-    depth = np.concatenate(parts)
-    tip = _indenter(bench, tissue, work)
-    steps = np.abs(np.diff(depth, prepend=0.0)) / 1e-3  # at 1 mm/s
-    return depth, np.array(
-        [tip.step(float(d), float(dt)) for d, dt in zip(depth, steps, strict=True)]
-    )
-
-
-def _relaxation(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray]:
-    time = np.concatenate([np.linspace(2e-3, 0.2, 100), np.geomspace(0.201, 180, 300)])
-    tip = _indenter(bench, tissue)
-    steps = np.diff(time, prepend=0.0)
-    depth = 1e-3 * np.minimum(time / 0.2, 1)
-    return time, np.array(
-        [tip.step(float(d), float(dt)) for d, dt in zip(depth, steps, strict=True)]
-    )
-
-
 def _approach(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray, FloatArray]:
-    tip = SprungIndenter.on_beam(_indenter(bench, tissue), sensor_modes(bench.sensor))
+    ball = Indenter(
+        tissue,
+        tip_radius_m=bench.sensor.tip.radius_m,
+        poisson_ratio=bench.contact.poisson_ratio,
+    )
+    tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
     time = np.arange(0, 0.6, 1e-3)
     rows = []
     for t in time:
