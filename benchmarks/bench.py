@@ -82,8 +82,11 @@ def run(output: Path, quick: bool) -> str:
     return text
 
 
-def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, float, str]]:
-    """Per task: least time [s], median ratio to the bare transform run just before, the goal."""
+def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, float, float, str]]:
+    """Per task: least time [s], its ratio to that of the bare transform, median ratio, the goal.
+
+    The median is of ratios to the transform just before: it moves with what else the machine does.
+    """
     np.ones(4_000_000)  # the allocator keeps what a process has once used
     record = setup.play(setup.excitation, IDEAL)()
     u, y = record.actuator.volts, record.sensor.volts
@@ -125,18 +128,22 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         "force of contact in steps of 2 ms, rigid tip": (push(rigid), ""),
         "the same, tip on the beam": (push(on_beam), ""),
     }
+    least = np.inf
     seconds: dict[str, list[float]] = {name: [] for name in tasks}
     ratios: dict[str, list[float]] = {name: [] for name in tasks}
     for repetition in range(repetitions + 1):
         for name, (task, _) in tasks.items():
             slow = name.startswith(("scipy", "nonlinear"))
+            if name.startswith("scipy") and repetition > 2:
+                continue
             reference = _best(transform, 4)
+            least = min(least, reference)
             own = _best(task, 1 if slow else 3)
             if repetition > 0:
                 seconds[name].append(own)
                 ratios[name].append(own / reference)
     return {
-        name: (min(seconds[name]), float(np.median(ratios[name])), goal)
+        name: (min(seconds[name]), min(seconds[name]) / least, float(np.median(ratios[name])), goal)
         for name, (_, goal) in tasks.items()
     }
 
@@ -221,20 +228,23 @@ def _report(timing: dict, linear: dict, errors: dict) -> str:
         "",
         "Ten modes on gelatine 10 %, 8 periods of 20000 samples at 50 kHz (3.2 s of signal), 3997",
         "lines, both channels, from rest, one thread; everything is made anew for each record.",
-        "Ratios are to a bare real FFT of both channels (160000 samples, double precision) just",
-        "before; medians over repetitions; milliseconds are the least.",
+        "Times are the least over repetitions, set against the least of a bare real FFT of both",
+        "channels (160000 samples, double precision); beside it the median of the ratios to the FFT",
+        "just before, which other work on the machine disturbs.",
         "",
-        "| Task | ms | x FFT | x faster than real time | goal |",
-        "|---|---|---|---|---|",
+        "| Task | ms | x FFT | median | x faster than real time | goal |",
+        "|---|---|---|---|---|---|",
     ]
-    for name, (seconds, ratio, goal) in timing.items():
+    for name, (seconds, ratio, median, goal) in timing.items():
         verdict = ""
         if goal == "5 FFT":
             verdict = f"<= 5 FFT: {'met' if ratio <= 5 else 'missed'}"
         elif goal:
             verdict = f"<= 1 s per 3.2 s: {'met' if seconds <= 1 else 'missed'}"
         faster = "" if name.startswith("bare") else f"{SIGNAL_S / seconds:.0f}"
-        rows.append(f"| {name} | {1e3 * seconds:.1f} | {ratio:.2f} | {faster} | {verdict} |")
+        rows.append(
+            f"| {name} | {1e3 * seconds:.1f} | {ratio:.2f} | {median:.2f} | {faster} | {verdict} |"
+        )
     rows += ["", "| Linear | relative error |", "|---|---|"]
     rows += [f"| {name} | {error:.1e} |" for name, error in linear.items()]
     rows += [
