@@ -7,7 +7,7 @@ import argparse
 import sys
 from pathlib import Path
 
-NAMES = ("distortion", "variance")
+NAMES = ("simulation", "distortion", "variance")
 BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
 
 
@@ -15,9 +15,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
     parser = commands.add_parser(
         "figures",
-        help="distortion and variance figures from the simulated bench",
-        description="Draw distortion over drive level (figures 5 and 6 of arXiv 1805.00682) and variance by "
-        "source (figure 9) from the simulated bench. Nothing here is a measurement.",
+        help="figures of the simulated bench, its distortion and its variance",
+        description="Draw what the simulated bench is made of (docs/simulation.md), distortion over drive "
+        "level (figures 5 and 6 of arXiv 1805.00682) and variance by source (figure 9) from the simulated "
+        "bench. Nothing here is a measurement.",
     )
     parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
     parser.add_argument(
@@ -33,7 +34,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Simulate, analyse, draw."""
     options.output.mkdir(parents=True, exist_ok=True)
-    draw = {"distortion": _distortion, "variance": _variance}
+    draw = {"simulation": _simulation, "distortion": _distortion, "variance": _variance}
     for name in NAMES if options.name is None else (options.name,):
         draw[name](options.output)
     return 0
@@ -41,6 +42,31 @@ def run(options: argparse.Namespace) -> int:
 
 def _progress(text: str) -> None:
     print(text, file=sys.stderr)
+
+
+def _simulation(output: Path) -> None:
+    from tactile_resonance.configuration import share_path
+    from tactile_resonance.report import simulation_figures
+    from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.simulation.bench import SimulatedBench
+    from tactile_resonance.simulation.library import read_tissues
+    from tactile_resonance.simulation.scene import read_scene
+
+    bench, library = SimulatedBench.from_configuration(), read_tissues()
+    scene = read_scene(library, share_path("config/scenes/inclusion.yaml"))
+    gels = ("gel10", "gel12", "gel14", "gel16")
+    organs = ("cortex", "white", "liver")
+    figures = {
+        "tissues": simulation_figures.draw_tissues(bench, library, (*gels, *organs)),
+        "indentation": simulation_figures.draw_indentation(
+            bench, library, ("gel10", "cortex", "liver")
+        ),
+        "scene": simulation_figures.draw_scene(bench, scene),
+        "creep": simulation_figures.draw_creep(bench, library, ("gel10", "cortex", "liver")),
+    }
+    for name, figure in figures.items():
+        save_figure(figure, output / f"{name}.png")
+    print(f"figures in {output}: {', '.join(f'{name}.png' for name in figures)}")
 
 
 def _distortion(output: Path) -> None:

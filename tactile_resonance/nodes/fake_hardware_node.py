@@ -164,7 +164,7 @@ class FakeHardwareNode(ManagedNode):
         self.serve(Play, "bench/play", self._on_play)
         self.serve(Trigger, "bench/stop", self._on_stop)
         self.serve(Truth, "bench/get_truth", self._on_truth)
-        self._said = ""
+        self._said_lines = 0
 
     def deactivate(self) -> None:
         """Silence the output."""
@@ -264,10 +264,10 @@ class FakeHardwareNode(ManagedNode):
         return response
 
     def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:
-        effort = str(run.effort(excitation))
-        if effort != self._said:
-            self._said = effort
-            self.get_logger().info(effort)
+        effort = run.effort(excitation)
+        if effort.lines != self._said_lines:
+            self._said_lines = effort.lines
+            self.get_logger().info(str(effort))
 
     def _on_truth(self, request: Truth.Request, response: Truth.Response) -> Truth.Response:
         if not self.active:

@@ -40,7 +40,7 @@ POLL_S = 0.005
 # A node that was started anew needs so long at most until it takes goals again.
 NODE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
-RETRACT_WITHIN_S = 15.0
+RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
 PLACE_FOR_S = 0.2
 

@@ -137,7 +137,7 @@ def as_table(points: Sequence[MeasuredPoint]) -> str:
         stds = np.sqrt(np.mean([p.std**2 for p in group], axis=0))
         mean = estimates.mean(axis=0)
         spread = estimates.std(axis=0, ddof=1) if len(group) > 1 else np.full(2, np.nan)
-        truth = group[0].truth
+        truth = np.mean([p.truth for p in group], axis=0)  # it may differ from point to point
         error = (mean - truth) / (stds / np.sqrt(len(group)))
         worst = np.max(np.abs([p.error_in_std for p in group]), axis=0)
         for k, (quantity, digits) in enumerate((("f0 [Hz]", 4), ("damping ratio", 6))):
@@ -193,4 +193,4 @@ def _draw_poles(axes: Axes, group: Sequence[MeasuredPoint], colour: str) -> None
         axes.plot(*p.estimate, ".", ms=3, color=colour)
         if np.all(np.isfinite(p.covariance)):
             draw_ellipse(axes, p.estimate, p.covariance, color=colour, lw=0.7)
-    axes.plot(*group[0].truth, "k+", ms=10)
+    axes.plot(*np.unique([p.truth for p in group], axis=0).T, "k+", ms=10)

@@ -16,7 +16,7 @@ from tactile_resonance.simulation.contact import (
     hertz_contact,
 )
 from tactile_resonance.simulation.fields import require
-from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.indentation import indent
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
 from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.tissue import Tissue
@@ -102,27 +102,23 @@ class ContactHistory:
 
         Times are counted from `start_s`, the first at or after it.
         """
-        time, depth = np.asarray(time_s, dtype=float), np.asarray(depth_m, dtype=float)
-        good = time.ndim == 1 and time.size >= 2 and bool(np.all(np.diff(time) > 0))
-        require(good, "time_s", time, "two ascending times or more, one axis")
-        require(depth.shape == time.shape, "depth_m", depth.shape, f"shape {time.shape}")
-        indenter = Indenter(
-            tissue, tip_radius_m=tip_radius_m, poisson_ratio=parameters.poisson_ratio
+        test = indent(
+            tissue,
+            time_s,
+            depth_m,
+            tip_radius_m=tip_radius_m,
+            poisson_ratio=parameters.poisson_ratio,
         )
-        rows = []
-        for x, dt in zip(depth, np.diff(time, prepend=time[0] - (time[1] - time[0])), strict=True):
-            force = indenter.step(float(x), float(dt))
-            rows.append((indenter.contact_radius_m, force, x))
-        radius, force_n, indentation = np.array(rows).T
+        time = test.time_s
         keep = time >= start_s
         require(bool(keep.any()), "start_s", start_s, f"up to {time[-1]:g}, the last time")
         return cls(
             tissue,
             parameters,
             time[keep] - time[keep][0],
-            radius[keep],
-            force_n[keep],
-            indentation[keep],
+            test.contact_radius_m[keep],
+            test.force_n[keep],
+            test.depth_m[keep],
         )
 
     def contact_at(self, time_s: float) -> Contact:

@@ -1,56 +1,73 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quasi-static indentation of viscoelastic tissue by a rigid sphere (Lee & Radok 1960)."""
+"""A whole test of indentation at once: force and contact radius for given times and depths."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.tissue import FloatArray, Tissue
 
+AT_ONCE_S = 1e-9  # in which the first depth is reached: glassy, as no Prony term is that fast
 
-def indentation_force(
+
+@dataclass(frozen=True, eq=False)
+class Indentation:
+    """Time [s], depth [m], force [N] and contact radius [m] of a test, (T,) arrays each."""
+
+    time_s: FloatArray
+    depth_m: FloatArray
+    force_n: FloatArray
+    contact_radius_m: FloatArray
+
+
+def indent(
     tissue: Tissue,
     time_s: ArrayLike,
     depth_m: ArrayLike,
     *,
     tip_radius_m: float,
     poisson_ratio: float,
-) -> FloatArray:
-    """Return the force [N] while a rigid sphere is pressed in and held, shape (T,).
-
-    ``F(t) = 4 sqrt(R) / (3 (1 - nu^2)) integral E(t - t') d(depth^(3/2))``, valid while the contact
-    does not shrink. Exact for ``depth^(3/2)`` linear between the given times.
+    adhesion_j_per_m2: float = 0.0,
+) -> Indentation:
+    """Return what a rigid sphere feels on its way in, while it is held, and out again.
 
     Parameters
     ----------
     tissue : Tissue
+        At rest before the first time, at which the first depth is put on at once.
     time_s : (T,) array
-        Strictly ascending times [s]; the tissue is relaxed before the first.
+        Strictly ascending times [s].
     depth_m : (T,) array
-        Indentation [m], 0 or above and never falling.
-    tip_radius_m, poisson_ratio : float
+        Depth of the lowest point below the undisturbed surface [m]; straight in between.
+    tip_radius_m, poisson_ratio, adhesion_j_per_m2 : float
+        As in `Indenter`.
 
     Raises
     ------
     ValueError
-        If times do not ascend or the depth falls or is negative.
+        If times do not ascend, or shapes differ.
     """
     time, depth = np.asarray(time_s, dtype=float), np.asarray(depth_m, dtype=float)
     shapes = time.ndim == 1 and time.size > 0 and depth.shape == time.shape
     require(shapes, "depth_m", depth.shape, f"the shape of time_s, {time.shape}, one axis")
     require(bool(np.all(np.diff(time) > 0)), "time_s", time, "strictly ascending times")
-    loading = bool(depth[0] >= 0) and bool(np.all(np.diff(depth) >= 0))
-    require(loading, "depth_m", depth, "0 or above and never falling (loading only)")
-    measure = depth**1.5
-    tau = np.asarray(tissue.prony_times_s, dtype=float)
-    memory = np.full(tau.size, measure[0])  # integral exp(-(t - t')/tau_j) d(depth^1.5)
-    stress = np.empty(time.size)
-    stress[0] = tissue.instantaneous_modulus_pa * measure[0]
-    for n in range(1, time.size):
-        step = time[n] - time[n - 1]
-        rate = (measure[n] - measure[n - 1]) / step
-        memory = memory * np.exp(-step / tau) - rate * tau * np.expm1(-step / tau)
-        stress[n] = tissue.equilibrium_modulus_pa * measure[n] + tissue.prony_moduli_pa @ memory
-    return 4 * np.sqrt(tip_radius_m) / (3 * (1 - poisson_ratio**2)) * stress
+    require(bool(np.all(np.isfinite(depth))), "depth_m", depth, "finite numbers")
+    tip = Indenter(
+        tissue,
+        tip_radius_m=tip_radius_m,
+        poisson_ratio=poisson_ratio,
+        adhesion_j_per_m2=adhesion_j_per_m2,
+    )
+    steps = np.diff(time, prepend=time[0] - 1.0)
+    steps[0] = AT_ONCE_S
+    rows = []
+    for x, dt in zip(depth.tolist(), steps.tolist(), strict=True):
+        force = tip.step(x, dt)
+        rows.append((force, tip.contact_radius_m))
+    force_n, radius_m = np.array(rows).T
+    return Indentation(time, depth, force_n, radius_m)

@@ -52,9 +52,13 @@ class NonlinearSteadyState:
     iterations: int
 
 
-def effective_drive(lines: Lines, nonlinear: NonlinearParameters) -> Lines:
-    """Return ``u + a2 u^2 + a3 u^3`` as lines on a grid `OVERSAMPLING` times as fine."""
-    fine = lines.resampled(OVERSAMPLING)
+def effective_drive(
+    lines: Lines, nonlinear: NonlinearParameters, oversampling: int = OVERSAMPLING
+) -> Lines:
+    """Return ``u + a2 u^2 + a3 u^3`` as lines on a grid `oversampling` times as fine, 4 or more."""
+    accepted = f"{OVERSAMPLING} or above"
+    require(oversampling >= OVERSAMPLING, "oversampling", oversampling, accepted)
+    fine = lines.resampled(oversampling)
     a2, a3 = nonlinear.actuator_quadratic_per_v, nonlinear.actuator_cubic_per_v2
     if a2 == 0.0 and a3 == 0.0:
         return fine
@@ -78,6 +82,7 @@ def nonlinear_steady_state(
     lines: Lines,
     *,
     max_iterations: int = 200,
+    oversampling: int = OVERSAMPLING,
 ) -> NonlinearSteadyState:
     """Return one period of the nonlinear sensor in steady state.
 
@@ -88,6 +93,9 @@ def nonlinear_steady_state(
     nonlinear : NonlinearParameters
     lines : Lines
         The drive.
+    max_iterations : int
+    oversampling : int
+        Products of the strain above half the fine sample rate fold back: 4 or more.
 
     Raises
     ------
@@ -95,7 +103,7 @@ def nonlinear_steady_state(
         If the iteration does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance,
         exceeds 1, as for a narrow-band drive of 4 V rms.
     """
-    drive = effective_drive(lines, nonlinear)
+    drive = effective_drive(lines, nonlinear, oversampling)
     count = drive.samples_per_period
     frequency_hz = np.arange(count // 2 + 1) * (drive.sample_rate_hz / count)
     response = model.without_direct_term().frequency_response(frequency_hz)
@@ -110,7 +118,7 @@ def nonlinear_steady_state(
             change = float(np.abs(following - strain).max())
             strain = following
             if change <= TOLERANCE * scale:
-                coarse = strain[::OVERSAMPLING]
+                coarse = strain[::oversampling]
                 sensor = coarse + model.direct * sample_period(lines)
                 return NonlinearSteadyState(sensor, coarse, iteration)
             if not change < 1e3 * scale:
@@ -131,11 +139,19 @@ class NonlinearStream:
     nonlinear : NonlinearParameters
     delay_s : float
         As in `ResponseStream`.
+    oversampling : int
+        Fine samples per sample, 4 or more.
     """
 
     def __init__(
-        self, model: PoleResidueModel, nonlinear: NonlinearParameters, *, delay_s: float = 0.0
+        self,
+        model: PoleResidueModel,
+        nonlinear: NonlinearParameters,
+        *,
+        delay_s: float = 0.0,
+        oversampling: int = OVERSAMPLING,
     ) -> None:
+        self._oversampling = oversampling
         self._nonlinear = nonlinear
         self._strain_model = model.without_direct_term()
         self._driven = ResponseStream(self._strain_model, delay_s=delay_s)
@@ -159,17 +175,17 @@ class NonlinearStream:
         samples = lines.samples_per_period if samples is None else samples
         through = self._through.play(lines, samples)
         if self._drive is None or not lines.same_signal(self._drive[0]):
-            self._drive = (lines, effective_drive(lines, self._nonlinear))
-        driven = self._driven.play(self._drive[1], samples * OVERSAMPLING)
-        strain = self._march(driven, lines.sample_rate_hz * OVERSAMPLING, lines)
-        return strain[::OVERSAMPLING] + through
+            self._drive = (lines, effective_drive(lines, self._nonlinear, self._oversampling))
+        driven = self._driven.play(self._drive[1], samples * self._oversampling)
+        strain = self._march(driven, lines.sample_rate_hz * self._oversampling, lines)
+        return strain[:: self._oversampling] + through
 
     def silence(self, samples: int, sample_rate_hz: float) -> FloatArray:
         """Return the response over `samples` samples of zero excitation."""
         through = self._through.silence(samples, sample_rate_hz)
-        fine_rate_hz = sample_rate_hz * OVERSAMPLING
-        driven = self._driven.silence(samples * OVERSAMPLING, fine_rate_hz)
-        return self._march(driven, fine_rate_hz, None)[::OVERSAMPLING] + through
+        fine_rate_hz = sample_rate_hz * self._oversampling
+        driven = self._driven.silence(samples * self._oversampling, fine_rate_hz)
+        return self._march(driven, fine_rate_hz, None)[:: self._oversampling] + through
 
     def skip(self, lines: Lines, periods: int) -> None:
         """Advance whole periods; a nonlinear response has to be computed all the same."""

@@ -74,8 +74,8 @@ class Sphere:
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the surface."""
         position = _coordinates(position_m, 3)
-        distance = np.linalg.norm(position - np.asarray(self.center_m), axis=-1)
-        return np.asarray(distance <= self.radius_m)
+        way = position - np.asarray(self.center_m)
+        return np.asarray(np.einsum("...i,...i", way, way) <= self.radius_m**2)
 
 
 def _coordinates(position_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:

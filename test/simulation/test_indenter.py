@@ -7,7 +7,6 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.indentation import indentation_force
 from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -34,10 +33,26 @@ def hertz(depth):
     return 4 / 3 * PLANE_MODULUS * np.sqrt(RADIUS) * np.maximum(depth, 0) ** 1.5
 
 
+def lee_radok(tissue, time, depth):
+    """Force while the contact grows, each convolution a sum over all steps before, shape (T,).
+
+    ``4 sqrt(R) / (3 (1 - nu^2)) integral E(t - t') d(depth^(3/2))``, exact for depth^(3/2) linear
+    in each step.
+    """
+    rate = np.diff(depth**1.5) / np.diff(time)  # (T - 1,)
+    late, early = (
+        np.maximum(time[:, None] - edge, 0) for edge in (time[1:], time[:-1])
+    )  # (T, T - 1): elapsed since the end and the start of each step
+    weight = tissue.equilibrium_modulus_pa * (early - late)
+    for modulus, tau in zip(tissue.prony_moduli_pa, tissue.prony_times_s, strict=True):
+        weight += modulus * tau * (np.exp(-late / tau) - np.exp(-early / tau))
+    return 4 * np.sqrt(RADIUS) / (3 * (1 - POISSON**2)) * weight @ rate
+
+
 def test_loading_and_hold_are_those_of_lee_and_radok(tissue):
     time = np.linspace(0, 3, 1501)
     depth = 5e-4 * np.minimum(time / 0.2, 1) ** 1.3
-    expected = indentation_force(tissue, time, depth, tip_radius_m=RADIUS, poisson_ratio=POISSON)
+    expected = lee_radok(tissue, time, depth)
     tip = indenter(tissue)
     found = follow(tip, depth, time[1])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * expected.max())
@@ -89,7 +104,7 @@ def test_unloading_is_that_of_ting(tissue):
     assert lost < 2 * rise - 0.01  # contact ends while the tip is still below the surface
 
 
-def row_of_springs(tissue, depth, dt, count=1500):
+def row_of_springs(tissue, depth, dt, count=600):
     """Force by marching a row of independent springs, each touching or free, by brute force."""
     x = (np.arange(count) + 0.5) * 1.7e-3 / count
     moduli = tissue.prony_moduli_pa[:, None]
@@ -118,10 +133,12 @@ def test_repeated_contact_is_that_of_a_row_of_springs(tissue):
         [np.linspace(*ends, 251)[1:] for ends in zip(turns, turns[1:], strict=False)]
     )
     found = follow(indenter(tissue), depth, 1e-3)
-    expected = row_of_springs(tissue, depth, 1e-3)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-3 * expected.max())
+    # brute force needs eight steps in place of one
+    fine = np.interp(np.arange(8 * depth.size) / 8, np.arange(depth.size), depth)
+    expected = row_of_springs(tissue, fine, 1e-3 / 8)[::8]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * expected.max())
     # the same contact, but for the width of one spring of the row
-    assert np.count_nonzero((found > 0) != (expected > 0)) <= 8
+    assert np.count_nonzero((found > 0) != (expected > 0)) <= 3
 
 
 def test_no_closed_cycle_gives_energy_and_no_force_pulls(tissue):

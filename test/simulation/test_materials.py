@@ -2,6 +2,7 @@
 """Gradients, random heterogeneity, and what lies under the surface; the map of their truth."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -245,3 +246,20 @@ def test_a_box_can_be_buried(library):
     box = Box((-0.01, -0.01, -0.01), (0.01, 0.01, -0.001))
     felt = Buried("box", box, library["gel16"]).felt_at(np.zeros(3), library["gel10"], 1e-3)
     assert 18.3e3 < felt.relaxation_modulus_1s_pa < 48.5e3
+
+
+def test_the_scene_of_the_documentation_is_read(tmp_path, library):
+    page = Path(__file__).resolve().parents[2] / "docs" / "simulation.md"
+    if not page.exists():
+        pytest.skip("the source tree's docs are not here")
+    text = page.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0]
+    path = tmp_path / "scene.yaml"
+    path.write_text(text, encoding="utf-8")
+    scene = read_scene(library, path)
+    assert len(scene.scan_points_m) == 81
+    over, beside = (scene.tissue_at(point) for point in ((0.1, 0.0), (0.12, 0.02)))
+    assert over.relaxation_modulus_1s_pa > beside.relaxation_modulus_1s_pa
+    percent = library.gelatine(13.0).relaxation_modulus_1s_pa
+    assert scene.regions[0].material.tissue_at(np.array([0.025, 0, 0])) == library.gelatine(13.0)
+    # under it the cortex of the deeper layer is felt too
+    assert scene.tissue_at((0.025, 0.0)).relaxation_modulus_1s_pa < percent

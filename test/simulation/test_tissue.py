@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from tactile_resonance.simulation.contact import hertz_contact
-from tactile_resonance.simulation.indentation import indentation_force
+from tactile_resonance.simulation.indentation import indent
 from tactile_resonance.simulation.tissue import Tissue
 
 NAMES = ["gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver"]
@@ -119,7 +119,8 @@ def test_force_drops_as_published_after_a_rigid_ramp(library, name, drop_10s, dr
     ramp = np.linspace(0, 0.2, 401)
     time = np.concatenate([ramp, [10.0, 180.0]])
     depth = 1e-3 * np.minimum(time / 0.2, 1)
-    force = indentation_force(library[name], time, depth, tip_radius_m=RADIUS, poisson_ratio=0.49)
+    test = indent(library[name], time, depth, tip_radius_m=RADIUS, poisson_ratio=0.49)
+    force = test.force_n
     assert force.argmax() == 400
     percent = 100 * (1 - force[-2:] / force[400])
     # the figures are rounded to a whole per cent, which puts liver's 73.5 % at the edge
@@ -129,18 +130,30 @@ def test_force_drops_as_published_after_a_rigid_ramp(library, name, drop_10s, dr
 def test_elastic_limit_of_indentation_is_hertz():
     solid = Tissue("solid", 10e3, (1.0,), (0.0,))
     depth = np.linspace(0, 1e-3, 11)
-    force = indentation_force(
-        solid, np.linspace(0, 1, 11), depth, tip_radius_m=RADIUS, poisson_ratio=0.49
-    )
+    test = indent(solid, np.linspace(0, 1, 11), depth, tip_radius_m=RADIUS, poisson_ratio=0.49)
     expected = 4 / 3 * 10e3 / (1 - 0.49**2) * np.sqrt(RADIUS) * depth**1.5
-    np.testing.assert_allclose(force, expected, rtol=1e-12)
+    np.testing.assert_allclose(test.force_n, expected, rtol=1e-12)
+    np.testing.assert_allclose(test.contact_radius_m, np.sqrt(RADIUS * depth), rtol=1e-12)
 
 
-def test_indentation_refuses_unloading(library):
-    with pytest.raises(ValueError, match="depth_m.*loading only"):
-        indentation_force(
-            library["gel10"], [0, 1, 2], [0, 1e-3, 0.5e-3], tip_radius_m=RADIUS, poisson_ratio=0.49
-        )
+def test_a_depth_put_on_at_once_relaxes_as_the_modulus(tissue):
+    time = np.concatenate([[0.0], np.geomspace(1e-4, 100, 30)])
+    test = indent(tissue, time, np.full(31, 3e-4), tip_radius_m=RADIUS, poisson_ratio=0.49)
+    elastic = 4 / 3 / (1 - 0.49**2) * np.sqrt(RADIUS) * 3e-4**1.5
+    np.testing.assert_allclose(test.force_n, elastic * tissue.relaxation_modulus(time), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("time", "depth", "named"),
+    [
+        ([0, 1, 1], [0, 0, 0], "time_s.*ascending"),
+        ([0, 1], [0, 0, 0], "depth_m.*shape"),
+        ([0, 1], [0, np.nan], "depth_m.*finite"),
+    ],
+)
+def test_bad_tests_of_indentation_are_refused_by_name(library, time, depth, named):
+    with pytest.raises(ValueError, match=named):
+        indent(library["gel10"], time, depth, tip_radius_m=RADIUS, poisson_ratio=0.49)
 
 
 def test_energy_giving_materials_are_refused():

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulated bench is made of, as figures: sensor on tissues, indentation, scene, creep."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from tactile_resonance.report.drawing import SIMULATED, new_figure
+from tactile_resonance.simulation.beam import mode_shape, sensor_modes
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
+from tactile_resonance.simulation.indentation import Indentation, indent
+from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.library import TissueLibrary
+from tactile_resonance.simulation.scene import PhantomScene
+from tactile_resonance.simulation.shapes import Sphere
+from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.truth_map import truth_map
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
+    """Mode shapes, frequency response in air and on tissues, and the poles of one mode."""
+    figure = new_figure(17, 9)
+    figure.suptitle(f"The bimorph in air and on tissue at 1 cN ({SIMULATED})")
+    shapes, whole, zoom, plane = figure.subplots(2, 2).ravel()
+    modes = sensor_modes(bench.sensor)
+    x = np.linspace(0, 1, 400)
+    scale = modes.tip_deflection / mode_shape(modes.eigenvalues, np.ones(1))[:, 0]
+    shape = mode_shape(modes.eigenvalues, x) * scale[:, None]
+    for n in range(5):
+        label = f"mode {n + 1}, {modes.natural_rad_s[n] / (2 * np.pi):.1f} Hz"
+        shapes.plot(1e3 * x * modes.length_m, shape[n], label=label)
+    shapes.set(
+        xlabel="position on the beam [mm]",
+        ylabel="mass-normalised [kg^-1/2]",
+        title="the first five of ten modes, in air, electrodes short-circuited",
+    )
+    shapes.legend(fontsize="small")
+    wide, near = np.geomspace(10, 10e3, 4000), np.linspace(200, 300, 2000)
+    for k, name in enumerate(("air", *names)):
+        tissue = None if name == "air" else library[name]
+        coupled = bench.coupled(tissue)
+        colour, label = f"C{k}", name if tissue is None else tissue.label
+        for axes, frequency in ((whole, wide), (zoom, near)):
+            level = 20 * np.log10(np.abs(coupled.frequency_response(frequency)))
+            axes.plot(frequency, level, color=colour, lw=1, label=label)
+        mode = coupled.mode_near(250)
+        plane.plot(mode.f0_hz, mode.damping_ratio, "o", color=colour)
+        plane.annotate(f" {label}", (mode.f0_hz, mode.damping_ratio), va="center", fontsize="small")
+    whole.set_xscale("log")
+    whole.set(xlabel="frequency [Hz]", ylabel="|U_sensor / U_actuator| [dB]", title="ten modes")
+    whole.legend(fontsize="small")
+    zoom.set(xlabel="frequency [Hz]", ylabel="[dB]", title="the mode used")
+    plane.set(xlabel="f0 [Hz]", ylabel="damping ratio", title="its pole")
+    plane.margins(x=0.25)
+    return figure
+
+
+def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
+    """Force over depth in and out, relaxation of the force, adhesion, and the tip on the beam."""
+    figure = new_figure(17, 9)
+    figure.suptitle(f"A ball of 5 mm pressed into tissue ({SIMULATED})")
+    cycle, relaxation, adhesion, sprung = figure.subplots(2, 2).ravel()
+    for k, name in enumerate(names):
+        tissue, colour = library[name], f"C{k}"
+        test = _cycle(bench, tissue, 0.0)
+        share = test.force_n / test.force_n.max()
+        cycle.plot(1e3 * test.depth_m, share, color=colour, label=tissue.label)
+        test = _relaxation(bench, tissue)
+        share = 100 * test.force_n / test.force_n.max()
+        relaxation.semilogx(test.time_s, share, color=colour, label=tissue.label)
+        time, at_base, tip = _approach(bench, tissue)
+        sprung.plot(time, 1e3 * at_base, color=colour, label=tissue.label)
+        sprung.plot(time, 1e3 * tip, ":", color=colour)
+    cycle.set(
+        xlabel="depth [mm]",
+        ylabel="force / its peak",
+        title="0.5 mm in and out at 1 mm/s, twice, rigid tip: the dent is still there",
+    )
+    relaxation.set(
+        xlabel="time after the start of a ramp of 0.2 s [s]",
+        ylabel="force / its peak [%]",
+        title="held at one depth, rigid tip",
+    )
+    relaxation.axhline(40, color="grey", lw=0.7, ls=":")
+    for work in (0.0, 0.01, 0.03):
+        test = _cycle(bench, library["gel10"], work)
+        adhesion.plot(1e3 * test.depth_m, 1e3 * test.force_n, label=f"{1e3 * work:g} mJ/m2")
+    adhesion.axhline(0, color="grey", lw=0.7)
+    adhesion.set(
+        xlabel="depth [mm]",
+        ylabel="force [mN]",
+        title="work of adhesion (assumed), gelatine 10 %",
+        xlim=(-0.03, 0.12),
+        ylim=(-0.6, 2.2),
+    )
+    sprung.set(
+        xlabel="time [s]",
+        ylabel="force [mN]",
+        title="base started and stopped at once, 5 mm/s: at the base (full), on the tip (dotted)",
+    )
+    for axes in (cycle, relaxation, adhesion, sprung):
+        axes.legend(fontsize="small")
+    return figure
+
+
+def _cycle(bench: SimulatedBench, tissue: Tissue, work: float) -> Indentation:
+    """Twice 0.5 mm in and 0.2 mm above the surface, at 1 mm/s."""
+    turns = np.array([0.0, 5e-4, -2e-4, 5e-4, -2e-4])
+    way = np.concatenate([[0.0], np.abs(np.diff(turns)).cumsum()])
+    time = np.arange(0, way[-1] / 1e-3, 1e-3)
+    return _indent(bench, tissue, time, np.interp(1e-3 * time, way, turns), work)
+
+
+def _relaxation(bench: SimulatedBench, tissue: Tissue) -> Indentation:
+    time = np.concatenate([np.linspace(0, 0.2, 101), np.geomspace(0.201, 180, 300)])
+    return _indent(bench, tissue, time, 1e-3 * np.minimum(time / 0.2, 1), 0.0)
+
+
+def _indent(
+    bench: SimulatedBench, tissue: Tissue, time: FloatArray, depth: FloatArray, work: float
+) -> Indentation:
+    return indent(
+        tissue,
+        time,
+        depth,
+        tip_radius_m=bench.sensor.tip.radius_m,
+        poisson_ratio=bench.contact.poisson_ratio,
+        adhesion_j_per_m2=work,
+    )
+
+
+def _approach(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ball = Indenter(
+        tissue,
+        tip_radius_m=bench.sensor.tip.radius_m,
+        poisson_ratio=bench.contact.poisson_ratio,
+    )
+    tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
+    time = np.arange(0, 0.6, 1e-3)
+    rows = []
+    for t in time:
+        force = tip.step(-2e-4 + min(5e-3 * t, 1.0e-3), 1e-3)
+        rows.append((force, tip.indenter.force_n))
+    at_base, at_tip = np.array(rows).T
+    return time, at_base, at_tip
+
+
+def draw_scene(bench: SimulatedBench, scene: PhantomScene) -> Figure:
+    """Truth over the surface of a scene with something buried in it."""
+    points = np.array(scene.scan_points_m)[:, :2]
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y = (np.linspace(a, b, 31) for a, b in zip(low, high, strict=True))
+    grid = np.stack(np.meshgrid(x, y), axis=-1)  # (31, 31, 2)
+    truth = truth_map(bench, scene, grid)
+    figure = new_figure(17, 5.5)
+    figure.suptitle(f"What the tip feels over the scene '{scene.name}' ({SIMULATED})")
+    panels = (
+        ("E(1 s) felt [kPa]", truth.modulus_1s_pa / 1e3),
+        ("f0 [Hz]", truth.f0_hz),
+        ("damping ratio", truth.damping_ratio),
+    )
+    angle = np.linspace(0, 2 * np.pi, 100)
+    for axes, (title, values) in zip(figure.subplots(1, 3), panels, strict=True):
+        image = axes.pcolormesh(1e3 * x, 1e3 * y, values, shading="gouraud")
+        figure.colorbar(image, ax=axes)
+        axes.plot(*(1e3 * points.T), "k.", ms=1)
+        for buried in scene.buried:
+            if isinstance(buried.shape, Sphere):
+                cx, cy = buried.shape.center_m[:2]
+                r = buried.shape.radius_m
+                axes.plot(1e3 * (cx + r * np.cos(angle)), 1e3 * (cy + r * np.sin(angle)), "w--")
+        axes.set(title=title, xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    return figure
+
+
+def draw_creep(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
+    """Force, contact radius and pole while force or depth are held."""
+    figure = new_figure(17, 5.5)
+    figure.suptitle(f"A contact from 1 s on: force held (full), depth held (dotted) ({SIMULATED})")
+    force_axes, radius_axes, pole_axes = figure.subplots(1, 3)
+    radius = bench.sensor.tip.radius_m
+    shown = np.linspace(0, 9, 40)
+    ramp = np.concatenate([np.linspace(0, 0.2, 101)[1:], np.linspace(0.21, 10, 980)])
+    for k, name in enumerate(names):
+        tissue, colour = library[name], f"C{k}"
+        held = ContactHistory.under_force(tissue, radius, bench.contact, duration_s=9.0)
+        depth = float(held.indentation_m[0])
+        still = ContactHistory.of_depth(
+            tissue, radius, bench.contact, ramp, depth * np.minimum(ramp / 0.2, 1), start_s=1.0
+        )
+        for history, style in ((held, "-"), (still, ":")):
+            f0 = np.abs(pole_trajectory(bench.sensor, history, shown)) / (2 * np.pi)
+            time = history.time_s + 1
+            label = tissue.label if style == "-" else None
+            force_axes.plot(time, 1e3 * history.force_n, style, color=colour, label=label)
+            radius_axes.plot(time, 1e3 * history.contact_radius_m, style, color=colour)
+            pole_axes.plot(shown + 1, f0 - f0[0], style, color=colour)
+    force_axes.set(xlabel="time [s]", ylabel="force [mN]", title="force")
+    radius_axes.set(xlabel="time [s]", ylabel="contact radius [mm]", title="contact radius")
+    pole_axes.set(xlabel="time [s]", ylabel="change of f0 [Hz]", title="mode used")
+    force_axes.legend(fontsize="small")
+    return figure
