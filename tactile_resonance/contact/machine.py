@@ -32,6 +32,9 @@ RIGHTING_S = 0.1
 ARRIVED_M, ARRIVED_RAD = 5e-5, 2e-3
 """Distance and angle from the standoff at which it is reached."""
 
+TURNING_M = 2e-3
+"""So far above where the surface is near the tip is turned [m]."""
+
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
 
@@ -315,11 +318,13 @@ class ContactController:
                 text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
                 self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
                 return None
-        goal = self._goal_position(p.standoff_m)
-        way = goal - arm.tip.position_m
-        distance = float(np.linalg.norm(way))
         turn = self._turn(arm)
         angle = float(np.linalg.norm(turn))
+        height = p.standoff_m
+        if angle > self.limits.misalignment_rad / 2:  # first turn, out of reach of the surface
+            height = max(height, self.limits.near_m + TURNING_M)
+        way = self._goal_position(height) - arm.tip.position_m
+        distance = float(np.linalg.norm(way))
         if distance < ARRIVED_M and angle < ARRIVED_RAD:
             self._enter(State.TARE, now_ns)
             return None

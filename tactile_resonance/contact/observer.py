@@ -15,8 +15,8 @@ from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.tare import TareError, TareLimits, tare
 
-WINDOW_SAMPLES = 60
-"""Forces kept for the first estimate of the contact: 120 ms at 500 Hz."""
+WINDOW_SAMPLES = 220
+"""Forces kept for the first estimate of the contact: 440 ms at 500 Hz, 1.8 mm at 4 mm/s."""
 
 LEAST_NOISE_N = 2e-5
 """The filter takes a force for no more certain than this [N]."""

@@ -92,9 +92,7 @@ class ContactBench:
         tip = Tip() if tip is None else tip
         on_tool = mount is Mount.TOOL
         centre = np.array([-0.03, 0.0, 0.01] if on_tool else [0.0, 0.0, -0.01])
-        mounting = CellMounting(
-            mount, carried_kg=tool_kg if on_tool else DISH_KG, centre_m=centre
-        )
+        mounting = CellMounting(mount, carried_kg=tool_kg if on_tool else DISH_KG, centre_m=centre)
         self.plant = Plant(
             surface, lambda _: tissue, tip.on, tip_radius_m=tip.radius_m, mounting=mounting
         )
@@ -102,8 +100,6 @@ class ContactBench:
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, centre) if on_tool else None
-        self.force = TipForce(
-            self.cell, Mounting(mount, mounting.frame, payload), self.arm.state
-        )
+        self.force = TipForce(self.cell, Mounting(mount, mounting.frame, payload), self.arm.state)
         self.arm.connect()
         self.force.start()

@@ -208,7 +208,12 @@ def test_tissue_that_is_taken_away_is_noticed(state):
     at = len(made.force_n)
     made.run_until(State.IDLE, 2.5)
     result = made.controller.result
-    assert result.cause in {Cause.CONTACT_LOST, Cause.SURFACE_MISSING, Cause.FORCE_RATE, Cause.DEPTH}
+    assert result.cause in {
+        Cause.CONTACT_LOST,
+        Cause.SURFACE_MISSING,
+        Cause.FORCE_RATE,
+        Cause.DEPTH,
+    }
     assert result.retracted
     assert max(made.force_n[at:]) < 1.2 * contacts.FORCE_N
 
