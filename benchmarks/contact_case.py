@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +25,6 @@ from tactile_resonance.simulation.transducer import CellParameters
 FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03
 TOOL = {
     "carried_kg": TOOL_KG,
-    "cell_noise_n": 1.6e-3,
     "acceleration_m_s2": 0.3,
     "approach_speed_m_s": 3e-3,
 }
@@ -147,25 +145,57 @@ def run_controller(
     case: Case,
     setup: Setup,
     parameters: ContactParameters | None = None,
-    listener: Callable | None = None,
+    record: list[float] | None = None,
 ) -> Outcome:
-    """Run our controller, told what is on the robot but nothing of the tissue."""
+    """Run our controller, told what is on the robot but nothing of the tissue.
+
+    The true force of each period is appended to `record`.
+    """
     rig = Rig(case, setup)
     bench = rig.bench
     if parameters is None:
+        noise = max(setup.noise_n, 1e-3)
         parameters = ContactParameters(
+            cell_noise_n=1.6 * noise if setup.mount is Mount.TOOL else noise,
+            tare_std_n=3e-4 * noise / 1e-3,
             beam_stiffness_n_per_m=MODES.static_stiffness_n_per_m if setup.beam else 0.0,
             **(TOOL if setup.mount is Mount.TOOL else {}),
         )
-    controller = ContactController(parameters, Limits(depth_m=DEEPEST_M))
-    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller, listener)
+    limits = Limits(
+        depth_m=DEEPEST_M,
+        # what trips on single forces is as wide as the noise needs
+        pull_force_n=8.0 * max(setup.noise_n, 1e-3),
+        force_rate_n_per_s=1.2 * max(setup.noise_n, 1e-3) / 1e-3,
+    )
+    controller = ContactController(parameters, limits)
+    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
     loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
     loop.run_while(lambda: controller.state is State.HOLD, 1.0)
     result = controller.result
     assert result is not None
+    if record is not None:
+        record += rig.force_n
     stated = None
     if ready is not None and result.force_n is not None and result.force_std_n is not None:
         stated = result.force_n, result.force_std_n
     return rig.outcome(ready, result.cause.value, stated)
+
+
+def contact_series(count: int) -> np.ndarray:
+    """Mean true force over 0.3 s of so many contacts in a row at one place [N], (count,)."""
+    rig = Rig(Case(2.5e-3, 10e3, 1.0, 1.5e-3, 0.0, 1), Setup("series"))
+    bench = rig.bench
+    parameters = ContactParameters(tare_s=0.2)
+    controller = ContactController(parameters, Limits())
+    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+    means = []
+    for _ in range(count):
+        if not loop.make(ContactGoal(rig.touch, Aim(FORCE_N))).reached:
+            raise RuntimeError(f"contact {len(means)} failed: {controller.result}")
+        rig.force_n.clear()
+        loop.run_while(lambda: controller.state is State.HOLD, 0.3)
+        means.append(float(np.mean(rig.force_n)))
+        loop.retract()
+    return np.array(means)

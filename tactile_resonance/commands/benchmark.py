@@ -8,7 +8,9 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-NAMES = ("frf", "poles", "bench", "robot")
+NAMES = ("frf", "poles", "bench", "contact", "robot")
+WITH_FULL = ("contact",)
+"""Those with a larger grid than they run by default."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -21,6 +23,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
+    parser.add_argument(
+        "--full", action="store_true", help=f"the whole grid ({', '.join(WITH_FULL)})"
+    )
     parser.add_argument(
         "--output",
         type=Path,
@@ -39,5 +44,6 @@ def run(options: argparse.Namespace) -> int:
         )
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
-        print(import_module(f"benchmarks.{name}").run(options.output, options.quick))
+        extra = {"full": True} if options.full and name in WITH_FULL else {}
+        print(import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra))
     return 0

@@ -27,6 +27,13 @@ LN_C_MEAN, LN_C_STD = math.log(800.0), 1.5
 """ln of C [N/m^1.5] before the touch: 2 to 40 kPa under balls of 1.5 to 3 mm give 140 to 3800."""
 
 
+SURFACES, STIFFNESSES = 28, 21
+"""Grid of the first estimate, over the height of the touch and ln C."""
+
+RECENT, GROUP = 40, 6
+"""Of the samples before the touch was told the last are used one by one, the others in groups."""
+
+
 @dataclass(frozen=True)
 class ContactEstimate:
     """What is known of the contact.
@@ -183,8 +190,8 @@ def touch_posterior(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (2,) and covariance (2, 2) of (height of touch, ln C) from few samples.
 
-    On a grid: the touch anywhere in the window, C by its prior; no linearisation, since at first
-    touch none holds.
+    On a grid: the touch anywhere on the way, C by its prior; no linearisation, since at first
+    touch none holds. Older samples, where at most soft tissue was touched, are taken in groups.
 
     Parameters
     ----------
@@ -193,30 +200,44 @@ def touch_posterior(
     noise_n : float
     beam_n_per_m : float
     """
-    highest, lowest = float(heights_m.max()), float(heights_m.min())
-    span = max(highest - lowest, 1e-6)
-    surface = lowest + span * (np.arange(24) + 0.5) / 24  # (s,)
-    ln_c = LN_C_MEAN + LN_C_STD * np.linspace(-2.5, 2.5, 21)  # (c,)
-    depth = np.maximum(surface[:, None, None] - heights_m, 0)  # (s, 1, n)
+    heights, forces, weights = _grouped(heights_m, forces_n)  # (p,) each
+    lowest = float(heights_m.min())
+    span = max(float(heights_m.max()) - lowest, 1e-6)
+    # finer towards the tip, since stiff tissue was touched only just now
+    edges = lowest + span * np.linspace(0, 1, SURFACES + 1) ** 2
+    surface, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)  # (s,)
+    ln_c = LN_C_MEAN + LN_C_STD * np.linspace(-2.5, 2.5, STIFFNESSES)  # (c,)
+    depth = np.maximum(surface[:, None, None] - heights, 0)  # (s, 1, p)
     c = np.exp(ln_c)[:, None]  # (c, 1)
-    root = np.broadcast_to(np.sqrt(depth), (24, 21, heights_m.size)).copy()
-    if beam_n_per_m != hertz.RIGID:
+    root = np.broadcast_to(np.sqrt(depth), (SURFACES, STIFFNESSES, heights.size)).copy()
+    if beam_n_per_m != hertz.RIGID:  # as in `hertz.force`
         for _ in range(4):
             excess = (c * root + beam_n_per_m) * root**2 - beam_n_per_m * depth
             root -= excess / ((3 * c * root + 2 * beam_n_per_m) * root + 1e-12)
-    misfit = ((forces_n - c * root**3) ** 2).sum(axis=-1) / noise_n**2  # (s, c)
+    misfit = ((forces - c * root**3) ** 2) @ weights / noise_n**2  # (s, c)
     cost = misfit / 2 + ((ln_c - LN_C_MEAN) / LN_C_STD) ** 2 / 2
-    weight = np.exp(-(cost - cost.min()))
+    weight = np.exp(-(cost - cost.min())) * width[:, None]
     weight /= weight.sum()
-    mean_s, mean_c = float((weight.sum(1) * surface).sum()), float((weight.sum(0) * ln_c).sum())
-    off_s, off_c = surface - mean_s, ln_c - mean_c
-    mixed = float((weight * np.outer(off_s, off_c)).sum())
-    # the width of a cell is not known away
-    cell_s, cell_c = (span / 24) ** 2 / 12, (LN_C_STD * 0.25) ** 2 / 12
-    covariance = np.array(
-        [
-            [float((weight.sum(1) * off_s**2).sum()) + cell_s, mixed],
-            [mixed, float((weight.sum(0) * off_c**2).sum()) + cell_c],
-        ]
-    )
-    return np.array([mean_s, mean_c]), covariance
+    of_surface, of_c = weight.sum(axis=1), weight.sum(axis=0)
+    mean = np.array([of_surface @ surface, of_c @ ln_c])
+    off_s, off_c = surface - mean[0], ln_c - mean[1]
+    mixed = off_s @ weight @ off_c
+    # within a cell all is equally likely
+    variance_s = of_surface @ (off_s**2 + width**2 / 12)
+    variance_c = of_c @ off_c**2 + (ln_c[1] - ln_c[0]) ** 2 / 12
+    return mean, np.array([[variance_s, mixed], [mixed, variance_c]])
+
+
+def _grouped(
+    heights_m: FloatArray, forces_n: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Newest samples as they are, older ones as means of groups; with how many each stands for."""
+    recent = min(len(forces_n), RECENT)
+    older = (len(forces_n) - recent) // GROUP * GROUP
+    begin = len(forces_n) - recent - older
+    parts = [
+        np.concatenate([x[begin : begin + older].reshape(-1, GROUP).mean(axis=1), x[-recent:]])
+        for x in (heights_m, forces_n)
+    ]
+    weights = np.concatenate([np.full(older // GROUP, float(GROUP)), np.ones(recent)])
+    return parts[0], parts[1], weights

@@ -22,14 +22,14 @@ class ForceWatch:
     Parameters
     ----------
     stuck_samples : int
-        So many equal forces in a row are a stuck sensor.
+        So many equal forces along z in a row are a stuck sensor, or one at the end of its range.
 
     Attributes
     ----------
     force_n : (3,) array
         Newest force at the tip, less the bias [N].
     peak_n : float
-        Largest force along +z since the bias was set [N].
+        Largest force along +z since the bias was set [N]; 0 before.
     """
 
     def __init__(self, stuck_samples: int) -> None:
@@ -37,21 +37,21 @@ class ForceWatch:
         self._equal = 1
         self._last: WrenchSample | None = None
         self._recent: deque[tuple[int, float]] = deque()  # time, force along z
-        self.bias_n = np.zeros(3)
+        self._bias_n: NDArray[np.float64] | None = None
         self.force_n: NDArray[np.float64] = np.zeros(3)
         self.peak_n = 0.0
 
+    @property
+    def bias_n(self) -> NDArray[np.float64]:
+        """What is taken off (3,) [N]; zeros before the tare."""
+        return np.zeros(3) if self._bias_n is None else self._bias_n
+
     def set_bias(self, bias_n: NDArray[np.float64]) -> None:
         """Take what the sensor shows out of contact (3,) as 0; forget what came before."""
-        self.bias_n = bias_n
+        self._bias_n = bias_n
         self._recent.clear()
         self.force_n = np.zeros(3)
         self.peak_n = 0.0
-
-    def restart(self) -> None:
-        """Forget all, as after a pause."""
-        self._last, self._equal = None, 1
-        self.set_bias(np.zeros(3))
 
     def add(self, sample: WrenchSample, inertia_n: float = 0.0) -> Breach | None:
         """Take one wrench, oldest first; what is wrong with it is returned and it is not used.
@@ -71,16 +71,17 @@ class ForceWatch:
         if last is not None and sample.time_ns <= last.time_ns:
             text = f"time of forces does not ascend: {sample.time_ns} after {last.time_ns} ns"
             return Breach(Cause.FORCE_INVALID, text)
-        same = last is not None and (x, y, z) == tuple(last.force_n)
+        same = last is not None and z == float(last.force_n[2])
         self._equal = self._equal + 1 if same else 1
         self._last = sample
         if self._equal >= self._stuck_samples:
             text = f"{self._equal} equal forces in a row: the sensor is stuck"
             return Breach(Cause.FORCE_STUCK, text)
-        self.force_n = sample.force_n - self.bias_n
-        self.force_n[2] -= inertia_n
+        self.force_n = sample.force_n - [0.0, 0.0, inertia_n]
+        if self._bias_n is not None:
+            self.force_n -= self._bias_n
+            self.peak_n = max(self.peak_n, float(self.force_n[2]))
         z = float(self.force_n[2])
-        self.peak_n = max(self.peak_n, z)
         self._recent.append((sample.time_ns, z))
         while self._recent[0][0] < sample.time_ns - KEEP_NS:
             self._recent.popleft()

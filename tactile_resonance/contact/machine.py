@@ -32,11 +32,17 @@ RIGHTING_S = 0.1
 ARRIVED_M, ARRIVED_RAD = 5e-5, 2e-3
 """Distance and angle from the standoff at which it is reached."""
 
+TURNING_M = 2e-3
+"""So far above where the surface is near the tip is turned [m]."""
+
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
 
 TOUCH_IN_TRAVEL_N = 0.01
 """Change of the untared force while coming down to the standoff that is a touch [N]."""
+
+LOST_GRACE_S = 0.02
+"""Forces from before the touch do not count for a lost contact, nor those of the first moments."""
 
 RETRACT_AFTER_S = 0.1
 """A fault's stop lasts so long before the tip is drawn back [s]."""
@@ -224,7 +230,9 @@ class ContactController:
             return None
         place = None if arm is None else self._place(arm)
         breach = self._judge(now_ns, arm, place, wrenches, fault)
-        if breach is not None and self.state is not State.FAULT:
+        if breach is not None and self.state is State.FAULT:
+            self._arm_was_bad = True  # nothing else counts in this state
+        elif breach is not None:
             self._fail(breach, now_ns)
         if breach is None and self._wish_retract and self.state is not State.RETRACT:
             text = "drawn back as asked for"
@@ -232,7 +240,7 @@ class ContactController:
             self._enter(State.RETRACT, now_ns)
         if arm is None or place is None:
             return self._stop()
-        twist = self._act(now_ns, arm, place, breach)
+        twist = self._act(now_ns, arm, place)
         if twist is None:
             return self._stop()
         twist = self._envelope.bound(twist, arm.tip.position_m, place)
@@ -289,9 +297,7 @@ class ContactController:
 
     # what each state does: the wished twist, None to stop
 
-    def _act(
-        self, now_ns: int, arm: ArmSample, place: Place, breach: Breach | None
-    ) -> FloatArray | None:
+    def _act(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         if self.state is State.TRAVEL:
             return self._travel(now_ns, arm, place)
         if self.state is State.TARE:
@@ -302,7 +308,8 @@ class ContactController:
             return self._press(now_ns, arm, place)
         if self.state is State.RETRACT:
             return self._draw_back(now_ns, arm, place)
-        return self._after_fault(now_ns, place, breach)
+        self._after_fault(now_ns)
+        return None
 
     def _travel(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         p = self.parameters
@@ -316,11 +323,13 @@ class ContactController:
                 text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
                 self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
                 return None
-        goal = self._goal_position(p.standoff_m)
-        way = goal - arm.tip.position_m
-        distance = float(np.linalg.norm(way))
         turn = self._turn(arm)
         angle = float(np.linalg.norm(turn))
+        height = p.standoff_m
+        if angle > self.limits.misalignment_rad / 2:  # first turn, out of reach of the surface
+            height = max(height, self.limits.near_m + TURNING_M)
+        way = self._goal_position(height) - arm.tip.position_m
+        distance = float(np.linalg.norm(way))
         if distance < ARRIVED_M and angle < ARRIVED_RAD:
             self._enter(State.TARE, now_ns)
             return None
@@ -406,7 +415,7 @@ class ContactController:
         """Whether the tissue has gone; a touch that was noise is taken back."""
         observer, limits = self._observer, self.limits
         mean = observer.watch.mean_n(limits.lost_s)
-        if mean is None:
+        if mean is None or now_ns - self._contact_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
             return False
         if self.state is State.CONTACT and mean < observer.noise_n / 4:
             observer.seek_touch()
@@ -434,13 +443,10 @@ class ContactController:
         twist[:3] = max(speed, 1e-4) * self._normal
         return twist
 
-    def _after_fault(self, now_ns: int, place: Place, breach: Breach | None) -> FloatArray | None:
+    def _after_fault(self, now_ns: int) -> None:
         """Stand still; then draw back, unless the arm itself was the fault."""
-        if breach is not None:
-            self._arm_was_bad = True
-        elif not self._arm_was_bad and now_ns - self._state_ns > 1e9 * RETRACT_AFTER_S:
+        if not self._arm_was_bad and now_ns - self._state_ns > 1e9 * RETRACT_AFTER_S:
             self._enter(State.RETRACT, now_ns)
-        return None
 
     # pieces
 

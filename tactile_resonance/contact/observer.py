@@ -15,11 +15,14 @@ from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.tare import TareError, TareLimits, tare
 
-WINDOW_SAMPLES = 60
-"""Forces kept for the first estimate of the contact: 120 ms at 500 Hz."""
+WINDOW_SAMPLES = 220
+"""Forces kept for the first estimate of the contact: 440 ms at 500 Hz, 1.8 mm at 4 mm/s."""
 
 LEAST_NOISE_N = 2e-5
 """The filter takes a force for no more certain than this [N]."""
+
+QUIETEST_SHARE = 0.1
+"""A sensor with less than this of the noise it states does not measure any more."""
 
 LONGEST_GUESS_S = 0.02
 """So far beyond the newest state of the arm its height is continued [s]."""
@@ -71,8 +74,12 @@ class Observer:
             zero = tare(self._unloaded, limits)
         except TareError as error:
             return Breach(Cause.TARE, str(error))
+        noise = float(zero.noise_rms_n[2])
+        if noise < QUIETEST_SHARE * p.cell_noise_n:
+            text = f"tare: noise of {1e3 * noise:.2g} mN rms, the source states"
+            return Breach(Cause.TARE, f"{text} {1e3 * p.cell_noise_n:g} mN: does it still measure?")
         self.watch.set_bias(zero.force_n)
-        self.noise_n = max(LEAST_NOISE_N, float(zero.noise_rms_n[2]))
+        self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.force_std_n[2])
         self.seek_touch()
         return None

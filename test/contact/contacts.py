@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A contact on the bench in virtual time, started close to the surface so that it is soon made."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.loop import ContactLoop
+from tactile_resonance.contact.machine import ContactController, ContactGoal
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.contact_bench import ContactBench, Tip
+from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.tissue import Tissue
+
+RADIUS_M, FORCE_N = 2.5e-3, 0.01
+SOFT = Tissue("soft", 4.5e3, (1.0,), (0.95,))  # 8.8 kPa at once, 4.5 after 1 s
+QUICK = ContactParameters(tare_s=0.1, standoff_m=2.1e-3, early_m=2e-3)
+
+
+@dataclass
+class Contact:
+    """Bench, controller, loop, and what truly happened, one entry per period."""
+
+    bench: ContactBench
+    controller: ContactController
+    loop: ContactLoop
+    goal: ContactGoal
+    force_n: list
+    speed_m_s: list
+
+    def run_until(self, state, longest_s=20.0):
+        """Run until a state is reached; False where it is not."""
+        self.loop.run_while(lambda: self.controller.state is not state, longest_s)
+        return self.controller.state is state
+
+    def run(self, duration_s):
+        self.loop.run_while(lambda: True, duration_s)
+
+
+def contact(
+    tissue=SOFT,
+    *,
+    height_m=1e-3,
+    tilt_rad=0.0,
+    start_m=2.5e-3,
+    parameters=QUICK,
+    limits=None,
+    aim=None,
+    seed=0,
+    **bench,
+):
+    touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
+    start = Pose(touch.position_m + [0, 0, start_m], touch.rotation_rad)
+    rig = ContactBench(
+        tissue, Plane.tilted(height_m, tilt_rad), start, tip=Tip(RADIUS_M), seed=seed, **bench
+    )
+    controller = ContactController(parameters, Limits() if limits is None else limits)
+    loop = ContactLoop(rig.arm, rig.force, rig.clock, controller)
+    force, speed = [], []
+    rig.clock.on_step.append(lambda: force.append(float(rig.plant.force_n[2])))
+    rig.clock.on_step.append(lambda: speed.append(float(rig.clock.motion.twist[2])))
+    goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
+    return Contact(rig, controller, loop, goal, force, speed)
+
+
+def started(**options):
+    made = contact(**options)
+    made.loop.start(made.goal)
+    return made
+
+
+def stiffer(tissue, factor):
+    return replace(tissue, relaxation_modulus_1s_pa=factor * tissue.relaxation_modulus_1s_pa)
+
+
+def lower(bench, by_m):
+    """Take the tissue away downwards."""
+    surface = bench.plant.surface
+    bench.plant.surface = Plane(surface.point_m - np.array([0, 0, by_m]), surface.normal)

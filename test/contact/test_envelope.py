@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The envelope by itself: whatever is asked for, what it lets through keeps every limit."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactile_resonance.contact.envelope import WALL_TIME_S, Envelope, Place
+from tactile_resonance.contact.force_watch import ForceWatch
+from tactile_resonance.contact.parameters import (
+    ContactParameters,
+    Limits,
+    Workspace,
+    check_ranges,
+    read_contact,
+)
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+
+LIMITS = Limits(workspace=Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5)))
+ENVELOPE = Envelope(LIMITS)
+SLACK = 1 + 1e-9
+
+number = st.floats(-1.0, 1.0)
+vectors = st.tuples(number, number, number).map(np.array)
+normals = vectors.filter(lambda v: np.linalg.norm(v) > 0.1).map(lambda v: v / np.linalg.norm(v))
+places = st.builds(
+    Place,
+    normal=normals,
+    height_m=st.floats(-0.01, 0.05),
+    depth_m=st.none() | st.floats(-1e-3, 6e-3),
+    misalignment_rad=st.floats(0, 1),
+)
+twists = st.tuples(*[number] * 6).map(np.array)
+positions = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.1, 0.6)).map(
+    np.array
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(twists, positions, places)
+def test_what_is_let_through_keeps_every_limit(twist, position, place):
+    out = ENVELOPE.bound(twist, position, place)
+    velocity, inwards = out[:3], -float(place.normal @ out[:3])
+    assert np.isfinite(out).all()
+    assert np.linalg.norm(velocity) <= LIMITS.free_speed_m_s * SLACK
+    assert np.linalg.norm(out[3:]) <= LIMITS.angular_speed_rad_s * SLACK
+    if place.height_m < LIMITS.near_m and inwards > 1e-12:
+        assert np.linalg.norm(velocity) <= LIMITS.near_speed_m_s * SLACK
+    if place.depth_m is not None:
+        along = velocity + inwards * place.normal
+        assert np.linalg.norm(along) <= LIMITS.lateral_speed_m_s * SLACK
+        assert inwards <= LIMITS.contact_speed_m_s * SLACK
+        if place.depth_m >= LIMITS.depth_m:
+            assert inwards <= 1e-12
+    for x, v, low, high in zip(
+        position, velocity, LIMITS.workspace.low_m, LIMITS.workspace.high_m, strict=True
+    ):
+        assert v <= max(0.0, high - x) / WALL_TIME_S * SLACK + 1e-15
+        assert v >= min(0.0, low - x) / WALL_TIME_S * SLACK - 1e-15
+
+
+@settings(max_examples=200, deadline=None)
+@given(twists, positions, places)
+def test_it_never_turns_a_motion_round_and_never_makes_one_faster(twist, position, place):
+    out = ENVELOPE.bound(twist, position, place)
+    assert float(out[:3] @ twist[:3]) >= -1e-12
+    assert np.linalg.norm(out[:3]) <= np.linalg.norm(twist[:3]) * SLACK + 1e-15
+    assert float(out[3:] @ twist[3:]) >= -1e-12
+    again = ENVELOPE.bound(out, position, place)
+    np.testing.assert_allclose(again, out, rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.sampled_from([math.nan, math.inf, -math.inf, 0.1]), min_size=6, max_size=6))
+def test_what_is_no_number_stops_the_tip(values):
+    twist = np.array(values)
+    if np.isfinite(twist).all():
+        return
+    place = Place(np.array([0.0, 0, 1]), 0.01, None, 0.0)
+    np.testing.assert_array_equal(ENVELOPE.bound(twist, np.array([0, 0, 0.1]), place), 0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.006, 0.05))
+def test_a_tip_that_comes_down_as_fast_as_allowed_is_slow_when_it_is_near(height):
+    # followed with dead time 4 ms and lag 10 ms, limited in acceleration to 0.5 m/s2
+    speed, delayed, line = 0.0, 0.0, [0.0, 0.0]
+    for _ in range(1500):
+        place = Place(np.array([0.0, 0, 1]), height, None, 0.0)
+        out = ENVELOPE.bound(np.array([0, 0, -0.1, 0, 0, 0]), np.array([0, 0, 0.2]), place)
+        delayed += min(1e-3, max(-1e-3, out[2] - delayed))
+        line.append(delayed)
+        speed += (line.pop(0) - speed) * (1 - math.exp(-0.2))
+        height += speed * 0.002
+        if height < LIMITS.near_m:
+            assert -speed <= 1.5 * LIMITS.near_speed_m_s  # what judge_motion lets pass
+
+
+def arm(**changes):
+    pose = Pose(np.array([0.1, 0.0, 0.2]), np.zeros(3))
+    return replace(ArmSample(1_000_000_000, 1.0, pose, np.zeros(6)), **changes)
+
+
+@pytest.mark.parametrize(
+    ("sample", "cause"),
+    [
+        (None, Cause.ARM_STALE),
+        (arm(time_ns=979_000_000), Cause.ARM_STALE),
+        (arm(moving_allowed=False, message="protective stop"), Cause.ARM_STOPPED),
+        (arm(tip=Pose(np.array([np.nan, 0, 0.2]), np.zeros(3))), Cause.ARM_INVALID),
+        (arm(tip=Pose(np.array([0.1, 0.31, 0.2]), np.zeros(3))), Cause.WORKSPACE),
+        (arm(tip=Pose(np.array([0.1, 0, 0.2]), np.array([0.0, 0.81, 0]))), Cause.TILT),
+        (arm(tip=Pose(np.array([0.1, 0, 0.2]), np.array([np.pi, 0, 0]))), Cause.TILT),
+    ],
+)
+def test_state_of_the_arm_is_judged(sample, cause):
+    assert ENVELOPE.judge_arm(1_000_000_000, sample).cause is cause
+
+
+@pytest.mark.parametrize(
+    "rotation", [[0, 0, 0], [0, 0, 3.0], [0.5, 0.5, 0], [0, 0.79, 0], [0.2, 0.1, 2.0]]
+)
+def test_upright_arm_passes(rotation):
+    pose = Pose(np.array([0.1, 0, 0.2]), np.array(rotation, dtype=float))
+    tilt = math.acos(min(1.0, pose.rotation.as_matrix()[2, 2]))
+    breach = ENVELOPE.judge_arm(1_000_000_000, arm(tip=pose))
+    assert (breach is None) == (tilt <= LIMITS.tilt_rad)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "place", "cause"),
+    [
+        ([0, 0, 0], (-0.001, 4.1e-3, 0.0), Cause.DEPTH),
+        ([0, 0, -0.008], (0.004, None, 0.0), Cause.SPEED),
+        ([0, 0, 0], (0.004, None, 0.06), Cause.MISALIGNED),
+        ([0, 0, -0.008], (0.006, None, 0.5), None),
+        ([0, 0, 0.05], (0.001, 1e-3, 0.0), None),
+    ],
+)
+def test_motion_near_the_surface_is_judged(velocity, place, cause):
+    sample = arm(tip_velocity=np.array([*velocity, 0, 0, 0], dtype=float))
+    limits = Envelope(replace(LIMITS, depth_m=4e-3))
+    breach = limits.judge_motion(sample, Place(np.array([0.0, 0, 1]), *place))
+    assert (None if breach is None else breach.cause) is cause
+
+
+def watched(forces, period_ns=2_000_000):
+    watch = ForceWatch(10)
+    watch.set_bias(np.zeros(3))
+    for n, force in enumerate(forces):
+        force = np.array(force, dtype=float) + [0, 0, 1e-9 * n]
+        assert watch.add(WrenchSample(n * period_ns, force, np.zeros(3))) is None
+    return watch, (len(forces) - 1) * period_ns
+
+
+@pytest.mark.parametrize(
+    ("forces", "cause"),
+    [
+        ([[0, 0, 0.0301]], Cause.FORCE_ABORT),
+        ([[0, 0, -0.0081]], Cause.FORCE_PULL),
+        ([[0.011, 0.011, 0.01]], Cause.FORCE_LATERAL),
+        ([[0, 0, 0.0]] * 8 + [[0, 0, 0.02]] * 3, Cause.FORCE_RATE),
+        ([[0, 0, 0.02]] * 8 + [[0, 0, 0.0]] * 3, Cause.FORCE_RATE),
+        ([[0, 0, 0.0012 * n] for n in range(20)], None),  # 0.6 N/s
+        ([[0.01, 0, 0.0299]], None),
+    ],
+)
+def test_force_is_judged(forces, cause):
+    watch, now = watched(forces)
+    breach = ENVELOPE.judge_force(now, watch)
+    assert (None if breach is None else breach.cause) is cause
+
+
+def test_old_force_is_judged():
+    watch, now = watched([[0, 0, 0.01]] * 5)
+    assert ENVELOPE.judge_force(now + 10_000_000, watch) is None
+    assert ENVELOPE.judge_force(now + 10_100_000, watch).cause is Cause.FORCE_STALE
+    assert ENVELOPE.judge_force_age(0, ForceWatch(10)).cause is Cause.FORCE_STALE
+
+
+@pytest.mark.parametrize(
+    ("sample", "cause"),
+    [
+        (WrenchSample(10, np.array([0, np.nan, 0]), np.zeros(3)), Cause.FORCE_INVALID),
+        (WrenchSample(10, np.zeros(3), np.zeros(3), overload=True), Cause.FORCE_OVERLOAD),
+        (WrenchSample(0, np.ones(3), np.zeros(3)), Cause.FORCE_INVALID),
+    ],
+)
+def test_bad_force_is_not_used(sample, cause):
+    watch, _ = watched([[0, 0, 0.01]])
+    assert watch.add(sample).cause is cause
+    assert watch.force_n[2] == 0.01
+
+
+def test_rate_of_a_ramp_is_its_slope():
+    rng = np.random.default_rng(0)
+    ramp = [[0, 0, 0.5 * 0.002 * n + 1e-4 * rng.standard_normal()] for n in range(50)]
+    watch, _ = watched(ramp)
+    assert watch.rate_n_per_s() == pytest.approx(0.5, abs=0.05)
+    assert watch.mean_n(0.02) == pytest.approx(0.5 * (0.098 - 0.009), abs=2e-4)
+    assert watch.mean_n(0.2) is None
+
+
+def test_configuration_is_read_and_checked(tmp_path):
+    parameters, limits = read_contact()
+    check_ranges(parameters, {"approach_speed_m_s": (0, limits.near_speed_m_s)})
+    assert limits.workspace.high_m == (1.0, 1.0, 1.0)
+    bad = tmp_path / "contact.yaml"
+    for text, message in [
+        ("contact: {approach_speed_m_s: 0.01}\nlimits: {}", "approach_speed_m_s: got 0.01"),
+        ("contact: {}\nlimits: {near_speed_m_s: 0.003}", "at most the limit 0.003"),
+        ("contact: {}\nlimits: {hard_force_n: 0.02}", "above 0.03"),
+        ("contact: {}\nlimits: {nearness: 1.0}", "nearness"),
+        ("contact: {}\nlimits: {workspace: {low_m: [1, 1], high_m: [2, 2, 2]}}", "low_m"),
+        ("contact: {standoff_m: 0.001}\nlimits: {}", "above early_m"),
+    ]:
+        bad.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_contact(bad)
+
+
+def test_a_tool_that_must_not_be_faster_than_its_limits():
+    with pytest.raises(ValueError, match="travel_speed_m_s: got 0.2"):
+        Limits().check(ContactParameters(travel_speed_m_s=0.2))

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The life of a contact: reached and held, given up, refused; parameters never move the robot."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, touch_pose
+from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.machine import ContactGoal, State
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.tracking import TrackingParameters
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, started, stiffer
+
+
+@pytest.mark.parametrize("tissue", [stiffer(SOFT, 0.4), SOFT, stiffer(SOFT, 4.0)])
+def test_force_is_reached_held_and_reported_with_an_honest_deviation(tissue):
+    made = contact(tissue, seed=7)
+    result = made.loop.make(made.goal)
+    assert result.reached
+    made.run(1.0)
+    true = np.mean(made.force_n[-500:])
+    assert true == pytest.approx(FORCE_N, rel=0.05)
+    assert max(made.force_n) < 1.15 * FORCE_N
+    assert made.bench.plant.touches == 1
+    held = made.controller.result
+    assert abs(held.force_n - true) < 4 * held.force_std_n
+    assert held.force_std_n < 3e-4
+    assert made.loop.retract().retracted
+    assert made.controller.state is State.IDLE
+    assert made.force_n[-1] == 0
+
+
+def test_states_follow_each_other():
+    made = contact()
+    seen = []
+    made.bench.clock.on_step.append(lambda: seen.append(made.controller.state))
+    made.loop.make(made.goal)
+    made.run(0.1)
+    made.loop.retract()
+    made.run(0.01)
+    order = [s for n, s in enumerate(seen) if n == 0 or s is not seen[n - 1]]
+    want = ["travel", "tare", "approach", "contact", "settle", "hold", "retract", "idle"]
+    assert [s.value for s in order if s is not State.IDLE] + ["idle"] == want
+
+
+def test_all_six_axes_go_to_the_pose_of_the_point():
+    touch = touch_pose([0.02, -0.01, 0.0], [0.1, -0.05, 1.0], [1, 1, 0], RADIUS_M)
+    made = contact(height_m=0.0, start_m=0.02)
+    made.bench.plant.surface = type(made.bench.plant.surface)(
+        np.array([0.02, -0.01, 0.0]), touch.rotation.as_matrix()[:, 2]
+    )
+    assert made.loop.make(ContactGoal(touch, Aim(FORCE_N))).reached
+    tip = made.bench.clock.motion.reported
+    assert misalignment_rad(tip, touch) < 0.01
+    normal = touch.rotation.as_matrix()[:, 2]
+    way = tip.position_m - touch.position_m
+    assert np.linalg.norm(way - (normal @ way) * normal) < 1e-4
+    assert made.controller.result.surface_m == pytest.approx(0, abs=2e-4)
+
+
+def test_indentation_is_held_while_the_force_decays():
+    made = contact(aim=Aim(FORCE_N, HoldMode.INDENTATION))
+    assert made.loop.make(made.goal).reached
+    made.run(0.2)
+    place, force = made.bench.clock.motion.reported.position_m[2], made.force_n[-1]
+    made.run(1.0)
+    assert made.bench.clock.motion.reported.position_m[2] == pytest.approx(place, abs=3e-6)
+    assert made.force_n[-1] < 0.9 * force
+
+
+@pytest.mark.parametrize("state", [s for s in State if s not in (State.IDLE, State.FAULT)])
+def test_a_cancelled_contact_draws_back_from_every_state(state):
+    made = started()
+    if state is State.RETRACT:
+        assert made.run_until(State.HOLD)
+        made.controller.retract()
+    assert made.run_until(state)
+    made.controller.retract()
+    made.loop.cycle()
+    assert made.controller.state in (State.RETRACT, State.IDLE)  # above the standoff: done
+    assert made.run_until(State.IDLE, 5.0)
+    result = made.controller.result
+    assert result.cause is Cause.CANCELLED
+    assert result.retracted
+    assert result.reached == (state in (State.HOLD, State.RETRACT))
+    assert max(made.force_n, default=0.0) < 1.2 * FORCE_N
+
+
+def test_parameters_are_refused_in_contact_and_nothing_changes():
+    made = started()
+    assert made.run_until(State.HOLD)
+    before = made.controller.parameters
+    with pytest.raises(ValueError, match="refused in state hold"):
+        made.controller.configure(replace(before, approach_speed_m_s=1e-3), Limits())
+    with pytest.raises(ValueError, match="goal: refused in state hold"):
+        made.loop.start(made.goal)
+    assert made.controller.parameters is before
+    speed = np.abs(made.speed_m_s[-10:]).max()
+    made.run(0.1)
+    assert np.abs(made.speed_m_s[-50:]).max() < speed + 5e-4
+    made.loop.retract()
+    made.controller.configure(replace(before, approach_speed_m_s=1e-3), Limits())
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (lambda t: ContactGoal(t, Aim(0.025)), "force_n: got 0.025"),
+        (lambda t: ContactGoal(Pose(t.position_m * np.nan, t.rotation_rad), Aim(0.01)), "finite"),
+        (lambda t: ContactGoal(Pose(t.position_m + 5, t.rotation_rad), Aim(0.01)), "workspace"),
+        (lambda t: ContactGoal(Pose(t.position_m, np.array([1.0, 0, 0])), Aim(0.01)), "tilted"),
+    ],
+)
+def test_goals_beyond_the_limits_are_refused(goal, message):
+    made = contact()
+    with pytest.raises(ValueError, match=message):
+        made.loop.start(goal(made.goal.touch))
+    assert made.controller.state is State.IDLE
+    made.run(0.05)
+    assert np.abs(made.speed_m_s).max() == 0
+
+
+def test_hold_ends_after_its_time():
+    made = contact(limits=Limits(hold_s=0.2))
+    assert made.loop.make(made.goal).reached
+    made.run_until(State.IDLE, 3.0)
+    result = made.controller.result
+    assert result.reached
+    assert result.cause is Cause.HOLD_ENDED
+    assert result.retracted
+
+
+def test_unsteady_zero_is_refused():
+    parameters = replace(QUICK, cell_noise_n=2e-4)
+    made = contact(parameters=parameters)
+    result = made.loop.make(made.goal)
+    assert result.cause is Cause.TARE
+    assert "noise" in result.message
+    made.run(0.5)
+    assert max(made.force_n) == 0
+
+
+def test_same_seed_same_contact_to_the_last_bit():
+    forces = []
+    for _ in range(2):
+        made = contact(seed=5)
+        made.loop.make(made.goal)
+        forces.append(made.force_n)
+    assert forces[0] == forces[1]
+
+
+def test_thirty_contacts_in_a_row_do_not_drift():
+    parameters = replace(QUICK, tare_s=0.1)
+    made = contact(
+        stiffer(SOFT, 2.0),
+        parameters=parameters,
+        height_m=1.5e-3,
+        tracking=TrackingParameters(),
+        seed=11,
+    )
+    means = []
+    for _ in range(30):
+        assert made.loop.make(made.goal).reached
+        made.run(0.1)
+        made.run(0.2)
+        means.append(np.mean(made.force_n[-100:]))
+        assert made.loop.retract().retracted
+    slope, offset = np.polyfit(np.arange(30), means, 1)
+    residual = means - (slope * np.arange(30) + offset)
+    slope_std = residual.std(ddof=2) / np.sqrt(30 * (30**2 - 1) / 12)
+    assert abs(slope) < 3.5 * slope_std
+    assert np.mean(means) == pytest.approx(FORCE_N, rel=0.02)
+    # bias of a tare, 50 forces of 1 mN, and what the hold leaves over 0.2 s
+    assert residual.std() < 0.035 * FORCE_N
+
+
+def test_wrong_idea_of_the_arm_is_survived():
+    # dead time and lag are twice what the controller believes
+    slow = TrackingParameters(dead_time_s=0.008, lag_s=0.020)
+    made = contact(stiffer(SOFT, 4.0), tracking=slow, seed=2)
+    assert made.loop.make(made.goal).reached
+    made.run(1.0)
+    assert np.mean(made.force_n[-500:]) == pytest.approx(FORCE_N, rel=0.05)
+    assert max(made.force_n) < 2 * FORCE_N
+
+
+def test_housing_stays_clear_of_the_tissue():
+    tip = TipGeometry()
+    # 64 mm at 0.17 rad rise 10.8 mm; ball 2.5 mm; housing 6 mm below the beam
+    assert tip.clearance(0.0) == pytest.approx(2.5e-3 + 0.064 * np.sin(0.17) - 6e-3)
+    assert tip.clearance(3e-3) == pytest.approx(tip.clearance(0.0) - 3e-3)
+    assert tip.clearance(0.0, 0.05) == pytest.approx(
+        tip.clearance(0.0) - 0.064 * np.cos(0.17) * np.tan(0.05)
+    )
+    with pytest.raises(ValueError, match="beam_tilt_rad: got 2"):
+        TipGeometry(beam_tilt_rad=2)
+
+
+def test_touch_pose_puts_the_ball_on_the_point():
+    normal = np.array([0.2, -0.1, 1.0])
+    pose = touch_pose([0.1, 0.2, 0.3], normal, [0, 1, 0], RADIUS_M)
+    turn = pose.rotation.as_matrix()
+    np.testing.assert_allclose(turn[:, 2], normal / np.linalg.norm(normal), atol=1e-12)
+    assert turn[1, 0] > 0.9  # x of the tip where it was asked for
+    lowest = pose.position_m - RADIUS_M * turn[:, 2]
+    np.testing.assert_allclose(lowest, [0.1, 0.2, 0.3], atol=1e-12)
+    for bad in ([0, 0, 0], [0, np.nan, 1]):
+        with pytest.raises(ValueError, match="normal"):
+            touch_pose([0, 0, 0], bad, [1, 0, 0], RADIUS_M)
+    with pytest.raises(ValueError, match="towards"):
+        touch_pose([0, 0, 0], [0, 0, 1], [0, 0, 1], RADIUS_M)
+
+
+def test_defaults_of_the_code_are_within_their_ranges():
+    Limits().check(ContactParameters())
