@@ -54,7 +54,7 @@ class NodeProcesses:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+                preexec_fn=end_with_parent if sys.platform == "linux" else None,
             )
 
     def check(self) -> None:
@@ -121,7 +121,8 @@ def take_priority(priority: int) -> None:
         ) from error
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Let this process, about to be executed, be told to end should its parent die (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
