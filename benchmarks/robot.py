@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
+from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 from tactile_resonance.simulation.robot.control_port import order
 
@@ -33,6 +34,7 @@ FloatArray = NDArray[np.float64]
 HOST = "127.0.77.1"
 SPEED_M_S, ACCELERATION_M_S2 = 0.02, 2.0
 MOVED_M_S = 0.0005
+RUNS = 3
 PERIOD_S = 0.004  # of the loop that commands
 
 
@@ -79,16 +81,25 @@ def run(output: Path, quick: bool) -> str:
     if find_spec("rtde_control") is None:
         raise ValueError("benchmark robot: ur_rtde is not installed (no wheel for Python 3.13)")
     seconds, repetitions = (3.0, 8) if quick else (20.0, 60)
-    results = {}
+    results: dict[str, LinkResult] = {}
+    failures: dict[str, str] = {}
     for name, priority in (("normal priority", 0), ("SCHED_FIFO", 2)):
         if priority and not _may_take(priority):
+            failures[name] = "not allowed on this machine"
             continue
-        for attempt in range(2):  # a stall of the simulation makes a run invalid; once more then
-            result = measure(seconds, repetitions, priority)
-            if result.stalls == 0 or attempt == 1:
+        for _ in range(RUNS):  # a stall of the simulation makes a run invalid
+            try:
+                result = measure(seconds, repetitions, priority)
+            except ArmError as error:
+                failures[name] = f"in {RUNS} runs, the last ended with: {error}"
+                continue
+            if result.stalls == 0 or name not in results:
+                results[name] = result
+            if result.stalls == 0:
                 break
-        results[name] = result
-    text = _report(results, seconds)
+    if not results:
+        raise ValueError(f"benchmark robot: no run came to its end; {failures}")
+    text = _report(results, failures, seconds)
     output.mkdir(parents=True, exist_ok=True)
     (output / "robot.md").write_text(text, encoding="utf-8")
     _draw(results, output / "robot.png")
@@ -188,6 +199,7 @@ def _simulated_robot(priority: int) -> Iterator[subprocess.Popen]:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        preexec_fn=end_with_parent if sys.platform == "linux" else None,
     )
     try:
         assert robot.stdout is not None
@@ -216,7 +228,7 @@ def _may_take(priority: int) -> bool:
     return True
 
 
-def _report(results: dict[str, LinkResult], seconds: float) -> str:
+def _report(results: dict[str, LinkResult], failures: dict[str, str], seconds: float) -> str:
     rows = [
         "# The link to the arm",
         "",
@@ -259,6 +271,15 @@ def _report(results: dict[str, LinkResult], seconds: float) -> str:
     for name in each[0].cpu:
         row(f"processor, {name} [%]", [f"{100 * r.cpu[name]:.0f}" for r in each])
     row("stalls of the simulation beyond 10 ms", [str(r.stalls) for r in each])
+    rows += [
+        "",
+        f"A run in which the simulation stalled is repeated, {RUNS} runs at most; one with stalls above is not",
+        "valid, and tells how busy the machine was. States are seen by an owner that sleeps 0.3 ms between",
+        "two looks.",
+    ]
+    rows += [
+        f"No run with {name}: {text}." for name, text in failures.items() if name not in results
+    ]
     return "\n".join(rows) + "\n"
 
 

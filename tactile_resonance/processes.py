@@ -144,7 +144,7 @@ def take_priority(priority: int) -> None:
 
 
 def end_with_parent() -> None:
-    """Called in a child between fork and exec: it is told to end should its parent die."""
+    """Let this process, about to be executed, be told to end should its parent die (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

@@ -19,7 +19,7 @@ from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
-from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+from tactile_resonance.simulation.robot.simulated_robot import STALL_S, SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.socketcand import SocketcandServer
 from tactile_resonance.simulation.tissue import Tissue
@@ -179,12 +179,17 @@ class CellOnBus:
 
     def step(self) -> None:
         """Take what clients sent, advance to the plant's time, send what is due."""
-        self._bus.epoch_s = time.time() - self._plant.time_s
+        self._keep_epoch(time.time() - self._plant.time_s)
         for can_id, data in self._bus.poll():
             self._bus.send(self._cell.receive(can_id, data))
         force_n, torque_nm = self._plant.wrench_at_cell()
         wrench = np.concatenate([force_n, torque_nm])
         self._bus.send(self._cell.step(wrench, self._plant.time_s))
+
+    def _keep_epoch(self, now_s: float) -> None:
+        """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall."""
+        if now_s < self._bus.epoch_s or now_s > self._bus.epoch_s + STALL_S:
+            self._bus.epoch_s = now_s
 
     def inject(self, fields: dict) -> dict:
         """Control port: fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""

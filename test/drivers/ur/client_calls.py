@@ -236,7 +236,7 @@ def force(host):
     assert control.moveL(above.tolist(), 0.25, 1.0)
     assert control.zeroFtSensor()
     base = [0.0] * 6
-    for _ in range(400):
+    for _ in range(250):
         assert control.forceMode(
             base, [0, 0, 1, 0, 0, 0], [0, 0, -10.0, 0, 0, 0], 2, [0.1, 0.1, 0.1, 0.2, 0.2, 0.2]
         )

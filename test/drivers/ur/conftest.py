@@ -14,6 +14,7 @@ import pytest
 
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
+from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 from tactile_resonance.simulation.robot.control_port import order
 
@@ -51,6 +52,7 @@ class Robot:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
 
     def wait(self):

@@ -5,8 +5,6 @@ import json
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 
 import pytest
@@ -240,19 +238,18 @@ def test_table_and_truth(robot):
         assert time.monotonic() < end
 
 
+def test_second_robot_on_an_address_says_why_it_ends(robot, capsys):
+    from tactile_resonance.cli import main
+
+    assert main(["simulate-ur", "--host", robot.host]) == 1
+    error = capsys.readouterr().err
+    assert "port 30004" in error
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_second_robot_on_an_address_and_orderly_end(start_robots, number):
+def test_ends_in_order(start_robots, number):
     (robot,) = start_robots()
-    second = subprocess.run(
-        [sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", robot.host],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert second.returncode == 1
-    assert "port 30004" in second.stderr
-    assert second.stderr.count("\n") == 1
     robot.process.send_signal(number)
     output, _ = robot.process.communicate(timeout=10)
     assert robot.process.returncode == 0
