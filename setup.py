@@ -13,7 +13,7 @@ from setuptools import find_namespace_packages, setup
 
 NAME = "tactile_resonance"
 HERE = Path(__file__).resolve().parent
-NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node", "manager_node")
 BUILT_FOR_ROS = "TACTILE_RESONANCE_BUILT_FOR_ROS" in os.environ  # set by CMakeLists.txt
 
 manifest = ElementTree.parse(HERE / "package.xml").getroot()

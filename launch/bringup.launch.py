@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of the stream; with `use_mock_hardware` the simulated bench too."""
 
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -41,26 +40,26 @@ def generate_launch_description():
             description="What lies on the simulated bench's table.",
         ),
     ]
-    namespace = LaunchConfiguration("namespace")
+    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context):
+    """The stream, the bench where asked for, and the manager that brings them up in this order."""
+    mock = LaunchConfiguration("use_mock_hardware").perform(context) == "true"
     parameters = LaunchConfiguration("params_file")
-    nodes = [
+    own = {"fake_hardware_node": {"scene": LaunchConfiguration("scene")}}
+    names = ["fake_hardware_node", *STREAM] if mock else list(STREAM)
+    own["manager_node"] = {"nodes": names}
+    return [
         Node(
             package=PACKAGE,
             executable=name,
             name=name,
-            namespace=namespace,
-            parameters=[parameters],
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[parameters, own.get(name, {})],
             output="screen",
+            respawn=True,  # the manager brings up again what was started anew
+            respawn_delay=1.0,
         )
-        for name in STREAM
+        for name in [*names, "manager_node"]
     ]
-    bench = Node(
-        package=PACKAGE,
-        executable="fake_hardware_node",
-        name="fake_hardware_node",
-        namespace=namespace,
-        parameters=[parameters, {"scene": LaunchConfiguration("scene")}],
-        output="screen",
-        condition=IfCondition(LaunchConfiguration("use_mock_hardware")),
-    )
-    return LaunchDescription([*arguments, *nodes, bench])

@@ -19,13 +19,12 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.identification.band import strongest_resonance_band
+from tactile_resonance.identification.estimator import POLES_METHODS
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.joint import identify_poles_from_records
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
-
-POLES_METHODS = ("auto", "joint", "frf")
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,7 @@ def analyse(
         If the band holds too few lines for the model, or the method does not fit the record.
     """
     if poles_method not in POLES_METHODS:
-        raise ValueError(
-            f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}"
-        )
+        raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
     structure = structure or ModelStructure()
     warnings = list(recording.notes)
     start = time.perf_counter()
@@ -126,9 +123,7 @@ def analyse(
         )
     if poles_method == "auto":
         poles_method = "joint" if recording.u.shape[0] == 1 and not channel_delay_s else "frf"
-    poles = _poles(
-        recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s
-    )
+    poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:

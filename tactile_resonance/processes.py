@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 GRACE_S = 5.0
@@ -56,6 +56,17 @@ class NodeProcesses:
                 start_new_session=True,
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
+
+    def bring_up(
+        self,
+        nodes: Sequence[str],
+        parameters: Mapping[str, Mapping[str, object]] | None = None,
+    ) -> None:
+        """Start nodes and the manager that configures and activates them in this order."""
+        given = dict(parameters or {})
+        given["manager_node"] = {"nodes": f"[{','.join(nodes)}]"}
+        for node in (*nodes, "manager_node"):
+            self.start(node, given.get(node))
 
     def check(self) -> None:
         """RuntimeError if a node has ended by itself, with the last line it printed."""

@@ -8,7 +8,9 @@ from tactile_resonance.multisine import design_multisine
 
 def test_peaks_shrink_and_nothing_else_changes():
     """Random phases give about 4; clipping is known to reach below 1.7 (a sine has 1.41)."""
-    random = design_multisine(sample_rate_hz=5e3, samples_per_period=2000, band_hz=(10, 1000), seed=3)
+    random = design_multisine(
+        sample_rate_hz=5e3, samples_per_period=2000, band_hz=(10, 1000), seed=3
+    )
     compressed = compress_crest_factor(random, passes=300)
     assert random.crest_factor() > 3
     assert compressed.crest_factor() < 1.7
@@ -29,7 +31,7 @@ def test_peaks_between_samples_count_when_oversampled():
     random = design_multisine(sample_rate_hz=2100.0, samples_per_period=420, band_hz=(10, 1000))
     compressed = compress_crest_factor(random, passes=200, oversampling=4)
     spectrum = np.zeros(16 * 210 + 1, complex)
-    spectrum[: 211] = compressed.spectrum()
+    spectrum[:211] = compressed.spectrum()
     fine = np.fft.irfft(spectrum, 16 * 420) * 16 * 420
     assert np.max(np.abs(fine)) < 2.0 * compressed.level_v
 

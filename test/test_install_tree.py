@@ -26,7 +26,12 @@ def prefix():
 def test_index_executables_config_and_launch(prefix):
     assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
     share = Path(packages.get_package_share_directory(NAME))
-    for name in ("package.xml", "config/nodes.yaml", "config/tissues.yaml", "launch/bringup.launch.py"):
+    for name in (
+        "package.xml",
+        "config/nodes.yaml",
+        "config/tissues.yaml",
+        "launch/bringup.launch.py",
+    ):
         assert (share / name).is_file(), name
     for kind in ("msg/FRF.msg", "msg/Poles.msg", "srv/Play.srv", "action/Measure.action"):
         assert (share / kind).is_file(), kind

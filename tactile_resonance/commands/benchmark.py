@@ -34,7 +34,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run one or all; each prints its table and writes table and figure."""
     if find_spec("benchmarks") is None:
-        raise ValueError("benchmark: no benchmarks found, run it from the source tree: tools/run.sh")
+        raise ValueError(
+            "benchmark: no benchmarks found, run it from the source tree: tools/run.sh"
+        )
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
         print(import_module(f"benchmarks.{name}").run(options.output, options.quick))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tactile_resonance.identification.result import Poles
     from tactile_resonance.simulation.scene import PhantomScene
 
-NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 START_TIMEOUT_S = 30.0
 
 
@@ -76,8 +76,7 @@ def run(options: argparse.Namespace) -> int:
         },
     }
     with NodeProcesses(output / "log") as nodes:
-        for node in NODES:
-            nodes.start(node, parameters.get(node))
+        nodes.bring_up(NODES, parameters)
         try:
             points = _measure(nodes, places, options)
         except RuntimeError as error:
@@ -132,7 +131,7 @@ def _measure(nodes: NodeProcesses, places: list, options: argparse.Namespace) ->
     points = []
     with ScanSession(nodes.check) as session:
         session.wait_for_nodes(START_TIMEOUT_S)
-        session.warm_up(places[0][2])
+        session.warm_up(places[0][2], START_TIMEOUT_S)
         with tqdm(
             total=len(places) * options.periods,
             unit="block",

@@ -21,7 +21,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
     parser.add_argument(
-        "--output", type=Path, default=Path("docs/figures"), metavar="DIR", help="default: docs/figures"
+        "--output",
+        type=Path,
+        default=Path("docs/figures"),
+        metavar="DIR",
+        help="default: docs/figures",
     )
     parser.set_defaults(run=run)
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import special
 
-from tactile_resonance.frf.neighbours import Neighbourhood
+from tactile_resonance.frf.neighbours import IntArray, Neighbourhood
 from tactile_resonance.frf.result import ComplexArray, FloatArray
 
 OVERSAMPLING = 2
@@ -71,9 +71,19 @@ class BandSpectrum:
 
     def bins(self, group: Neighbourhood) -> ComplexArray:
         """(W, C, L) bins of the record so far around lines, as ``group.gather`` of its spectra."""
+        return self.at(group.offsets, group.centre_bins)
+
+    def at(self, offsets: IntArray, centres: IntArray) -> ComplexArray:
+        """(W, C, L) bins of the record so far at ``centres + offsets``.
+
+        Parameters
+        ----------
+        offsets : (W,) int
+        centres : (L,) int
+            Multiples of the number of periods.
+        """
         periods = self.periods
         samples = self._samples
-        offsets, centres = group.offsets, group.centre_bins  # (W,), (L,)
         # the bin lies at harmonic h + r / P: all lines share the fraction r / P
         position = OVERSAMPLING * offsets / periods
         nearest = np.ceil(position - _KERNEL_POINTS / 2).astype(np.int64)  # first grid point used

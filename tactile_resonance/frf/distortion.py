@@ -172,9 +172,7 @@ def _interpolate(x: IntArray, values: npt.NDArray, at: IntArray) -> npt.NDArray:
 def _sentence(name: str, lines: DetectionLines) -> str:
     if not np.any(lines.in_band):
         return f"No {name} detection lines in the excited band."
-    raw, level = (
-        float(np.max(x)) for x in (lines.rms_output_level_db, lines.rms_level_db)
-    )
+    raw, level = (float(np.max(x)) for x in (lines.rms_output_level_db, lines.rms_level_db))
     text = (
         f"{name.capitalize()} lines: output {raw:.1f} dB against the linear output (rms), "
         f"{level:.1f} dB corrected for the input's own distortion"

@@ -131,9 +131,7 @@ def _noise_threshold_between(
     local = ndimage.uniform_filter1d(mean, width, mode="nearest", origin=0)[1:]
     bins = width * (periods - 1)
     # the ratio of two exponential means is F distributed
-    quantile = special.fdtri(
-        2 * records, 2 * bins * records, 1 - _FALSE_ALARM / harmonics.size
-    )
+    quantile = special.fdtri(2 * records, 2 * bins * records, 1 - _FALSE_ALARM / harmonics.size)
     return np.asarray(quantile * local)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_resonance.frf.band_bins_stream import BandBinsStream
 from tactile_resonance.frf.fault_types import Fault, FaultKind, FaultReport
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -26,6 +27,8 @@ class MeasurementFrf:
         Only lines in this band are computed; all excited lines without.
     order, dof : int
         Of the local polynomial method.
+    bins_band_hz : (low, high), optional
+        All bins of this band go with the FRF while there is one realisation.
     """
 
     def __init__(
@@ -35,10 +38,13 @@ class MeasurementFrf:
         band_hz: tuple[float, float] | None = None,
         order: int = 2,
         dof: int = 6,
+        bins_band_hz: tuple[float, float] | None = None,
     ) -> None:
         self.measurement_id = measurement_id
         self._band_hz, self._order, self._dof = band_hz, order, dof
+        self._bins_band_hz = bins_band_hz
         self._stream: FrfStream | None = None
+        self._bins: BandBinsStream | None = None
         self._realisation = -1
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
@@ -78,6 +84,14 @@ class MeasurementFrf:
                 dof=self._dof,
                 max_periods=excitation.periods,
             )
+            if self._bins_band_hz is not None:
+                self._bins = BandBinsStream(
+                    excitation.harmonics,
+                    n,
+                    sample_rate_hz=excitation.sample_rate_hz,
+                    band_hz=self._bins_band_hz,
+                    max_periods=excitation.periods,
+                )
         self._remember(record)
         self._check(u.reshape(-1, n), y.reshape(-1, n), excitation)
         so_far = self._periods.setdefault(record.realisation, 0)
@@ -93,14 +107,15 @@ class MeasurementFrf:
     def frf(self) -> FRF:
         """The FRF so far; status FAILED where no period could be used.
 
-        A delay of the sensor channel that the record states is taken out.
+        A delay of the sensor channel that the record states is taken out; bins, which hold the
+        transient too, then do not come along.
         """
         frf = self._frf
         if frf is None:
             frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
         delay_s = float("nan") if self._last is None else self._last.channel_delay_s
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
-            frf = correct_skew(frf, delay_s)
+            frf = correct_skew(replace(frf, bins=None), delay_s)
         frf = FaultReport(tuple(self._faults.values())).marked(frf)
         if not self._notes:
             return frf
@@ -130,12 +145,17 @@ class MeasurementFrf:
         """Periods (P, N) that follow those of the same realisation without a gap."""
         if realisation != self._realisation and stream.periods:
             stream.next_realisation()
+            self._bins = None  # several realisations speak through their mean FRF
         self._realisation = realisation
         for period_u, period_y in zip(u, y, strict=True):
             single = stream.add_period(period_u, period_y)
+            if self._bins is not None:
+                self._bins.add_period(period_u, period_y)
             self._periods[realisation] += 1
         if len(self._periods) == 1:
             self._frf = single
+            if self._bins is not None:
+                self._frf = replace(single, bins=self._bins.bins())
         elif stream.periods >= max(self._periods.values()):
             self._frf = stream.robust().frf
 

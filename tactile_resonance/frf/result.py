@@ -9,6 +9,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.frf.band_bins import BandBins
+
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -44,6 +46,8 @@ class FRF:
         Mean sensor and actuator spectra, row order [Y; U] [V], scaled by 1/N.
     spectra_covariance : (..., 2, 2, F) complex or None
         Noise covariance of these means [V^2].
+    bins : BandBins or None
+        All bins of a band of the record behind G, where asked for and from one realisation.
     periods, realisations : int
         How many were used.
     method : str
@@ -60,6 +64,7 @@ class FRF:
     total_dof: int = 0
     spectra: ComplexArray | None = None
     spectra_covariance: ComplexArray | None = None
+    bins: BandBins | None = None
     periods: int = 1
     realisations: int = 1
     method: str = ""
@@ -92,6 +97,7 @@ class FRF:
             total_dof=self.total_dof,
             spectra=cut(self.spectra),
             spectra_covariance=cut(self.spectra_covariance),
+            bins=self.bins,
             periods=self.periods,
             realisations=self.realisations,
             method=self.method,

@@ -10,13 +10,16 @@ sections 6.3.2 and 9.12). The bins between harmonics bring the level of the nois
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 from scipy import special
 
+from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.identification.basis import PolynomialBasis
 from tactile_resonance.identification.bins import BinData, BinGroup
 from tactile_resonance.identification.covariance import invert_normal, modes_in_band
@@ -421,3 +424,69 @@ def identify_poles_from_records(
         input_noise_ratio=input_noise_ratio,
     )
     return single(plan(u, y))
+
+
+def identify_poles_from_bins(
+    bins: BandBins,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+    *,
+    input_noise_ratio: float | None = None,
+    notes: Sequence[str] = (),
+) -> Poles:
+    """Poles from the bins that a stream of periods keeps; plans of the latest kinds are kept.
+
+    Parameters
+    ----------
+    bins : BandBins
+    band_hz : (low, high), optional
+        Within that of the bins, which is taken when absent.
+    structure, input_noise_ratio
+        See `JointPlan`.
+    notes : sequence of str
+        Added to the message.
+
+    Raises
+    ------
+    ValueError
+        If the bins do not cover the band, or as `JointPlan`.
+    """
+    if band_hz is None:
+        band_hz = bins.band_hz
+    plan = _plan(
+        bins.sample_rate_hz,
+        bins.samples_per_period,
+        bins.periods,
+        np.ascontiguousarray(bins.harmonics, np.int64).tobytes(),
+        (float(band_hz[0]), float(band_hz[1])),
+        structure or ModelStructure(),
+        input_noise_ratio,
+    )
+    first = plan.bins[0] - bins.first_bin
+    if first < 0 or first + plan.bins.size > bins.u.size:
+        raise ValueError(
+            f"band_hz: {band_hz}, the bins cover {bins.band_hz[0]:g} to {bins.band_hz[1]:g} Hz"
+        )
+    here = slice(first, first + plan.bins.size)
+    return single(plan.from_bins(bins.u[here], bins.y[here]), notes=notes)
+
+
+@lru_cache(maxsize=32)
+def _plan(
+    sample_rate_hz: float,
+    samples_per_period: int,
+    periods: int,
+    harmonics: bytes,
+    band_hz: tuple[float, float],
+    structure: ModelStructure,
+    input_noise_ratio: float | None,
+) -> JointPlan:
+    return JointPlan(
+        sample_rate_hz,
+        samples_per_period,
+        periods,
+        np.frombuffer(harmonics, np.int64),
+        band_hz,
+        structure,
+        input_noise_ratio=input_noise_ratio,
+    )

@@ -319,7 +319,9 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
     )
 
 
-def _significant(residues: ComplexArray, covariance: FloatArray, lines: int) -> npt.NDArray[np.bool_]:
+def _significant(
+    residues: ComplexArray, covariance: FloatArray, lines: int
+) -> npt.NDArray[np.bool_]:
     """(n,) modes whose residue noise alone would not make.
 
     A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from

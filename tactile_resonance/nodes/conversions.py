@@ -18,6 +18,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
+from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
@@ -190,6 +191,8 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
         _fill(message.sensor_variance, frf.spectra_covariance[0, 0].real, float)
         _fill(message.actuator_variance, frf.spectra_covariance[1, 1].real, float)
         _fill_complex(message, "covariance_", frf.spectra_covariance[0, 1])
+    if frf.bins is not None:
+        _write_bins(message, frf.bins)
     return message
 
 
@@ -224,6 +227,7 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         total_dof=message.total_dof,
         spectra=spectra,
         spectra_covariance=covariance,
+        bins=_bins(message),
         periods=message.periods,
         realisations=message.realisations,
         method=message.method,
@@ -328,6 +332,34 @@ def contact_from_message(message: PoseStamped, force_n: float, force_std_n: floa
         (turn.x, turn.y, turn.z, turn.w),
         message.header.frame_id,
         time_from_message(message.header.stamp),
+    )
+
+
+def _write_bins(message: msg.FRF, bins: BandBins) -> None:
+    _fill_complex(message, "bins_actuator_", bins.u)
+    _fill_complex(message, "bins_sensor_", bins.y)
+    _fill(message.bins_harmonics, bins.harmonics, np.uint32)
+    message.bins_first = bins.first_bin
+    message.bins_sample_rate_hz = bins.sample_rate_hz
+    message.bins_samples_per_period = bins.samples_per_period
+    message.bins_periods = bins.periods
+
+
+def _bins(message: msg.FRF) -> BandBins | None:
+    names = [f"bins_{c}_{part}" for c in ("actuator", "sensor") for part in ("real", "imag")]
+    sizes = {len(getattr(message, name)) for name in names}
+    if sizes == {0}:
+        return None
+    if len(sizes) > 1:
+        raise ValueError(f"{', '.join(names)}: sizes {sorted(sizes)}, expected as many of each")
+    return BandBins(
+        message.bins_first,
+        _complex(message, "bins_actuator_"),
+        _complex(message, "bins_sensor_"),
+        _view(message.bins_harmonics).astype(np.int64),
+        message.bins_sample_rate_hz,
+        message.bins_samples_per_period,
+        message.bins_periods,
     )
 
 

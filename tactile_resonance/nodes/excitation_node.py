@@ -7,14 +7,15 @@ import threading
 import time
 from dataclasses import replace
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.node import Node
 from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
+from tactile_resonance.contact.force_history import ForceHistory
 from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import devices, excitation_design
@@ -22,9 +23,11 @@ from tactile_resonance.nodes.conversions import (
     contact_from_message,
     excitation_to_message,
     record_to_message,
+    time_from_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, STREAM, run_node
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
@@ -43,54 +46,53 @@ class Cancelled(Exception):
     """The goal was cancelled."""
 
 
-class ExcitationNode(Node):
+class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched) and `record`.
 
-    Every record is on disk before it is published. Records carry the tip pose and the force heard
-    last on `tcp_pose` and `wrench`, where the device is no replay. The device is read in a thread
-    of its own, so that its blocking calls never hold up the executor.
+    Every record is on disk before it is published. Records carry the tip pose heard last on
+    `tcp_pose` and the mean of `wrench` over the block, where the device is no replay. The device is
+    read in a thread of its own, so that its blocking calls never hold up the executor.
     """
 
-    # before the node is there: what fails on the way is cleaned up through destroy_node
-    _device: AcquisitionDevice | None = None
-
     def __init__(self) -> None:
-        super().__init__("excitation_node")
-        declare(self, PARAMETERS)
+        super().__init__("excitation_node", PARAMETERS)
+        self._last_id = 0
+
+    def configure(self) -> None:
+        """Open the device; the store follows with the first measurement."""
         (self._frame_id,) = values(self, "frame_id")
-        self._excitations = self.create_publisher(msg.Excitation, "excitation", EXCITATIONS)
-        self._records = self.create_publisher(msg.Record, "record", RESULTS)
-        self._device = devices.make_device(self)
+        self._excitations = self.publish_on(msg.Excitation, "excitation", EXCITATIONS)
+        self._records = self.publish_on(msg.Record, "record", RESULTS)
+        self._device: AcquisitionDevice = devices.make_device(self)
+        self.resources.callback(self._device.close)
         self._store: RecordStore | None = None
         self._has_store = False
         self._pose = PoseStamped()
-        self._force_n = float("nan")
+        self._forces = ForceHistory()
         self._busy = threading.Lock()
         self._measurements = 0
-        self._last_id = 0
-        self.create_subscription(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.create_subscription(WrenchStamped, "wrench", self._on_wrench, STREAM)
-        self._server = ActionServer(
+        self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        self.listen(WrenchStamped, "wrench", self._on_wrench, SERIES)
+        server = ActionServer(
             self,
             Measure,
             "measure",
             self._on_goal,
+            goal_callback=self._on_request,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT_S,
         )
+        self.resources.callback(server.destroy)
 
-    def destroy_node(self) -> None:
-        """Silence the output first, where a device was opened at all."""
-        if self._device is not None:
-            self._device.close()
-        super().destroy_node()
+    def _on_request(self, _: Measure.Goal) -> GoalResponse:
+        return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._pose = message
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         # +z is the outward surface normal: what the tissue does to the tip points along it
-        self._force_n = message.wrench.force.z
+        self._forces.add(time_from_message(message.header.stamp), message.wrench.force.z)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
@@ -140,7 +142,7 @@ class ExcitationNode(Node):
             self._busy.release()
             result.outcome = Measure.Result.REFUSED
             result.message = _reason(error)
-            self.get_logger().error(f"refused: {result.message}")
+            self.health.error(f"refused: {result.message}")
             return result
         planned = sum(excitation.periods for excitation in excitations)
         try:
@@ -153,7 +155,7 @@ class ExcitationNode(Node):
         except (OSError, DeviceError) as error:
             result.outcome = Measure.Result.FAILED
             result.message = _reason(error)
-            self.get_logger().error(f"failed: {result.message}")
+            self.health.error(f"failed: {result.message}")
         finally:
             self._busy.release()
         return result
@@ -215,6 +217,8 @@ class ExcitationNode(Node):
                 )
                 if goal.is_cancel_requested:
                     raise Cancelled
+                if not self.active:
+                    raise DeviceError("device: stopped, the node was deactivated")
         finally:
             self._device.stop()
 
@@ -240,12 +244,16 @@ class ExcitationNode(Node):
                 frame_id=info.frame_id or self._frame_id,
                 label=excitation.label,
                 simulated=info.simulated,
-                contact=block.contact or self._contact(),
+                contact=block.contact or self._contact(block.time_ns, excitation.period_s),
             ),
         )
 
-    def _contact(self) -> Contact:
-        return contact_from_message(self._pose, self._force_n, float("nan"))
+    def _contact(self, start_ns: int, length_s: float) -> Contact:
+        """Force while the block was taken; where none was heard then, the last one, of unknown accuracy."""
+        force_n, std_n = self._forces.mean(start_ns, start_ns + round(length_s * 1e9))
+        if np.isnan(force_n):
+            force_n = self._forces.newest()[1]
+        return contact_from_message(self._pose, force_n, std_n)
 
 
 def _reason(error: Exception) -> str:

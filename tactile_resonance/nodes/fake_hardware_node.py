@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.duration import Duration
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
@@ -24,11 +23,13 @@ from tactile_resonance.nodes.conversions import (
     record_to_message,
     time_from_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM, run_node
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
-from tactile_resonance.simulation.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.tissue import Tissue
@@ -53,7 +54,7 @@ PARAMETERS = (
 ACKNOWLEDGED_WITHIN_S = 5.0
 
 
-class FakeHardwareNode(Node):
+class FakeHardwareNode(ManagedNode):
     """Serves `bench/play` and `bench/stop`, hands out `bench/block`.
 
     The tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there is tissue: the
@@ -61,30 +62,29 @@ class FakeHardwareNode(Node):
     modes), both with the stamp of the pose they belong to.
     """
 
-    # before the node is there: what fails on the way is cleaned up through destroy_node
-    _playing: threading.Thread | None = None
-    _stop = threading.Event()
-
     def __init__(self) -> None:
-        super().__init__("fake_hardware_node")
-        declare(self, PARAMETERS)
+        super().__init__("fake_hardware_node", PARAMETERS)
+        self._playing: threading.Thread | None = None
+        self._stop = threading.Event()
+
+    def configure(self) -> None:
+        """Read the scene and make the sensor."""
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
         self._scene = read_scene(read_tissues(), path if path.is_absolute() else share_path(scene))
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
         self._tissue: Tissue | None = None
-        self._blocks = self.create_publisher(msg.Record, "bench/block", RESULTS)
-        self._truth = self.create_publisher(msg.Poles, "bench/truth", LATCHED)
-        self._wrench = self.create_publisher(WrenchStamped, "wrench", STREAM)
-        self.create_subscription(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.create_service(Play, "bench/play", self._on_play)
-        self.create_service(Trigger, "bench/stop", self._on_stop)
+        self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
+        self._truth = self.publish_on(msg.Poles, "bench/truth", LATCHED)
+        self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
+        self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        self.serve(Play, "bench/play", self._on_play)
+        self.serve(Trigger, "bench/stop", self._on_stop)
 
-    def destroy_node(self) -> None:
-        """Silence the output first."""
+    def deactivate(self) -> None:
+        """Silence the output."""
         self._silence()
-        super().destroy_node()
 
     def _on_pose(self, message: PoseStamped) -> None:
         if message == self._pose:
@@ -123,6 +123,9 @@ class FakeHardwareNode(Node):
         return self._scene.force_n if self._tissue else 0.0
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
+        if not self.active:
+            response.message = f"fake_hardware_node is {self.state_name()}"
+            return response
         try:
             excitation = excitation_from_message(request.excitation)
             effects = BenchEffects(

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.frf.measurement import MeasurementFrf
@@ -15,7 +14,8 @@ from tactile_resonance.nodes.conversions import (
     frf_to_message,
     record_from_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
 from tactile_resonance.record import Record
 
@@ -26,27 +26,37 @@ PARAMETERS = (
     Parameter("band_high_hz", 0.0, "To here [Hz]; 0: all excited lines.", 0.0, 1e7),
     Parameter("transient_order", 2, "Order of the local polynomial for the transient.", 0, 10),
     Parameter("noise_dof", 6, "Degrees of freedom of the noise variance, at least.", 1, 100),
+    Parameter(
+        "bins_low_hz",
+        200.0,
+        "All bins of the record from here go with the FRF, for the joint estimator of poles [Hz].",
+        0.0,
+        1e7,
+    ),
+    Parameter("bins_high_hz", 300.0, "To here [Hz]; 0: none are sent.", 0.0, 1e7),
 )
 
 
-class FrfNode(Node):
+class FrfNode(ManagedNode):
     """After every record the FRF of its measurement so far; one measurement at a time."""
 
     def __init__(self) -> None:
-        super().__init__("frf_node")
-        declare(self, PARAMETERS)
-        self._publisher = self.create_publisher(msg.FRF, "frf", RESULTS)
+        super().__init__("frf_node", PARAMETERS)
+
+    def configure(self) -> None:
+        """Nothing known yet of any measurement."""
+        self._publisher = self.publish_on(msg.FRF, "frf", RESULTS)
         self._excitations: dict[int, Excitation] = {}
         self._waiting: list[Record] = []
         self._measurement: MeasurementFrf | None = None
-        self.create_subscription(msg.Excitation, "excitation", self._on_excitation, EXCITATIONS)
-        self.create_subscription(msg.Record, "record", self._on_record, RESULTS)
+        self.listen(msg.Excitation, "excitation", self._on_excitation, EXCITATIONS)
+        self.listen(msg.Record, "record", self._on_record, RESULTS)
 
     def _on_excitation(self, message: msg.Excitation) -> None:
         try:
             excitation = excitation_from_message(message)
         except ValueError as error:
-            self.get_logger().error(f"excitation {message.excitation_id}: {error}")
+            self.health.error(f"excitation {message.excitation_id}: {error}")
             return
         # records of the measurement before may still be queued: forget the oldest only
         self._excitations.pop(excitation.excitation_id, None)
@@ -62,7 +72,7 @@ class FrfNode(Node):
         try:
             record = record_from_message(message)
         except ValueError as error:
-            self.get_logger().error(f"record of excitation {message.excitation_id}: {error}")
+            self.health.error(f"record of excitation {message.excitation_id}: {error}")
             return
         self._take(record)
 
@@ -71,7 +81,7 @@ class FrfNode(Node):
         try:
             self._estimate(record)
         except ValueError as error:
-            self.get_logger().error(f"record of excitation {record.origin.excitation_id}: {error}")
+            self.health.error(f"record of excitation {record.origin.excitation_id}: {error}")
             nothing = FRF(
                 np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=str(error)
             )
@@ -83,7 +93,7 @@ class FrfNode(Node):
             self._waiting.append(record)
             if len(self._waiting) > MOST_WAITING:
                 lost = self._waiting.pop(0)
-                self.get_logger().error(
+                self.health.error(
                     f"no excitation {lost.origin.excitation_id} arrived: block {lost.block_index} not used"
                 )
             return
@@ -104,11 +114,13 @@ class FrfNode(Node):
         low_hz, high_hz, order, dof = values(
             self, "band_low_hz", "band_high_hz", "transient_order", "noise_dof"
         )
+        bins_low_hz, bins_high_hz = values(self, "bins_low_hz", "bins_high_hz")
         return MeasurementFrf(
             measurement_id,
             band_hz=(low_hz, high_hz) if high_hz > 0 else None,
             order=order,
             dof=dof,
+            bins_band_hz=(bins_low_hz, bins_high_hz) if bins_high_hz > 0 else None,
         )
 
 

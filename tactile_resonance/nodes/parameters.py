@@ -23,7 +23,7 @@ class Parameter:
     ----------
     name : str
         With its unit.
-    default : bool, int, float or str
+    default : bool, int, float, str or list of str
     description : str
     low, high : float or None
         Range of a number, ends included.
@@ -34,7 +34,7 @@ class Parameter:
     """
 
     name: str
-    default: bool | int | float | str
+    default: bool | int | float | str | list[str]
     description: str
     low: float | None = None
     high: float | None = None

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FRF -> poles."""
+"""FRF, and the bins it brings -> poles."""
 
 from __future__ import annotations
 
-from rclpy.node import Node
-
 from tactile_resonance import msg
-from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_frf
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.nodes.conversions import (
@@ -15,7 +13,8 @@ from tactile_resonance.nodes.conversions import (
     origin_from_message,
     poles_to_message,
 )
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import RESULTS, run_node
 
 PARAMETERS = (
@@ -30,17 +29,26 @@ PARAMETERS = (
         0,
         20,
     ),
+    Parameter(
+        "method",
+        "auto",
+        "joint: poles and transient from all bins of the band; frf: from the FRF; auto: joint where "
+        "the FRF brings the bins.",
+        choices=POLES_METHODS,
+    ),
 )
 
 
-class PolesNode(Node):
+class PolesNode(ManagedNode):
     """Every FRF that arrives becomes poles, with the same header."""
 
     def __init__(self) -> None:
-        super().__init__("poles_node")
-        declare(self, PARAMETERS)
-        self._publisher = self.create_publisher(msg.Poles, "poles", RESULTS)
-        self.create_subscription(msg.FRF, "frf", self._on_frf, RESULTS)
+        super().__init__("poles_node", PARAMETERS)
+
+    def configure(self) -> None:
+        """Topics in and out."""
+        self._publisher = self.publish_on(msg.Poles, "poles", RESULTS)
+        self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 
     def _on_frf(self, message: msg.FRF) -> None:
         origin = origin_from_message(message)
@@ -48,18 +56,17 @@ class PolesNode(Node):
             frf, _ = frf_from_message(message)
             poles = self._identify(frf)
         except ValueError as error:
-            self.get_logger().error(f"FRF of measurement {origin.measurement_id}: {error}")
+            self.health.error(f"FRF of measurement {origin.measurement_id}: {error}")
             poles = Poles(status=PolesStatus.FAILED, message=str(error))
         self._publisher.publish(poles_to_message(poles, origin))
 
     def _identify(self, frf: FRF) -> Poles:
         """Poles, or the reason why there are none: a reader waits for an answer to every FRF."""
-        low_hz, high_hz, order, terms = values(
-            self, "band_low_hz", "band_high_hz", "order", "residual_terms"
+        low_hz, high_hz, order, terms, method = values(
+            self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )
-        if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
-            return Poles(status=PolesStatus.FAILED, message=frf.message)
-        return identify_poles(frf, (low_hz, high_hz), ModelStructure.with_residual(order, terms))
+        structure = ModelStructure.with_residual(order, terms)
+        return poles_of_frf(frf, (low_hz, high_hz), structure, method)
 
 
 def main() -> None:

@@ -45,6 +45,10 @@ EXCITATIONS = QoSProfile(
 STREAM = QoSProfile(
     depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
 )
+# Wrenches where their mean over a time counts: two seconds of them may wait.
+SERIES = QoSProfile(
+    depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
 
 
 def run_node(make: Callable[[], Node]) -> None:

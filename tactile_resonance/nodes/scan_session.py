@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -67,6 +68,7 @@ class ScanSession:
         self._poles: dict[int, msg.Poles] = {}
         self._truth: msg.Poles | None = None
         self._progress: Progress = lambda done, planned: None
+        self._refusal = ""
 
     def __enter__(self) -> ScanSession:
         rclpy.init(context=self._context)
@@ -79,6 +81,7 @@ class ScanSession:
         subscribe(msg.FRF, "frf", lambda m: self._keep_final(self._frfs, m), RESULTS)
         subscribe(msg.Poles, "poles", lambda m: self._keep_final(self._poles, m), RESULTS)
         subscribe(msg.Poles, "bench/truth", self._on_truth, LATCHED)
+        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -87,10 +90,18 @@ class ScanSession:
         rclpy.shutdown(context=self._context)
 
     def wait_for_nodes(self, timeout_s: float) -> None:
-        """Until the action and all topics of the stream have somebody at both ends."""
+        """Until the action and all topics of the stream have somebody at both ends.
+
+        Raises
+        ------
+        NoAnswer
+            If a node refuses to come up, or not all are there in time.
+        """
         count = self._node.count_publishers, self._node.count_subscribers
 
         def complete() -> bool:
+            if self._refusal:
+                raise NoAnswer(self._refusal)
             ends = {"excitation": 1, "record": 1, "frf": 2, "poles": 1, "bench/block": 1}
             return self._measure.server_is_ready() and all(
                 count[0](topic) >= 1 and count[1](topic) >= readers
@@ -99,22 +110,22 @@ class ScanSession:
 
         self._wait(complete, timeout_s, "the nodes to find each other")
 
-    def warm_up(self, position_m: tuple[float, float, float], attempts: int = 5) -> PointResult:
+    def warm_up(self, position_m: tuple[float, float, float], timeout_s: float) -> PointResult:
         """Measure briefly until poles come back: only then has every node heard every other.
 
-        The graph tells that publishers and subscribers exist, not that each pair has matched; records
-        published before that reach nobody.
+        The graph tells that publishers and subscribers exist, not that each pair has matched or that
+        its node is active; records published before that reach nobody.
         """
         goal = Measure.Goal(label="warm-up", periods=3)
-        for attempt in range(attempts):
+        deadline = time.monotonic() + timeout_s
+        while True:
             try:
                 return self.measure(
                     position_m, goal, lambda done, planned: None, timeout_s=10, answer_timeout_s=2
                 )
             except NoAnswer:
-                if attempt == attempts - 1:
+                if time.monotonic() > deadline:
                     raise
-        raise AssertionError("unreachable")
 
     def measure(
         self,
@@ -137,6 +148,8 @@ class ScanSession:
         truth = self._truth
         goal_future = self._measure.send_goal_async(goal, feedback_callback=self._on_feedback)
         handle = self._result(goal_future, timeout_s, "the goal to be taken")
+        if not handle.accepted:
+            raise NoAnswer(f"measurement of {goal.label}: rejected, the node is not active")
         answer = self._result(handle.get_result_async(), timeout_s, "the measurement")
         if answer.result.outcome != Measure.Result.DONE:
             raise NoAnswer(f"measurement of {goal.label}: {answer.result.message}")
@@ -159,6 +172,12 @@ class ScanSession:
 
     def _on_truth(self, message: msg.Poles) -> None:
         self._truth = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            # the manager only repeats what the node itself says better
+            if status.level == DiagnosticStatus.ERROR and not status.name.endswith("manager_node"):
+                self._refusal = f"{status.name.lstrip('/')} is {status.message}"
 
     def _on_feedback(self, message: object) -> None:
         self._progress(message.feedback.blocks, message.feedback.blocks_planned)

@@ -57,7 +57,9 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
 def _draw_case(axes: Axes, distortion: Distortion) -> None:
     power = np.mean(np.abs(distortion.output) ** 2, axis=-2)
     style: dict[str, Any] = {"marker": ".", "ms": 1.5, "ls": "none"}
-    axes.semilogx(distortion.frequency_hz, decibel(power), color="k", label="linear output", **style)
+    axes.semilogx(
+        distortion.frequency_hz, decibel(power), color="k", label="linear output", **style
+    )
     for name, colour in (("odd", "C3"), ("even", "C0")):
         lines = getattr(distortion, name)
         if lines.harmonics.size == 0:

@@ -21,7 +21,7 @@ from tactile_resonance.report.drawing import SIMULATED, decibel, draw_ellipse, n
 COLUMNS = (
     *("phantom", "point", "x_m", "y_m", "force_n", "f0_hz", "f0_std_hz", "f0_true_hz"),
     *("damping_ratio", "damping_ratio_std", "damping_ratio_true", "pole_real_rad_s"),
-    *("pole_imag_rad_s", "cost", "expected_cost", "status", "measurement_id"),
+    *("pole_imag_rad_s", "cost", "expected_cost", "status", "measurement_id", "method"),
 )
 
 
@@ -105,7 +105,7 @@ def as_csv(points: Sequence[MeasuredPoint]) -> str:
         ]
         writer.writerow(
             [p.phantom, p.point, *(repr(float(x)) for x in numbers)]
-            + [p.poles.status.value, p.origin.measurement_id]
+            + [p.poles.status.value, p.origin.measurement_id, p.poles.method]
         )
     return text.getvalue()
 
@@ -137,6 +137,8 @@ def as_table(points: Sequence[MeasuredPoint]) -> str:
                 f"{'-' if len(group) == 1 else f'{spread[k]:.2g}':>9}  {truth[k]:>12.{digits}f}  "
                 f"{error[k]:>11.2f}  {worst[k]:>11.2f}"
             )
+    methods = sorted({p.poles.method for p in points})
+    lines.append(f"method: {', '.join(methods)}")
     return "\n".join(lines)
 
 

@@ -3,34 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from tactile_resonance.simulation.acquisition import (
-    BenchEffects,
-    Block,
-    ChannelSamples,
-    SignalParts,
-    convert,
-    join,
-)
+from tactile_resonance.simulation.acquisition import BenchEffects
+from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.contact import ContactParameters, hertz_contact
+from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.lines import Lines, PeriodicExcitation
-from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
-from tactile_resonance.simulation.nonlinear import NonlinearStream
 from tactile_resonance.simulation.parameters import SensorParameters, read_sensor
-from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.tissue import Tissue
-from tactile_resonance.simulation.truth import Truth, truth_of
 
 DEFAULT_EFFECTS = BenchEffects()
-_SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
 
 
 @dataclass(frozen=True)
@@ -98,182 +83,21 @@ class SimulatedBench:
         coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
         return BenchRun(self.sensor, coupled, seed, effects, keep_parts)
 
-
-class BenchRun:
-    """One stay of the tip at one point: excitations are played one after another, from rest.
-
-    The state of the sensor carries over from block to block and from excitation to excitation.
-    Playing the same excitation again continues its periods; another one starts a new realisation.
-    """
-
-    def __init__(
+    def start_varying(
         self,
-        sensor: SensorParameters,
-        coupled: CoupledBimorph,
-        seed: int,
-        effects: BenchEffects,
-        keep_parts: bool,
-    ) -> None:
-        good = isinstance(seed, (int, np.integer)) and seed >= 0
-        require(good, "seed", seed, "an integer, 0 or above")
-        self.coupled = coupled
-        self.seed = seed
-        self.effects = effects
-        self._acquisition = sensor.acquisition
-        self._keep_parts = keep_parts
-        skew = effects.channel_skew_s
-        direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
-        late_s = max(0.0, skew)
-        self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
-        self._sensor: ResponseStream | NonlinearStream
-        self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
-        if effects.nonlinearity:
-            self._sensor = NonlinearStream(coupled.modal, sensor.nonlinear, delay_s=late_s)
-            if keep_parts:
-                self._linear = ResponseStream(coupled.modal, delay_s=late_s)
-        else:
-            self._sensor = ResponseStream(coupled.modal, delay_s=late_s)
-        self._lines: Lines | None = None
-        self._realisation = -1
-        self._index = 0
-        self._samples = 0
-        hum = np.random.SeedSequence(seed, spawn_key=(_HUM,))
-        self.hum_phase_rad = float(np.random.default_rng(hum).uniform(0, 2 * np.pi))
-
-    def truth(self, frequency_hz: ArrayLike = ()) -> Truth:
-        """Return the exact linear behaviour, with the response at `frequency_hz` [Hz]."""
-        return truth_of(self.coupled, frequency_hz)
-
-    def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Block:
-        """Return the next periods of an excitation as one block."""
-        require(periods >= 1, "periods", periods, "1 or above")
-        lines = self._take_up(excitation)
-        return join([self._make_block(lines, lines.samples_per_period) for _ in range(periods)])
-
-    def play(
-        self,
-        excitation: PeriodicExcitation | Lines,
-        periods: int,
+        history: ContactHistory,
         *,
-        periods_per_block: int = 1,
-    ) -> Iterator[Block]:
-        """Yield the next periods of an excitation block by block; each is made when asked for."""
-        require(periods_per_block >= 1, "periods_per_block", periods_per_block, "1 or above")
-        whole = periods >= 1 and periods % periods_per_block == 0
-        require(whole, "periods", periods, f"a multiple of periods_per_block = {periods_per_block}")
-        lines = Lines.of(excitation)
-        for _ in range(periods // periods_per_block):
-            yield self.block(lines, periods_per_block)
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
+    ) -> BenchRun:
+        """Return a run whose contact changes as `history` says, from its first time on.
 
-    def skip(self, excitation: PeriodicExcitation | Lines, periods: int) -> None:
-        """Let periods pass unrecorded, at little cost; what follows is as if they had been."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        if periods == 0:
-            return
-        lines = self._take_up(excitation)
-        for stream in self._streams():
-            stream.skip(lines, periods)
-        self._index += periods
-        self._samples += periods * lines.samples_per_period
-
-    def burst(
-        self,
-        excitation: PeriodicExcitation | Lines,
-        samples: int,
-        *,
-        ring_down_samples: int = 0,
-    ) -> Block:
-        """Return one block: the first `samples` of a period, then silence.
-
-        Always a realisation of its own; at most one period of excitation.
+        Raises
+        ------
+        ValueError
+            If the nonlinearity is asked for: it is not modelled on a changing contact.
         """
-        require(ring_down_samples >= 0, "ring_down_samples", ring_down_samples, "0 or above")
-        self._end_excitation()
-        lines = self._take_up(excitation)
-        block = self._make_block(lines, samples, ring_down_samples)
-        self._end_excitation()
-        return block
-
-    def _streams(self) -> list[ResponseStream | NonlinearStream]:
-        linear = [] if self._linear is None else [self._linear]
-        return [self._drive, self._sensor, *linear]
-
-    def _take_up(self, excitation: PeriodicExcitation | Lines) -> Lines:
-        lines = Lines.of(excitation)
-        if self._lines is None or not lines.same_signal(self._lines):
-            self._lines = lines
-            self._realisation += 1
-            self._index = 0
-        return self._lines
-
-    def _end_excitation(self) -> None:
-        if self._lines is not None:
-            for stream in self._streams():
-                stream.silence(0, self._lines.sample_rate_hz)
-        self._lines = None
-
-    def _make_block(self, lines: Lines, samples: int, ring_down: int = 0) -> Block:
-        total = samples + ring_down
-
-        def run(stream: ResponseStream | NonlinearStream) -> FloatArray:
-            played = stream.play(lines, samples)
-            if ring_down == 0:
-                return played
-            return np.concatenate([played, stream.silence(ring_down, lines.sample_rate_hz)])
-
-        drive = run(self._drive)
-        clean = run(self._sensor)
-        linear = clean if self._linear is None else run(self._linear)
-        drive_noise = self._noise(_ACTUATOR, self.effects.actuator_noise_v, total)
-        sensor_rms = self._acquisition.noise_rms_v(lines.sample_rate_hz)
-        noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, total)
-        disturbance = self._disturbance(lines.sample_rate_hz, total)
-        parts = None
-        if self._keep_parts:
-            zero = np.zeros(total)
-            parts = SignalParts(
-                actuator_v=drive,
-                actuator_noise_v=zero if drive_noise is None else drive_noise,
-                linear_v=linear,
-                distortion_v=clean - linear,
-                disturbance_v=zero if disturbance is None else disturbance,
-                noise_v=zero if noise is None else noise,
-            )
-        for added in (disturbance, noise):
-            clean = clean if added is None else clean + added
-        drive = drive if drive_noise is None else drive + drive_noise
-        block = Block(
-            realisation=self._realisation,
-            index=self._index,
-            start_time_s=self._samples / lines.sample_rate_hz,
-            sample_rate_hz=lines.sample_rate_hz,
-            samples_per_period=lines.samples_per_period,
-            actuator=self._channel(drive, self._acquisition.actuator_scale_v),
-            sensor=self._channel(clean, self._acquisition.sensor_scale_v),
-            parts=parts,
-        )
-        self._index += 1
-        self._samples += total
-        return block
-
-    def _channel(self, volts: FloatArray, scale_v: float) -> ChannelSamples:
-        if self.effects.quantisation:
-            return convert(volts, scale_v, self._acquisition.adc_bits)
-        return ChannelSamples(None, 0.0, volts, False)
-
-    def _noise(self, channel: int, rms_v: float, samples: int) -> FloatArray | None:
-        """Return noise that depends on seed, realisation, period and channel only."""
-        if rms_v == 0.0:
-            return None
-        key = (channel, self._realisation, self._index)
-        sequence = np.random.SeedSequence(self.seed, spawn_key=key)
-        return rms_v * np.random.Generator(np.random.SFC64(sequence)).standard_normal(samples)
-
-    def _disturbance(self, sample_rate_hz: float, samples: int) -> FloatArray | None:
-        effects = self.effects
-        if effects.hum_v == effects.offset_v == effects.drift_v_per_s == 0.0:
-            return None
-        time_s = (self._samples + np.arange(samples)) / sample_rate_hz
-        phase = 2 * np.pi * effects.hum_frequency_hz * time_s + self.hum_phase_rad
-        hum = np.sqrt(2) * effects.hum_v * np.cos(phase)
-        return np.asarray(hum + effects.offset_v + effects.drift_v_per_s * time_s)
+        require(not effects.nonlinearity, "nonlinearity", True, "off while the contact changes")
+        coupled = history.coupled_at(self.sensor, 0.0)
+        return BenchRun(self.sensor, coupled, seed, effects, keep_parts, history)

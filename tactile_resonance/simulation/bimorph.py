@@ -105,13 +105,42 @@ class CoupledBimorph:
         return a, b, c, self.feedthrough
 
     @cached_property
-    def _expansion(self) -> tuple[ComplexArray, ComplexArray]:
-        """All poles and residues, sorted by imaginary, then real part."""
+    def _expansion(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """All poles, residues and eigenvectors with C v = 1, by imaginary, then real part."""
         a, b, c, _ = self.state_space
         poles, vectors = np.linalg.eig(a)
-        residues = (c @ vectors) * np.linalg.solve(vectors, b.astype(complex))
+        # in these coordinates the states are those of PoleResidueModel
+        vectors = vectors / (c @ vectors)
+        residues = np.linalg.solve(vectors, b.astype(complex))
         order = np.lexsort((poles.real, poles.imag))
-        return poles[order].astype(complex), residues[order]
+        return poles[order].astype(complex), residues[order], vectors[:, order]
+
+    def carry_state(self, modal_state: ComplexArray, after: CoupledBimorph) -> ComplexArray:
+        """Return the modal state (K,) of `modal` just after the contact has become another.
+
+        Deflections, velocities, strain voltage and the deformation of every Prony term stay.
+
+        Parameters
+        ----------
+        modal_state : (K,) array
+        after : CoupledBimorph
+            The same sensor on a tissue of as many Prony terms.
+        """
+        require(
+            after.poles_rad_s.size == self.poles_rad_s.size,
+            "after",
+            after.poles_rad_s.size,
+            f"a system of {self.poles_rad_s.size} states",
+        )
+        keep = self.poles_rad_s.imag >= 0
+        x = (self._expansion[2][:, keep] @ (self.modal.weights * modal_state)).real
+        if self.contact is not None and after.contact is not None:
+            old, new = (c.prony_stiffness_n_per_m for c in (self.contact, after.contact))
+            # states sqrt(k_j) z_j; a term of no stiffness has none
+            scale = np.divide(new, old, out=np.zeros_like(new), where=old > 0)
+            x[x.size - old.size :] *= np.sqrt(scale)
+        states = np.linalg.solve(after._expansion[2], x.astype(complex))
+        return np.asarray(states[after.poles_rad_s.imag >= 0])
 
     @property
     def poles_rad_s(self) -> ComplexArray:

@@ -108,23 +108,41 @@ def hertz_contact(
     force = parameters.force_n if force_n is None else force_n
     require(0 < force < np.inf, "force_n", force, "a number above 0")
     require(0 < hold_time_s < np.inf, "hold_time_s", hold_time_s, "a number above 0")
-    nu, density = parameters.poisson_ratio, parameters.density_kg_per_m3
-    plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - nu**2)
+    plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - parameters.poisson_ratio**2)
     creep = tissue.creep_compliance(hold_time_s) / tissue.creep_compliance(1.0)
     radius = float((3 * force * tip_radius_m / (4 * plane_modulus) * creep) ** (1 / 3))
+    return contact_of_radius(
+        tissue, radius, parameters, force_n=float(force), indentation_m=radius**2 / tip_radius_m
+    )
+
+
+def contact_of_radius(
+    tissue: Tissue,
+    radius_m: float,
+    parameters: ContactParameters,
+    *,
+    force_n: float,
+    indentation_m: float,
+) -> Contact:
+    """Return the contact of a given contact radius [m], however it came about.
+
+    Force and indentation are carried along: a small vibration sees the radius alone.
+    """
+    require(0 < radius_m < np.inf, "radius_m", radius_m, "a number above 0")
+    nu, density = parameters.poisson_ratio, parameters.density_kg_per_m3
     damping = mass = 0.0
     if parameters.radiation:
         reference_rad_s = 2 * np.pi * parameters.radiation_reference_hz
         modulus = tissue.complex_modulus(1j * reference_rad_s)
         wave_speed = np.sqrt(np.abs(modulus) / (2 * (1 + nu) * density))
-        damping = float(2 * density * wave_speed * np.pi * radius**2)
-        mass = 1.257 * density * radius**3
+        damping = float(2 * density * wave_speed * np.pi * radius_m**2)
+        mass = 1.257 * density * radius_m**3
     return Contact(
         tissue=tissue,
-        force_n=float(force),
-        contact_radius_m=radius,
-        indentation_m=radius**2 / tip_radius_m,
-        stiffness_factor_m=2 * radius / (1 - nu**2),
+        force_n=force_n,
+        contact_radius_m=radius_m,
+        indentation_m=indentation_m,
+        stiffness_factor_m=2 * radius_m / (1 - nu**2),
         radiation_damping_ns_per_m=damping,
         radiation_mass_kg=mass,
     )

@@ -86,12 +86,19 @@ class ResponseStream:
     delay_s : float
         The output is sampled this much late: output sample n is the response at ``t_n - delay``,
         0 before the start.
+    negligible_v : float
+        A pole's free decay is left out where it stays below this [V]; 0: where it would be lost in
+        rounding. The steady state is always whole.
     """
 
-    def __init__(self, model: PoleResidueModel, *, delay_s: float = 0.0) -> None:
+    def __init__(
+        self, model: PoleResidueModel, *, delay_s: float = 0.0, negligible_v: float = 0.0
+    ) -> None:
         require(bool(0 <= delay_s <= MAX_DELAY_S), "delay_s", delay_s, f"0 to {MAX_DELAY_S} s")
         self._model = model
+        require(negligible_v >= 0, "negligible_v", negligible_v, "0 or above")
         self._delay_s = delay_s
+        self._negligible_v = negligible_v
         self._sample_rate_hz: float | None = None
         self._plan: _Plan | None = None  # None: silence
         self._phase = 0  # samples of the current period already played
@@ -108,6 +115,19 @@ class ResponseStream:
             return self._plan.state + self._deviation
         now_s = self._phase / self._plan.lines.sample_rate_hz
         return steady_state(self._model, self._plan.lines, now_s) + self._deviation
+
+    def continued(self, model: PoleResidueModel, state: ComplexArray) -> ResponseStream:
+        """Return a stream of another model that goes on from here, in a given state (K,)."""
+        other = ResponseStream(model, delay_s=self._delay_s, negligible_v=self._negligible_v)
+        other._sample_rate_hz, other._phase = self._sample_rate_hz, self._phase
+        other._late = self._late.copy()
+        if self._plan is not None:
+            lines = self._plan.lines
+            other._plan = other._make_plan(lines)
+            now_s = self._phase / lines.sample_rate_hz
+            state = state - steady_state(model, lines, now_s)
+        other._deviation = state
+        return other
 
     def play(self, lines: Lines, samples: int | None = None) -> FloatArray:
         """Return the response to the next samples of an excitation, one period by default.
@@ -170,7 +190,12 @@ class ResponseStream:
         """Add the decay of the deviation to a steady response, move on, apply the delay."""
         whole, part_s = self._delay_steps()
         decay = free_decay(
-            self._model, self._deviation, steady.size, self._interval_s, part_s, floor
+            self._model,
+            self._deviation,
+            steady.size,
+            self._interval_s,
+            part_s,
+            max(floor, self._negligible_v),
         )
         response = steady + decay
         self._deviation = self._deviation * self._decay(steady.size)

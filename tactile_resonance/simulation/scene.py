@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phantoms on the table: regions of space and the tissue in each."""
+"""Phantoms on the table: regions of space, what fills them, and what is buried under the surface."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,94 +20,56 @@ from tactile_resonance.simulation.fields import (
     require,
     section,
 )
+from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
+from tactile_resonance.simulation.materials import Material, mixture, read_material, read_tissue
+from tactile_resonance.simulation.modal import FloatArray
+from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.simulation.shapes import SHAPES, Point, Shape, read_shape
 from tactile_resonance.simulation.tissue import Tissue
-
-Point = tuple[float, ...]
-
-
-class Shape(Protocol):
-    """A region of space."""
-
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell for positions (..., 2 or 3) [m] which lie inside, shape (...)."""
-        ...
-
-
-@dataclass(frozen=True)
-class Disc:
-    """A disc in x, y at any height: the surface of a round dish."""
-
-    center_m: Point
-    radius_m: float
-
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which positions lie inside or on the edge."""
-        distance = np.linalg.norm(position_m[..., :2] - np.asarray(self.center_m), axis=-1)
-        return np.asarray(distance <= self.radius_m)
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box with edges along the axes; two coordinates per corner leave the height open."""
-
-    low_m: Point
-    high_m: Point
-
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which positions lie inside or on the faces."""
-        position = _coordinates(position_m, len(self.low_m))
-        inside = (position >= np.asarray(self.low_m)) & (position <= np.asarray(self.high_m))
-        return np.asarray(inside.all(axis=-1))
-
-
-@dataclass(frozen=True)
-class HalfSpace:
-    """All positions with ``normal . (position - point) <= 0``."""
-
-    point_m: Point
-    normal: Point
-
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which positions lie on the side the normal points away from."""
-        position = _coordinates(position_m, len(self.normal))
-        return np.asarray((position - np.asarray(self.point_m)) @ np.asarray(self.normal) <= 0)
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A ball; positions without a height are taken at height 0."""
-
-    center_m: Point
-    radius_m: float
-
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which positions lie inside or on the surface."""
-        position = _coordinates(position_m, 3)
-        distance = np.linalg.norm(position - np.asarray(self.center_m), axis=-1)
-        return np.asarray(distance <= self.radius_m)
-
-
-def _coordinates(position_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Cut off the height, or add height 0, so that the last axis has `count` coordinates."""
-    missing = count - position_m.shape[-1]
-    if missing <= 0:
-        return position_m[..., :count]
-    return np.concatenate([position_m, np.zeros((*position_m.shape[:-1], missing))], axis=-1)
 
 
 @dataclass(frozen=True)
 class Region:
-    """A shape filled with one tissue."""
+    """A shape filled with one material."""
+
+    name: str
+    shape: Shape
+    material: Material
+
+
+@dataclass(frozen=True)
+class Buried:
+    """Something under the surface: an inclusion, the layer below a layer.
+
+    The tip feels it as far as the stresses of its contact reach: with the share f of the strain
+    energy inside the shape (`hertz_field`), ``1/E = (1 - f)/E_region + f/E_buried``, and Prony
+    ratios at f between the two. Exact to first order in the contrast, otherwise less than the truth
+    for what is stiffer. The contact radius is that of the tip on the region alone.
+
+    Attributes
+    ----------
+    name : str
+    shape : Shape
+    tissue : Tissue
+    """
 
     name: str
     shape: Shape
     tissue: Tissue
 
+    def felt_at(self, surface_point_m: FloatArray, above: Tissue, radius_m: float) -> Tissue:
+        """Return what the tip feels at a point (3,) of the surface where `above` lies."""
+        share = energy_share(self.shape, surface_point_m, radius_m)
+        if share == 0:
+            return above
+        low, high = above.relaxation_modulus_1s_pa, self.tissue.relaxation_modulus_1s_pa
+        return mixture(above, self.tissue, share, 1 / ((1 - share) / low + share / high))
+
 
 @dataclass(frozen=True)
 class PhantomScene:
-    """What lies on the table. Where regions overlap, the later one is there.
+    """What lies on the table, its surface at height 0. Where regions overlap, the later is there.
 
     Attributes
     ----------
@@ -117,12 +79,19 @@ class PhantomScene:
     regions : tuple of Region
     scan_points_m : tuple of (x, y) or (x, y, z)
         Where to measure [m].
+    buried : tuple of Buried
+        Felt from the surface of whatever region is there.
+    tip_radius_m, poisson_ratio : float
+        They set how deep the tip feels; of no account where nothing is buried.
     """
 
     name: str
     force_n: float
     regions: tuple[Region, ...]
     scan_points_m: tuple[Point, ...]
+    buried: tuple[Buried, ...] = ()
+    tip_radius_m: float = 2.5e-3
+    poisson_ratio: float = 0.49
 
     def region_index(self, position_m: ArrayLike) -> NDArray[np.int64]:
         """Return the index of the region at positions (..., 2 or 3) [m], -1 where there is none."""
@@ -140,15 +109,32 @@ class PhantomScene:
         return None if index < 0 else self.regions[index]
 
     def tissue_at(self, position_m: ArrayLike) -> Tissue | None:
-        """Return the tissue at one position (2 or 3 coordinates) [m], or None."""
+        """Return what the tip feels at one position (2 or 3 coordinates) [m], or None: nothing.
+
+        Regions are looked up at the position itself; what is buried is felt from the surface
+        straight above or below it.
+        """
         region = self.region_at(position_m)
-        return None if region is None else region.tissue
+        if region is None:
+            return None
+        position = np.zeros(3)
+        given = np.asarray(position_m, dtype=float)
+        position[: given.size] = given
+        tissue = region.material.tissue_at(position)
+        position[2] = 0.0
+        for buried in self.buried:
+            # Hertz contact of the preload, as in `hertz_contact`
+            plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - self.poisson_ratio**2)
+            radius = (0.75 * self.force_n * self.tip_radius_m / plane_modulus) ** (1 / 3)
+            tissue = buried.felt_at(position, tissue, radius)
+        return tissue
 
 
 def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene:
     """Read the phantoms of a scene file; by default ``config/scenes/gelatine_phantoms.yaml``.
 
-    Only the fields ``name``, ``force_n``, ``regions`` and ``scan_points`` are read here.
+    Only the fields ``name``, ``force_n``, ``regions``, ``buried`` and ``scan_points`` are read
+    here; the tip is that of ``config/sensors/bimorph.yaml``.
 
     Raises
     ------
@@ -161,6 +147,8 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
     good = isinstance(entries, list) and len(entries) > 0
     require(good, f"{where}: regions", entries, "a list of one region or more")
     assert isinstance(entries, list)
+    buried = content.get("buried", [])
+    require(isinstance(buried, list), f"{where}: buried", buried, "a list")
     force = number(content.get("force_n"), f"{where}: force_n")
     require(force > 0, f"{where}: force_n", force, "a number above 0")
     return PhantomScene(
@@ -171,66 +159,42 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
             for i, entry in enumerate(entries)
         ),
         scan_points_m=_read_points(section(content, "scan_points", where), where),
+        buried=tuple(
+            _read_buried(entry, library, f"{where}: buried[{i}]") for i, entry in enumerate(buried)
+        ),
+        tip_radius_m=read_sensor().tip.radius_m,
+        poisson_ratio=library.contact.poisson_ratio,
     )
 
 
 def _read_region(entry: object, library: TissueLibrary, where: str) -> Region:
     require(isinstance(entry, Mapping), where, entry, "a mapping")
     assert isinstance(entry, Mapping)
-    shapes = {"disc", "box", "half_space", "sphere"}
-    known_keys(entry, {"name", "tissue", "gelatine_percent"} | shapes, where)
-    materials = [key for key in ("tissue", "gelatine_percent") if key in entry]
-    require(len(materials) == 1, where, materials, "exactly one of tissue, gelatine_percent")
-    forms = [key for key in entry if key in shapes]
-    require(len(forms) == 1, where, forms, f"exactly one of {sorted(shapes)}")
-    try:
-        if materials == ["tissue"]:
-            tissue = library[str(entry["tissue"])]
-        else:
-            tissue = library.gelatine(number(entry["gelatine_percent"], "gelatine_percent"))
-    except ValueError as error:
-        raise ValueError(f"{where}.{error}") from error
-    form = forms[0]
-    shape = _read_shape(form, section(entry, form, where), f"{where}.{form}")
-    return Region(str(entry.get("name", tissue.name)), shape, tissue)
+    filling = {"tissue", "gelatine_percent", "gradient", "heterogeneity"}
+    known_keys(entry, {"name", *filling, *SHAPES}, where)
+    material = read_material(entry, library, where)
+    shape = read_shape(entry, where)
+    name = entry.get("name", entry.get("tissue"))
+    if name is None and "gelatine_percent" in entry:
+        name = f"gel{entry['gelatine_percent']:g}"
+    return Region(str("gradient" if name is None else name), shape, material)
 
 
-def _read_shape(form: str, fields: Mapping[str, Any], where: str) -> Shape:
-    def point(key: str, *counts: int) -> Point:
-        value = numbers(fields.get(key), f"{where}.{key}")
-        accepted = " or ".join(str(count) for count in counts)
-        require(len(value) in counts, f"{where}.{key}", value, f"{accepted} coordinates")
-        return value
-
-    def radius() -> float:
-        value = number(fields.get("radius_m"), f"{where}.radius_m")
-        require(value > 0, f"{where}.radius_m", value, "a number above 0")
-        return value
-
-    if form == "disc":
-        known_keys(fields, {"center_m", "radius_m"}, where)
-        return Disc(point("center_m", 2), radius())
-    if form == "sphere":
-        known_keys(fields, {"center_m", "radius_m"}, where)
-        return Sphere(point("center_m", 3), radius())
-    if form == "box":
-        known_keys(fields, {"low_m", "high_m"}, where)
-        low = point("low_m", 2, 3)
-        high = point("high_m", len(low))
-        ordered = all(a < b for a, b in zip(low, high, strict=True))
-        require(ordered, f"{where}.high_m", high, f"above low_m = {low} in every coordinate")
-        return Box(low, high)
-    known_keys(fields, {"point_m", "normal"}, where)
-    origin = point("point_m", 2, 3)
-    normal = point("normal", len(origin))
-    require(any(normal), f"{where}.normal", normal, "a vector other than 0")
-    return HalfSpace(origin, normal)
+def _read_buried(entry: object, library: TissueLibrary, where: str) -> Buried:
+    require(isinstance(entry, Mapping), where, entry, "a mapping")
+    assert isinstance(entry, Mapping)
+    known_keys(entry, {"name", "tissue", "gelatine_percent", "sphere", "box", "half_space"}, where)
+    tissue = read_tissue(entry, library, where)
+    return Buried(str(entry.get("name", tissue.name)), read_shape(entry, where), tissue)
 
 
 def _read_points(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
-    """Read ``centres_m`` x ``offsets_m``: every offset about every centre, centre by centre."""
+    """Read ``centres_m`` x ``offsets_m``, centre by centre, or a ``grid``, row by row in x."""
     where = f"{where}: scan_points"
-    known_keys(fields, {"centres_m", "offsets_m"}, where)
+    known_keys(fields, {"centres_m", "offsets_m", "grid"}, where)
+    if "grid" in fields:
+        require(len(fields) == 1, where, sorted(fields), "either a grid or centres_m, offsets_m")
+        return _read_grid(section(fields, "grid", where), f"{where}.grid")
 
     def points(key: str) -> list[Point]:
         value = fields.get(key)
@@ -247,3 +211,15 @@ def _read_points(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
     require(same, f"{where}.offsets_m", offsets[0], f"{len(centres[0])} coordinates")
     pairs = [(centre, offset) for centre in centres for offset in offsets]
     return tuple(tuple(a + b for a, b in zip(*pair, strict=True)) for pair in pairs)
+
+
+def _read_grid(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
+    known_keys(fields, {"low_m", "high_m", "counts"}, where)
+    low, high = (numbers(fields.get(key), f"{where}.{key}", 2) for key in ("low_m", "high_m"))
+    counts = fields.get("counts")
+    good = isinstance(counts, list) and len(counts) == 2
+    good = good and all(type(n) is int and n >= 1 for n in counts or ())
+    require(good, f"{where}.counts", counts, "two integers of 1 or above")
+    assert isinstance(counts, list)
+    x, y = (np.linspace(a, b, n).tolist() for a, b, n in zip(low, high, counts, strict=True))
+    return tuple((a, b) for b in y for a in x)

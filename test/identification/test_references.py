@@ -74,9 +74,7 @@ def silverbox(shared_data):
         np.stack([data[name].ravel()[end - 8192 : end] for end in ends])[:, None]
         for name in ("V1", "V2")
     )
-    return estimate_frf(
-        u, y, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2)
-    )
+    return estimate_frf(u, y, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2))
 
 
 def test_silverbox(silverbox):

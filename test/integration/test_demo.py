@@ -69,14 +69,16 @@ def test_four_concentrations_are_told_apart(domain, tmp_path):
     options = ["--measurement", rows[0]["measurement_id"], "--band", "200", "300"]
     answer = subprocess.run(
         [sys.executable, "-m", "tactile_resonance.cli", "analyze", records, *options]
-        + ["--method", "frf", "--json", tmp_path / "again.json"],
+        + ["--json", tmp_path / "again.json"],
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert answer.returncode == 0, answer.stderr
-    again = json.loads((tmp_path / "again.json").read_text())["poles"][0]
-    # streamed and at once agree to 1e-9 of the response; a millionth of its standard deviation here
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["method"] == rows[0]["method"] == "joint maximum likelihood of poles and transient"
+    again = again["poles"][0]
+    # streamed and at once agree to rounding of the bins; a millionth of the standard deviation here
     assert abs(again["f0_hz"] - float(rows[0]["f0_hz"])) < 1e-6 * float(rows[0]["f0_std_hz"])
 
 
@@ -89,9 +91,9 @@ def test_interrupted_demo_leaves_no_process(domain, tmp_path, number):
         text=True,
     )
     deadline = time.monotonic() + 60
-    while len(processes_of(tmp_path)) < 4 and time.monotonic() < deadline:
+    while len(processes_of(tmp_path)) < 5 and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert len(processes_of(tmp_path)) == 4
+    assert len(processes_of(tmp_path)) == 5
     time.sleep(3)
     demo.send_signal(number)
     _, errors = demo.communicate(timeout=20)
@@ -107,7 +109,7 @@ def test_killed_demo_takes_its_nodes_along(domain, tmp_path):
         stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + 60
-    while len(processes_of(tmp_path)) < 4 and time.monotonic() < deadline:
+    while len(processes_of(tmp_path)) < 5 and time.monotonic() < deadline:
         time.sleep(0.1)
     time.sleep(2)
     demo.kill()

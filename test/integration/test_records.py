@@ -2,7 +2,6 @@
 """No block is dropped silently: on disk before it is heard, refused before it is played."""
 
 import array
-import shutil
 import signal
 import struct
 import time
@@ -69,11 +68,16 @@ class Client:
             self.executor.spin_once(timeout_sec=0.05)
 
     def ask(self, **goal):
-        """Future of the result of a goal."""
+        """Future of the result of a goal; asked until the node is active."""
         self.wait(self.client.server_is_ready)
-        accepted = self.client.send_goal_async(Measure.Goal(**goal))
-        self.wait(accepted.done)
-        return accepted.result().get_result_async()
+        deadline = time.monotonic() + 30.0
+        while time.monotonic() < deadline:
+            answer = self.client.send_goal_async(Measure.Goal(**goal))
+            self.wait(answer.done)
+            if answer.result().accepted:
+                return answer.result().get_result_async()
+            self.executor.spin_once(timeout_sec=0.1)
+        raise AssertionError("no node takes the goal")
 
     def measure(self, **goal):
         result = self.ask(**goal)
@@ -114,8 +118,7 @@ def bits(message):
 
 
 def start(nodes, names, **parameters):
-    for name in names:
-        nodes.start(name, parameters.get(name))
+    nodes.bring_up(names, parameters)
 
 
 def assert_on_disk(content, messages):
@@ -135,7 +138,7 @@ def test_kill_leaves_every_published_record_on_disk(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
         start(
             nodes,
-            ("excitation_node", "frf_node", "poles_node", "fake_hardware_node"),
+            ("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),
             excitation_node={"record_folder": records, **SHORT},
             fake_hardware_node={"speed": 2.0},
         )
@@ -185,13 +188,13 @@ def test_a_disk_that_goes_away_ends_the_measurement(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
         start(
             nodes,
-            ("excitation_node", "fake_hardware_node"),
+            ("fake_hardware_node", "excitation_node"),
             excitation_node={"record_folder": records, **SHORT},
             fake_hardware_node={"speed": 2.0},
         )
         result = client.ask(periods=100_000)
         client.wait(lambda: len(client.heard["record"]) >= 5)
-        shutil.rmtree(records)
+        records.rename(tmp_path / "gone")
         client.wait(result.done)
         result = result.result().result
         assert result.outcome == Measure.Result.FAILED
@@ -213,7 +216,7 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, Client() as client:
         start(
             nodes,
-            ("excitation_node", "fake_hardware_node", *readers),
+            ("fake_hardware_node", "excitation_node", *readers),
             excitation_node={"record_folder": records, "frame_id": "left/tip"},
             fake_hardware_node={"speed": 0.0},
         )

@@ -21,7 +21,7 @@ from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_session import NoAnswer, ScanSession
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 
-NODES = ("excitation_node", "frf_node", "poles_node", "fake_hardware_node")
+NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 GEL_10 = (0.0, 0.0, 0.0)
 GEL_16 = (0.18, 0.0, 0.0)
 
@@ -56,7 +56,7 @@ class Listener:
     def join(self, session):
         """Measure until a whole measurement has been heard: only then has everybody found the listener."""
         for _ in range(20):
-            key = session.warm_up(GEL_10).origin.measurement_id
+            key = session.warm_up(GEL_10, 30.0).origin.measurement_id
             deadline = time.monotonic() + 1.0
             while time.monotonic() < deadline:
                 self.executor.spin_once(timeout_sec=0.05)
@@ -81,11 +81,10 @@ def session(tmp_path_factory):
             "fake_hardware_node": {"speed": 0.0},
             "excitation_node": {"record_folder": tmp_path_factory.mktemp("records")},
         }
-        for node in NODES:
-            nodes.start(node, parameters.get(node))
+        nodes.bring_up(NODES, parameters)
         with ScanSession(nodes.check) as session:
             session.wait_for_nodes(30.0)
-            session.warm_up(GEL_10)
+            session.warm_up(GEL_10, 30.0)
             yield session
 
 
@@ -174,10 +173,18 @@ def test_level_above_the_sensors_limit_is_refused(session):
     assert session.measure(GEL_10, Measure.Goal(periods=3), quiet).poles.f0_hz.size == 1
 
 
+def test_a_node_that_refuses_to_come_up_says_why(domain, tmp_path):
+    with NodeProcesses(tmp_path) as nodes:
+        nodes.bring_up(NODES, {"fake_hardware_node": {"scene": "nowhere.yaml"}})
+        refusal = r"fake_hardware_node is unconfigured: .*nowhere.yaml"
+        with ScanSession(nodes.check) as session, pytest.raises(NoAnswer, match=refusal):
+            session.wait_for_nodes(30.0)
+
+
 def test_a_node_that_ended_is_named(domain, tmp_path):
     with NodeProcesses(tmp_path) as nodes:
-        nodes.start("fake_hardware_node", {"scene": "nowhere.yaml"})
-        with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*nowhere.yaml"):
+        nodes.start("fake_hardware_node", {"speed": -1.0})
+        with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*speed"):
             wait_for_an_end(nodes)
 
 

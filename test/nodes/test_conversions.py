@@ -10,6 +10,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not here")
 serialization = pytest.importorskip("rclpy.serialization")
 msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
 from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
 from tactile_resonance.identification.result import Poles, PolesStatus  # noqa: E402
 from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
@@ -119,6 +120,7 @@ def complex_normal(*shape):
 def test_frf(complete):
     covariance = complex_normal(2, 2, 30)
     covariance = covariance + np.conj(np.swapaxes(covariance, 0, 1))  # Hermitian
+    bins = BandBins(17, complex_normal(12), complex_normal(12), np.arange(5, 8), 1e3, 64, 4)
     frf = FRF(
         frequency_hz=np.sort(RNG.uniform(1, 100, 30)),
         g=complex_normal(30),
@@ -128,6 +130,7 @@ def test_frf(complete):
         total_dof=3,
         spectra=complex_normal(2, 30) if complete else None,
         spectra_covariance=covariance if complete else None,
+        bins=bins if complete else None,
         periods=4,
         realisations=2,
         method="m",

@@ -59,7 +59,9 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
 
     monkeypatch.setattr(devices, "make_device", lambda _: Device())
     with rclpy.init(domain_id=free_domain_id(os.environ)):
-        ExcitationNode().destroy_node()
+        node = ExcitationNode()
+        node.trigger_configure()
+        node.destroy_node()
     assert closed == [True]
 
 

@@ -28,6 +28,8 @@ N, RATE_HZ, PERIODS = 200, 1000.0, 3
 def node(monkeypatch):
     with rclpy.init(domain_id=free_domain_id(os.environ)):
         node = FrfNode()
+        node.trigger_configure()
+        node.trigger_activate()
         node.published = []
         monkeypatch.setattr(node._publisher, "publish", node.published.append)
         yield node

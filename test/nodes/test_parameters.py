@@ -17,6 +17,7 @@ from tactile_resonance.nodes import (
     excitation_node,
     fake_hardware_node,
     frf_node,
+    manager_node,
     poles_node,
 )
 from tactile_resonance.processes import free_domain_id
@@ -26,12 +27,14 @@ NODES = {
     "frf_node": frf_node.FrfNode,
     "poles_node": poles_node.PolesNode,
     "fake_hardware_node": fake_hardware_node.FakeHardwareNode,
+    "manager_node": manager_node.ManagerNode,
 }
 DECLARED = {
     "excitation_node": excitation_node.PARAMETERS,
     "frf_node": frf_node.PARAMETERS,
     "poles_node": poles_node.PARAMETERS,
     "fake_hardware_node": fake_hardware_node.PARAMETERS,
+    "manager_node": manager_node.PARAMETERS,
 }
 
 

@@ -14,10 +14,17 @@ import rclpy
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.nodes.conversions import frf_to_message
+from tactile_resonance.identification.joint import identify_poles_from_records
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.nodes.conversions import (
+    excitation_to_message,
+    frf_to_message,
+    record_to_message,
+)
+from tactile_resonance.nodes.frf_node import FrfNode
 from tactile_resonance.nodes.poles_node import PolesNode
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.record import Origin
+from tactile_resonance.record import Channel, Origin, Record
 
 LINES_HZ = np.arange(200.0, 300.1, 2.5)
 SPECTRA = ("sensor_real", "sensor_imag", "actuator_real", "actuator_imag")
@@ -27,6 +34,8 @@ SPECTRA = ("sensor_real", "sensor_imag", "actuator_real", "actuator_imag")
 def node(monkeypatch):
     with rclpy.init(domain_id=free_domain_id(os.environ)):
         node = PolesNode()
+        node.trigger_configure()
+        node.trigger_activate()
         node.published = []
         monkeypatch.setattr(node._publisher, "publish", node.published.append)
         yield node
@@ -51,6 +60,11 @@ BROKEN = {
     "variance short": lambda m: shorten(m, "variance_noise"),
     "one spectrum": lambda m: m.sensor_real.extend([1.0] * LINES_HZ.size),
     "one variance": lambda m: m.sensor_variance.extend([1.0] * LINES_HZ.size),
+    "bins short": lambda m: m.bins_sensor_imag.extend([1.0]),
+    "bins without a rate": lambda m: [
+        getattr(m, f"bins_{name}").extend([1.0])
+        for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
+    ],
     "nothing": lambda m: [
         setattr(m, n, array.array("d")) for n in ("frequency_hz", "real", "imag", "variance_noise")
     ],
@@ -69,3 +83,56 @@ def test_a_broken_frf_gets_a_failure_with_a_reason(node, case):
     assert len(failed.f0_hz) == 0
     assert after.status == msg.Poles.STATUS_OK
     assert after.f0_hz[0] == pytest.approx(250, rel=1e-6)
+
+
+def test_bins_give_after_every_block_what_the_whole_record_gives(node, monkeypatch):
+    """Through the messages of both nodes: a mode of 2 % at 250 Hz from rest, measured with noise."""
+    rng = np.random.default_rng(3)
+    excitation = design_multisine(
+        sample_rate_hz=5e3, samples_per_period=2000, band_hz=(100, 1000), seed=1, periods=3
+    )
+    u = np.tile(excitation.period(), 3)
+    s = 2j * np.pi * np.fft.rfftfreq(4 * u.size, 1 / 5e3)
+    g = 0.02 + 100 * s / (s**2 + 10 * np.pi * s * 2 + (500 * np.pi) ** 2)
+    y = np.fft.irfft(np.fft.rfft(u, 4 * u.size) * g)[: u.size]  # from rest
+    u, y = (x + 1e-4 * rng.standard_normal(x.size) for x in (u, y))
+    frf_node = FrfNode()
+    frf_node.trigger_configure()
+    frf_node.trigger_activate()
+    sent = []
+    monkeypatch.setattr(frf_node._publisher, "publish", sent.append)
+    frf_node._on_excitation(excitation_to_message(excitation, 0, "tip"))
+    for block in range(3):
+        here = slice(2000 * block, 2000 * (block + 1))
+        record = Record(
+            Channel(u[here]), Channel(y[here]), 5e3, 2000, block_index=block,
+            origin=Origin(0, excitation.excitation_id, final=block == 2),
+        )  # fmt: skip
+        frf_node._on_record(record_to_message(record))
+        node._on_frf(sent[-1])
+        mine = node.published[-1]
+        whole = identify_poles_from_records(
+            u[: here.stop].reshape(-1, 2000),
+            y[: here.stop].reshape(-1, 2000),
+            sample_rate_hz=5e3,
+            harmonics=excitation.harmonics,
+            band_hz=(200.0, 300.0),
+        )
+        assert mine.method == whole.method == "joint maximum likelihood of poles and transient"
+        assert mine.f0_hz[0] == pytest.approx(whole.f0_hz[0], rel=1e-9)
+        assert mine.damping_ratio[0] == pytest.approx(whole.damping_ratio[0], rel=1e-8)
+        if block == 0:
+            assert mine.status == msg.Poles.STATUS_NO_COVARIANCE
+        else:
+            assert mine.status == msg.Poles.STATUS_OK
+            assert np.array(mine.covariance) == pytest.approx(whole.covariance.ravel(), rel=1e-6)
+    frf_node.destroy_node()
+    # a band that the bins do not cover is fitted to the FRF, and says why
+    node.set_parameters([rclpy.Parameter("band_high_hz", value=350.0)])
+    node._on_frf(sent[-1])
+    assert node.published[-1].method == "weighted least squares"
+    assert "bins cover 200 to 300 Hz" in node.published[-1].message
+    node.set_parameters([rclpy.Parameter("method", value="joint")])
+    node._on_frf(sent[-1])
+    assert node.published[-1].status == msg.Poles.STATUS_FAILED
+    assert "bins cover 200 to 300 Hz" in node.published[-1].message

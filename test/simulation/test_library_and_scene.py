@@ -7,15 +7,10 @@ import yaml
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.materials import Uniform
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.scene import (
-    Box,
-    HalfSpace,
-    PhantomScene,
-    Region,
-    Sphere,
-    read_scene,
-)
+from tactile_resonance.simulation.scene import PhantomScene, Region, read_scene
+from tactile_resonance.simulation.shapes import Box, HalfSpace, Sphere
 
 
 def write(tmp_path, content):
@@ -120,9 +115,9 @@ def test_later_regions_cover_earlier_ones(library):
         "nodule",
         0.01,
         (
-            Region("block", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), gel),
-            Region("right", HalfSpace((0.5, 0.0), (-1.0, 0.0)), liver),
-            Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), library["gel16"]),
+            Region("block", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), Uniform(gel)),
+            Region("right", HalfSpace((0.5, 0.0), (-1.0, 0.0)), Uniform(liver)),
+            Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), Uniform(library["gel16"])),
         ),
         (),
     )

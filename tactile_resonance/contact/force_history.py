@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The force over the time in which a block was taken, with its uncertainty."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+BATCHES = 8
+LEAST_SAMPLES = 4 * BATCHES
+
+
+class ForceHistory:
+    """Normal forces of the last seconds.
+
+    Parameters
+    ----------
+    length_s : float
+        How far back it reaches [s].
+    """
+
+    def __init__(self, length_s: float = 60.0) -> None:
+        self._length_ns = round(length_s * 1e9)
+        self._samples: deque[tuple[int, float]] = deque()
+
+    def add(self, time_ns: int, force_n: float) -> None:
+        """Take one force [N]; one older than the newest is of a clock set back: all before is forgotten."""
+        if self._samples and time_ns < self._samples[-1][0]:
+            self._samples.clear()
+        self._samples.append((time_ns, force_n))
+        while self._samples[0][0] < time_ns - self._length_ns:
+            self._samples.popleft()
+
+    def mean(self, start_ns: int, end_ns: int) -> tuple[float, float]:
+        """Mean force from `start_ns` to `end_ns` [N] and its standard deviation.
+
+        The standard deviation is that of the mean, found from the means of eight batches, so that
+        correlated noise and a slow decay count as they should (method of batch means); an offset of the
+        sensor is not in it.
+
+        Returns
+        -------
+        force_n, force_std_n : float
+            NaN, NaN where nothing was heard in that time; a standard deviation of NaN where fewer than
+            32 samples were.
+        """
+        forces = np.array([f for t, f in self._samples if start_ns <= t <= end_ns])
+        if forces.size == 0:
+            return float("nan"), float("nan")
+        if forces.size < LEAST_SAMPLES:
+            return float(forces.mean()), float("nan")
+        means = np.array([batch.mean() for batch in np.array_split(forces, BATCHES)])
+        return float(forces.mean()), float(means.std(ddof=1) / np.sqrt(BATCHES))
+
+    def newest(self) -> tuple[int, float]:
+        """Time [ns] and force [N] heard last; 0 and NaN before the first."""
+        return self._samples[-1] if self._samples else (0, float("nan"))

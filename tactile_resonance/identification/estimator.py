@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which estimator of the poles the data at hand allow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.identification.identify import identify_poles
+from tactile_resonance.identification.joint import identify_poles_from_bins
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+
+POLES_METHODS = ("auto", "joint", "frf")
+
+
+def poles_of_frf(
+    frf: FRF,
+    band_hz: tuple[float, float],
+    structure: ModelStructure | None = None,
+    method: str = "auto",
+) -> Poles:
+    """Poles from the bins that come with an FRF, else from the FRF itself.
+
+    Parameters
+    ----------
+    frf : FRF
+        With (F,) arrays.
+    band_hz : (low, high)
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+    method : {"auto", "joint", "frf"}
+        ``auto`` is ``joint`` where the FRF brings bins that cover the band and hold lines enough.
+
+    Returns
+    -------
+    Poles
+        Always with a status; its ``method`` says which was taken.
+
+    Raises
+    ------
+    ValueError
+        If the method is none, or ``joint`` is not possible.
+    """
+    if method not in POLES_METHODS:
+        raise ValueError(f"method: {method!r}, accepted are {', '.join(POLES_METHODS)}")
+    structure = structure or ModelStructure()
+    if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
+        return Poles(status=PolesStatus.FAILED, message=frf.message)
+    reason = _joint_impossible(frf, band_hz, structure)
+    if method == "joint" and reason:
+        raise ValueError(f"method: joint, but {reason}")
+    if method == "frf" or frf.bins is None or reason:
+        poles = identify_poles(frf, band_hz, structure)
+        if method == "auto" and frf.bins is not None:
+            message = "; ".join(filter(None, [poles.message, f"from the FRF: {reason}"]))
+            poles = replace(poles, message=message)
+        return poles
+    notes = [frf.message] if frf.status is not FrfStatus.OK else []
+    return identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
+
+
+def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:
+    """Why there can be no joint estimate; empty where there can."""
+    bins = frf.bins
+    if bins is None:
+        return "the FRF brings no bins: it is from several realisations, or they were not asked for"
+    low_hz, high_hz = bins.band_hz
+    margin = bins.resolution_hz * (1 + 1e-9)  # the band's ends need not lie on bins
+    if band_hz[0] <= low_hz - margin or band_hz[1] >= high_hz + margin:
+        return f"the bins cover {low_hz:g} to {high_hz:g} Hz of {band_hz[0]:g} to {band_hz[1]:g} Hz"
+    line_hz = bins.sample_rate_hz / bins.samples_per_period
+    lines = bins.harmonics * line_hz
+    count = int(((lines >= band_hz[0]) & (lines <= band_hz[1])).sum())
+    if count <= structure.fewest_lines:
+        return (
+            f"the band holds {count} excited lines, more than {structure.fewest_lines} are needed"
+        )
+    if structure.delay:
+        return "it estimates no delay"
+    return ""

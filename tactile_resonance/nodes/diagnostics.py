@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node tells about its own health on `/diagnostics`, once a second."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+PERIOD_S = 1.0
+# How long after an error a node still warns of it.
+ERROR_REMEMBERED_S = 10.0
+
+
+@dataclass
+class _Flow:
+    """Messages of one topic, in or out."""
+
+    total: int = 0
+    reported: int = 0
+    last_s: float = field(default=float("nan"))
+
+
+class Health:
+    """Counts what goes in and out, remembers the last error, and publishes both.
+
+    Parameters
+    ----------
+    node : Node
+    state : callable
+        Name of the node's lifecycle state.
+    details : callable
+        Further figures of the node by name.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        state: Callable[[], str],
+        details: Callable[[], Mapping[str, str]],
+    ) -> None:
+        self._node = node
+        self._state = state
+        self._details = details
+        self._flows: dict[str, _Flow] = {}
+        self._error = ""
+        self._error_s = float("-inf")
+        self._reported_s = time.monotonic()
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_timer(PERIOD_S, self._publish)
+
+    def saw(self, topic: str) -> None:
+        """Count one message of a topic."""
+        flow = self._flows.setdefault(topic, _Flow())
+        flow.total += 1
+        flow.last_s = time.monotonic()
+
+    def error(self, text: str) -> None:
+        """Log an error and remember it."""
+        self._node.get_logger().error(text)
+        self._error = text
+        self._error_s = time.monotonic()
+
+    def _publish(self) -> None:
+        now_s = time.monotonic()
+        state = self._state()
+        recent = now_s - self._error_s < ERROR_REMEMBERED_S
+        level, message = DiagnosticStatus.OK, state
+        if recent:
+            level = DiagnosticStatus.WARN if state == "active" else DiagnosticStatus.ERROR
+            message = f"{state}: {self._error}"
+        values = {"state": state}
+        for topic, flow in self._flows.items():
+            rate_hz = (flow.total - flow.reported) / (now_s - self._reported_s)
+            flow.reported = flow.total
+            values[f"{topic}: messages"] = str(flow.total)
+            values[f"{topic}: rate [Hz]"] = f"{rate_hz:.3g}"
+            values[f"{topic}: age [s]"] = f"{now_s - flow.last_s:.3g}"
+        if self._error:
+            values["last error"] = self._error
+            values["last error: age [s]"] = f"{now_s - self._error_s:.3g}"
+        values.update(self._details())
+        self._reported_s = now_s
+        name = self._node.get_fully_qualified_name()
+        status = DiagnosticStatus(
+            level=level,
+            name=name,
+            message=message,
+            hardware_id=self._node.get_namespace(),
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The life that all nodes share: configure, activate, deactivate, clean up, and recover from errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from rclpy.exceptions import ParameterException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle.publisher import LifecyclePublisher
+from rclpy.qos import QoSProfile
+
+from tactile_resonance.drivers.acquisition import DeviceError
+from tactile_resonance.nodes.diagnostics import Health
+from tactile_resonance.nodes.parameters import Parameter, declare
+
+# What a configuration may be refused with; anything else is a defect and keeps its traceback.
+REFUSALS = (ValueError, OSError, DeviceError, ParameterException)
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node whose subclasses say only what they set up and what they do.
+
+    `configure` makes publishers, subscriptions, services and devices through `publish_on`, `listen`,
+    `serve` and `resources`; the way back undoes them in reverse order. What arrives while the node is
+    not active is dropped, and what it publishes then goes nowhere.
+
+    Parameters
+    ----------
+    name : str
+    parameters : sequence of Parameter
+    """
+
+    def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
+        super().__init__(name)
+        self.resources = ExitStack()
+        self.active = False
+        self._failing = False
+        declare(self, parameters)
+        self.health = Health(self, self.state_name, self.details)
+
+    # What a subclass says
+
+    def configure(self) -> None:
+        """Set up; refuse with ValueError, OSError or DeviceError."""
+        raise NotImplementedError
+
+    def activate(self) -> None:
+        """Begin to work."""
+
+    def deactivate(self) -> None:
+        """Stop working at once; may be called when nothing is under way."""
+
+    def details(self) -> Mapping[str, str]:
+        """Figures for the diagnostics beside rates and errors."""
+        return {}
+
+    # What it sets up with
+
+    def publish_on(self, kind: type, topic: str, qos: QoSProfile) -> LifecyclePublisher:
+        """Publisher until the node is cleaned up."""
+        publisher = self.create_lifecycle_publisher(kind, topic, qos)
+        self.resources.callback(self.destroy_lifecycle_publisher, publisher)
+        return publisher
+
+    def listen(
+        self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> None:
+        """Subscription until the node is cleaned up; heard while it is active."""
+
+        def heard(message: Any) -> None:
+            if self.active:
+                self.health.saw(topic)
+                callback(message)
+
+        subscription = self.create_subscription(kind, topic, heard, qos)
+        self.resources.callback(self.destroy_subscription, subscription)
+
+    def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        """Service until the node is cleaned up; the callback sees to `active` itself."""
+        service = self.create_service(kind, name, callback)
+        self.resources.callback(self.destroy_service, service)
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Timer until the node is cleaned up; called while it is active."""
+        timer = self.create_timer(period_s, lambda: callback() if self.active else None)
+        self.resources.callback(self.destroy_timer, timer)
+
+    def fail(self, reason: str) -> None:
+        """Give up for a reason: back to unconfigured, from where the manager starts it anew."""
+        self.health.error(reason)
+        if self.active:
+            self._failing = True
+            self.trigger_deactivate()
+
+    # Its life
+
+    def state_name(self) -> str:
+        """Name of the present state."""
+        return self._state_machine.current_state[1]
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Set up, or say why not and stay unconfigured."""
+        try:
+            self.configure()
+        except REFUSALS as error:
+            self._undo()
+            self.health.error(" ".join(str(error).split()))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.health.error(f"defect while configuring: {error!r}")
+            raise
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to work."""
+        result = super().on_activate(state)
+        self.activate()
+        self.active = True
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop working."""
+        self.active = False
+        self.deactivate()
+        if self._failing:
+            self._failing = False
+            return TransitionCallbackReturn.ERROR
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let everything go that `configure` made."""
+        self._undo()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and let everything go."""
+        self._undo()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let everything go, ready to be configured again."""
+        self._undo()
+        return TransitionCallbackReturn.SUCCESS
+
+    def destroy_node(self) -> None:
+        """Stop what is under way first, in whatever state."""
+        self._undo()
+        super().destroy_node()
+
+    def _undo(self) -> None:
+        if self.active:
+            self.active = False
+            self.deactivate()
+        self.resources.close()

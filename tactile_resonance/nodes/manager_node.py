@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Brings the nodes up in order, and those back that failed or were started anew."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from tactile_resonance.nodes.diagnostics import Health
+from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.running import run_node
+
+STREAM_NODES = ["excitation_node", "frf_node", "poles_node"]
+
+PARAMETERS = (
+    Parameter(
+        "nodes",
+        STREAM_NODES,
+        "Names of the managed nodes, in the order in which they come up.",
+        read_only=True,
+    ),
+    Parameter("answer_timeout_s", 15.0, "Longest wait for an answer of a node [s].", 0.1, 3600.0),
+    Parameter("retry_s", 1.0, "First wait after a refusal [s]; doubled each time.", 0.05, 60.0),
+)
+
+TICK_S = 0.1
+LONGEST_RETRY_S = 16.0
+
+_UP = {
+    State.PRIMARY_STATE_UNCONFIGURED: Transition.TRANSITION_CONFIGURE,
+    State.PRIMARY_STATE_INACTIVE: Transition.TRANSITION_ACTIVATE,
+}
+_DOWN = {
+    State.PRIMARY_STATE_ACTIVE: Transition.TRANSITION_DEACTIVATE,
+    State.PRIMARY_STATE_INACTIVE: Transition.TRANSITION_CLEANUP,
+}
+_NAMES = {
+    State.PRIMARY_STATE_UNKNOWN: "unreachable",
+    State.PRIMARY_STATE_UNCONFIGURED: "unconfigured",
+    State.PRIMARY_STATE_INACTIVE: "inactive",
+    State.PRIMARY_STATE_ACTIVE: "active",
+    State.PRIMARY_STATE_FINALIZED: "finalised",
+}
+
+
+@dataclass
+class _Managed:
+    """One node as the manager sees it."""
+
+    name: str
+    get: Client
+    change: Client
+    state: int = State.PRIMARY_STATE_UNKNOWN
+    pending: Future | None = None
+    client: Client | None = None
+    deadline_s: float = 0.0
+    refusals: int = 0
+    next_try_s: float = field(default=0.0)
+
+
+class ManagerNode(Node):
+    """Asks each node for its state and moves it on; a node waits for those before it.
+
+    A node that fails goes back to unconfigured, one that is started anew is unconfigured: both are
+    brought up again. Services `~/shut_down` (all nodes unconfigured, in reverse order) and `~/start`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("manager_node")
+        declare(self, PARAMETERS)
+        (names,) = values(self, "nodes")
+        self._nodes = [self._managed(name) for name in names]
+        if not self._nodes:
+            raise ValueError("nodes: empty, expected names of nodes")
+        self._wanted_up = True
+        self._was_up = False
+        self.health = Health(self, self._summary, self._details)
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/shut_down", self._on_shut_down)
+        self.create_timer(TICK_S, self._tick)
+
+    def _managed(self, name: str) -> _Managed:
+        return _Managed(
+            name,
+            self.create_client(GetState, f"{name}/get_state"),
+            self.create_client(ChangeState, f"{name}/change_state"),
+        )
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._want(True, response)
+
+    def _on_shut_down(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._want(False, response)
+
+    def _want(self, up: bool, response: Trigger.Response) -> Trigger.Response:
+        self._wanted_up = up
+        for node in self._nodes:
+            node.refusals, node.next_try_s = 0, 0.0
+        response.success = True
+        response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
+        return response
+
+    def _tick(self) -> None:
+        ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
+        moves = _UP if self._wanted_up else _DOWN
+        clear = True  # whether all nodes before have come as far as they should
+        for node in self._nodes if self._wanted_up else reversed(self._nodes):
+            self._advance(node, moves if clear else {})
+            clear = clear and node.state == ready
+        if clear and self._wanted_up and not self._was_up:
+            self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
+        self._was_up = clear and self._wanted_up
+
+    def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
+        """One step of one node: an answer taken, or a question asked."""
+        now_s = time.monotonic()
+        if node.pending is not None:
+            if not node.pending.done():
+                if now_s > node.deadline_s:
+                    self._drop(node)
+                return
+            self._take(node, now_s)
+        if not (node.get.service_is_ready() and node.change.service_is_ready()):
+            node.state = State.PRIMARY_STATE_UNKNOWN
+            return
+        transition = moves.get(node.state)
+        if transition is not None and now_s >= node.next_try_s:
+            request = ChangeState.Request(transition=Transition(id=transition))
+            self._ask(node, node.change, request, now_s)
+        else:
+            self._ask(node, node.get, GetState.Request(), now_s)
+
+    def _ask(self, node: _Managed, client: Client, request: object, now_s: float) -> None:
+        (timeout_s,) = values(self, "answer_timeout_s")
+        node.client, node.pending = client, client.call_async(request)
+        node.deadline_s = now_s + timeout_s
+
+    def _take(self, node: _Managed, now_s: float) -> None:
+        answer, node.pending = node.pending.result(), None
+        if isinstance(answer, GetState.Response):
+            if node.state == State.PRIMARY_STATE_ACTIVE != answer.current_state.id:
+                self.health.error(f"{node.name} is {_NAMES.get(answer.current_state.id)} again")
+            node.state = answer.current_state.id
+            return
+        node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
+        if answer.success:
+            node.refusals = 0
+            return
+        (retry_s,) = values(self, "retry_s")
+        wait_s = min(retry_s * 2**node.refusals, LONGEST_RETRY_S)
+        node.refusals += 1
+        node.next_try_s = now_s + wait_s
+        self.health.error(
+            f"{node.name} refuses to come up (its log and /diagnostics say why), "
+            f"asked again in {wait_s:g} s"
+        )
+
+    def _drop(self, node: _Managed) -> None:
+        """A node that was killed never answers."""
+        node.client.remove_pending_request(node.pending)
+        node.pending = None
+        node.state = State.PRIMARY_STATE_UNKNOWN
+        self.health.error(f"{node.name} does not answer")
+
+    def _summary(self) -> str:
+        return "active" if self._was_up else ("starting" if self._wanted_up else "shut down")
+
+    def _details(self) -> dict[str, str]:
+        return {node.name: _NAMES.get(node.state, "in transition") for node in self._nodes}
+
+
+def main() -> None:
+    """Console script."""
+    run_node(ManagerNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A contact that changes while it is measured: force and indentation as functions of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
+from tactile_resonance.simulation.contact import (
+    Contact,
+    ContactParameters,
+    contact_of_radius,
+    hertz_contact,
+)
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.modal import ComplexArray, FloatArray
+from tactile_resonance.simulation.parameters import SensorParameters
+from tactile_resonance.simulation.tissue import Tissue
+
+
+@dataclass(frozen=True, eq=False)
+class ContactHistory:
+    """Contact radius, force and indentation over time, linear between the times given.
+
+    A small vibration sees the contact radius alone: while a tip is held at one depth the force
+    relaxes and the poles stay; while the force is held the contact grows and they move.
+
+    Attributes
+    ----------
+    tissue : Tissue
+    parameters : ContactParameters
+    time_s : (T,) array
+        Ascending [s]; before the first and after the last the contact stays as it is there.
+    contact_radius_m : (T,) array
+        Above 0 throughout.
+    force_n, indentation_m : (T,) arrays
+    """
+
+    tissue: Tissue
+    parameters: ContactParameters
+    time_s: FloatArray
+    contact_radius_m: FloatArray
+    force_n: FloatArray
+    indentation_m: FloatArray
+
+    def __post_init__(self) -> None:
+        time = self.time_s
+        good = time.ndim == 1 and time.size > 0 and bool(np.all(np.diff(time) > 0))
+        require(good, "time_s", time, "ascending times, one axis")
+        for name in ("contact_radius_m", "force_n", "indentation_m"):
+            values = getattr(self, name)
+            good = values.shape == time.shape and bool(np.all(np.isfinite(values)))
+            require(good, name, values, f"{time.size} finite numbers, one for each time")
+        radius = self.contact_radius_m
+        require(bool(np.all(radius > 0)), "contact_radius_m", radius.min(), "contact throughout")
+
+    @classmethod
+    def under_force(
+        cls,
+        tissue: Tissue,
+        tip_radius_m: float,
+        parameters: ContactParameters,
+        *,
+        force_n: float | None = None,
+        since_s: float = 1.0,
+        duration_s: float,
+        steps: int = 200,
+    ) -> ContactHistory:
+        """Return the creep under a held force, from `since_s` after it was put on."""
+        require(duration_s > 0, "duration_s", duration_s, "a number above 0")
+        # evenly in the logarithm of the time held, as creep goes
+        held = np.geomspace(since_s, since_s + duration_s, steps + 1)
+        contacts = [
+            hertz_contact(tissue, tip_radius_m, parameters, force_n=force_n, hold_time_s=float(t))
+            for t in held
+        ]
+        return cls(
+            tissue,
+            parameters,
+            held - since_s,
+            np.array([c.contact_radius_m for c in contacts]),
+            np.array([c.force_n for c in contacts]),
+            np.array([c.indentation_m for c in contacts]),
+        )
+
+    @classmethod
+    def of_depth(
+        cls,
+        tissue: Tissue,
+        tip_radius_m: float,
+        parameters: ContactParameters,
+        time_s: ArrayLike,
+        depth_m: ArrayLike,
+        *,
+        start_s: float = 0.0,
+    ) -> ContactHistory:
+        """Return the contact of a ball moved to given depths; what was before `start_s` is cut off.
+
+        Times are counted from `start_s`, the first at or after it.
+        """
+        time, depth = np.asarray(time_s, dtype=float), np.asarray(depth_m, dtype=float)
+        good = time.ndim == 1 and time.size >= 2 and bool(np.all(np.diff(time) > 0))
+        require(good, "time_s", time, "two ascending times or more, one axis")
+        require(depth.shape == time.shape, "depth_m", depth.shape, f"shape {time.shape}")
+        indenter = Indenter(
+            tissue, tip_radius_m=tip_radius_m, poisson_ratio=parameters.poisson_ratio
+        )
+        rows = []
+        for x, dt in zip(depth, np.diff(time, prepend=time[0] - (time[1] - time[0])), strict=True):
+            force = indenter.step(float(x), float(dt))
+            rows.append((indenter.contact_radius_m, force, x))
+        radius, force_n, indentation = np.array(rows).T
+        keep = time >= start_s
+        require(bool(keep.any()), "start_s", start_s, f"up to {time[-1]:g}, the last time")
+        return cls(
+            tissue,
+            parameters,
+            time[keep] - time[keep][0],
+            radius[keep],
+            force_n[keep],
+            indentation[keep],
+        )
+
+    def contact_at(self, time_s: float) -> Contact:
+        """Return the contact at one time."""
+        radius, force, depth = (
+            float(np.interp(time_s, self.time_s, values))
+            for values in (self.contact_radius_m, self.force_n, self.indentation_m)
+        )
+        return contact_of_radius(
+            self.tissue, radius, self.parameters, force_n=force, indentation_m=depth
+        )
+
+    def coupled_at(self, sensor: SensorParameters, time_s: float) -> CoupledBimorph:
+        """Return the linear sensor on the contact of one time."""
+        return couple(sensor, self.contact_at(time_s))
+
+
+def pole_trajectory(
+    sensor: SensorParameters,
+    history: ContactHistory,
+    time_s: ArrayLike,
+    *,
+    near_hz: float = 250.0,
+) -> ComplexArray:
+    """Return the pole of one resonance at times (T,) [s], shape (T,) [rad/s].
+
+    The resonance is that whose natural frequency is nearest to `near_hz` at the first time, and
+    then the nearest to itself.
+    """
+    poles: list[complex] = []
+    for t in np.atleast_1d(np.asarray(time_s, dtype=float)):
+        coupled = history.coupled_at(sensor, float(t))
+        if poles:
+            found = min((m.pole_rad_s for m in coupled.modes), key=lambda p: abs(p - poles[-1]))
+        else:
+            found = coupled.mode_near(near_hz).pole_rad_s
+        poles.append(found)
+    return np.array(poles)

@@ -1,0 +1,397 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A rigid ball pressed into viscoelastic tissue through time: loading, unloading, contact again.
+
+The axisymmetric contact of a viscoelastic half-space maps exactly on a row of independent
+viscoelastic springs at positions x >= 0 under the profile ``x^2 / R``, whatever the history, while
+the contact is one circle: Popov & Hess, *Method of Dimensionality Reduction* (2015), ch. 8;
+Argatov & Popov, ZAMM 96 (2016), who show that it is the solution of Lee & Radok (1960) while the
+contact grows and that of Ting (1966) while it shrinks. Spring x has the displacement
+``u = depth - x^2 / R`` while it touches, the line load
+``q = [Einf u + sum E_j v_j] / (1 - nu^2)`` with ``v_j' = u' - v_j / tau_j``, and lets go at q = 0;
+from there it recovers free of load. The force is ``2 integral_0^a q dx``.
+
+All springs that touch see the same motion, so sums over them take a few operations per step; only
+the profile of v_j, which tells where the edge goes, is kept, at nodes.
+"""
+
+from __future__ import annotations
+
+from math import ceil, cos, exp, expm1, pi, sin, sqrt
+
+import numpy as np
+
+from tactile_resonance.simulation.beam import BeamModes
+from tactile_resonance.simulation.fields import require
+from tactile_resonance.simulation.free_springs import FreeSprings, Node, Values
+from tactile_resonance.simulation.tissue import Tissue
+
+NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes as its square
+MAX_NODES_PER_STEP = 64
+SUBSTEP_S = 5e-4  # of the sprung tip: a twentieth of the period of the mode on stiff gelatine
+
+
+class Indenter:
+    """A spherical rigid tip on a viscoelastic half-space, stepped through time.
+
+    Inertia of the tissue is left out (see `contact` for the waves of fast vibration), friction too.
+
+    Parameters
+    ----------
+    tissue : Tissue
+    tip_radius_m : float
+        Radius R of the ball [m].
+    poisson_ratio : float
+        Of the tissue.
+    adhesion_j_per_m2 : float
+        Work of adhesion w [J/m2]; 0: none. The edge lets go at the line load of Johnson, Kendall &
+        Roberts (1971), ``-sqrt(2 pi a w E1)``, ``E1 = E(1 s) / (1 - nu^2)``: in the elastic limit
+        this is their theory, pull-off at ``-1.5 pi w R``. In tissue the modulus at the edge is
+        chosen, not known.
+
+    Attributes
+    ----------
+    force_n : float
+        On the tip along the outward normal [N]; 0 or above without adhesion.
+    contact_radius_m : float
+        a [m]; 0 out of contact.
+    depth_m : float
+        Depth of the ball's lowest point below the undisturbed surface [m]; negative above it.
+    """
+
+    def __init__(
+        self,
+        tissue: Tissue,
+        *,
+        tip_radius_m: float,
+        poisson_ratio: float,
+        adhesion_j_per_m2: float = 0.0,
+    ) -> None:
+        require(0 < tip_radius_m < np.inf, "tip_radius_m", tip_radius_m, "a number above 0")
+        require(0 <= poisson_ratio <= 0.5, "poisson_ratio", poisson_ratio, "0 to 0.5")
+        work = adhesion_j_per_m2
+        require(0 <= work < np.inf, "adhesion_j_per_m2", work, "0 or above")
+        self._radius = tip_radius_m
+        self._scale = 2 / (1 - poisson_ratio**2)  # both halves of the row
+        moduli, times = tissue.prony_moduli_pa, np.asarray(tissue.prony_times_s)
+        moduli, times = moduli[moduli > 0], times[moduli > 0]
+        self._einf, self._e0 = tissue.equilibrium_modulus_pa, tissue.instantaneous_modulus_pa
+        self._moduli, self._times = moduli.tolist(), times.tolist()
+        # edge load / sqrt(x), as q (1 - nu^2)
+        plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - poisson_ratio**2)
+        self._pull = (1 - poisson_ratio**2) * sqrt(2 * pi * work * plane_modulus)
+        self._free = FreeSprings(moduli, times, self._e0)
+        self._spacing = NODE_SPACING * tip_radius_m
+        self._interval = 0.0
+        self._decay: Values = []
+        self._mean_decay: Values = []
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue with the tip far above it."""
+        self.force_n = 0.0
+        self.contact_radius_m = 0.0
+        self.depth_m = -np.inf
+        self._time = 0.0
+        self._touching = False
+        zero = [0.0] * len(self._times)
+        self._sum = zero  # integral_0^a v_j dx
+        self._common = zero  # what every touching spring has gone through alike
+        self._edge = zero  # v_j at x = a
+        self._inside: list[Node] = []  # x, time, v_j - common, x ascending
+        self._outside: list[Node] = []  # x, time, free state, x descending
+
+    def step(self, depth_m: float, dt_s: float) -> float:
+        """Move the tip to a depth at constant speed within `dt_s` and return the force [N]."""
+        if not dt_s > 0:
+            require(False, "dt_s", dt_s, "a number above 0")
+        moved = depth_m - self.depth_m
+        self.depth_m = depth_m
+        self._time += dt_s
+        if self._touching:
+            self._set_interval(dt_s)
+            shift = [moved * m for m in self._mean_decay]
+            decay, a = self._decay, self.contact_radius_m
+            self._sum = [d * s + a * v for d, s, v in zip(decay, self._sum, shift, strict=True)]
+            self._common = [d * c + v for d, c, v in zip(decay, self._common, shift, strict=True)]
+            self._edge = [d * e + v for d, e, v in zip(decay, self._edge, shift, strict=True)]
+            excess = self._load(a, self._edge)
+            if excess < 0:
+                self._recede(excess)
+            else:
+                self._advance(excess)
+        elif not self._touch(moved, dt_s):
+            return 0.0
+        return self._update_force()
+
+    def tangent(self, dt_s: float) -> tuple[float, float]:
+        """Return (force [N] after holding for `dt_s`, force per further depth [N/m]).
+
+        To first order the force after a step is ``force + stiffness (depth - present depth)``.
+        """
+        if not self._touching:
+            return 0.0, 0.0
+        self._set_interval(dt_s)
+        a, stress, stiffness = self.contact_radius_m, 0.0, self._einf
+        terms = zip(self._moduli, self._decay, self._mean_decay, self._sum, strict=True)
+        for modulus, decay, mean, total in terms:
+            stress += modulus * decay * total
+            stiffness += modulus * mean
+        stress += self._einf * a * (self.depth_m - a * a / (3 * self._radius))
+        return self._scale * stress, self._scale * a * stiffness
+
+    def _set_interval(self, dt_s: float) -> None:
+        """Keep ``exp(-dt / tau)`` and its mean over the step, which steady motion sees."""
+        if dt_s != self._interval:
+            self._interval = dt_s
+            self._decay = [exp(-dt_s / tau) for tau in self._times]
+            self._mean_decay = [-tau / dt_s * expm1(-dt_s / tau) for tau in self._times]
+
+    def _load(self, x: float, v: Values) -> float:
+        """Return ``q (1 - nu^2)`` at x, above that at which the edge lets go."""
+        load = self._einf * (self.depth_m - x * x / self._radius) + self._pull * sqrt(x)
+        for modulus, value in zip(self._moduli, v, strict=True):
+            load += modulus * value
+        return load
+
+    def _touch(self, moved: float, dt_s: float) -> bool:
+        """Begin a contact if the tip has met the surface, which may still be dented."""
+        surface = 0.0
+        if self._outside:
+            surface = self._free.displacement(self._outside[-1], self._time)
+        gone_in = self.depth_m - surface
+        if gone_in <= 0:
+            return False
+        # the part of the step in contact; the first step ever starts at the surface
+        self._set_interval(dt_s * min(1.0, gone_in / moved) if 0 < moved < np.inf else dt_s)
+        start = [0.0] * len(self._times)
+        if self._outside:
+            start = self._free.deformation(self._outside.pop(), self._time)
+        self._edge = [v + gone_in * m for v, m in zip(start, self._mean_decay, strict=True)]
+        self._touching = True
+        self._sum = self._common = [0.0] * len(self._times)
+        self._inside = [(0.0, self._time, self._edge)]
+        self._advance(self._load(0.0, self._edge))
+        return True
+
+    def _advance(self, excess: float) -> None:
+        """Let springs outside the edge touch, those that have recovered first."""
+        radius, pull = self._radius, self._pull / self._e0
+        while self._outside:
+            node = self._outside[-1]
+            x, a = node[0], self.contact_radius_m
+            surface = self._free.displacement(node, self._time)
+            start = [v - pull * sqrt(x) for v in self._free.deformation(node, self._time)]
+            gone_in = self.depth_m - x * x / radius - surface + pull * sqrt(x)
+            if gone_in >= 0:
+                self._outside.pop()
+                ends = zip(start, self._mean_decay, strict=True)
+                self._extend(x, [v + gone_in * m for v, m in ends])
+                excess = self._load(x, self._edge)
+                continue
+            at_edge = excess / self._e0
+            share = at_edge / (at_edge - gone_in)
+            pairs = zip(self._edge, start, strict=True)
+            edge = [(1 - share) * (v - at_edge) + share * w for v, w in pairs]
+            self._extend(sqrt(a * a + share * (x * x - a * a)), edge)
+            return
+        x, a = self._undisturbed_edge(), self.contact_radius_m
+        if x > a:
+            self._take_undisturbed(a, x)
+
+    def _take_undisturbed(self, a: float, x: float) -> None:
+        """Move the edge from a to x over springs that never touched, all in closed form."""
+        radius, pull = self._radius, self._pull / self._e0
+        pressed = self.depth_m * (x - a) - (x * x * x - a * a * a) / (3 * radius)
+        pulled = 2 / 3 * pull * (x * sqrt(x) - a * sqrt(a))
+        added = [m * (pressed + pulled) - pulled for m in self._mean_decay]
+        self._sum = [s + v for s, v in zip(self._sum, added, strict=True)]
+        self._keep_edge()
+        # nodes on the way, where the edge has leapt
+        count = min(MAX_NODES_PER_STEP, int((x - a) / self._spacing))
+        for n in range(1, count + 1):
+            at = a + (x - a) * n / (count + 1)
+            jump = -pull * sqrt(at)
+            gone_in = self.depth_m - at * at / radius - jump
+            self._edge = [jump + m * gone_in for m in self._mean_decay]
+            self.contact_radius_m = at
+            self._keep_edge()
+        self.contact_radius_m, self._edge = x, [-pull * sqrt(x)] * len(self._times)
+
+    def _undisturbed_edge(self) -> float:
+        """Return the radius at which undisturbed springs just touch."""
+        if self._pull == 0:
+            return sqrt(self._radius * max(0.0, self.depth_m))
+        # depth - x^2/R + pull/E0 sqrt(x): concave, so Newton from the right falls to the root
+        pull, radius, depth = self._pull / self._e0, self._radius, self.depth_m
+        x = 2 * ((radius * pull) ** (2 / 3) + sqrt(radius * abs(depth)))
+        for _ in range(60):
+            value = depth - x * x / radius + pull * sqrt(x)
+            slope = -2 * x / radius + pull / (2 * sqrt(x))
+            if slope >= 0:
+                return 0.0
+            change = value / slope
+            x -= change
+            if x <= 0:
+                return 0.0
+            if abs(change) <= 1e-14 * x:
+                break
+        return x
+
+    def _extend(self, x: float, edge: Values) -> None:
+        """Move the edge outwards to x, v_j linear in x^2 on the way."""
+        parts = _segment(self.contact_radius_m, x, self._edge, edge)
+        self._sum = [s + part for s, part in zip(self._sum, parts, strict=True)]
+        self._keep_edge()
+        self.contact_radius_m, self._edge = x, edge
+
+    def _keep_edge(self) -> None:
+        """Make the present edge a node of the profile, where the last one is far enough inside."""
+        if self.contact_radius_m - self._inside[-1][0] >= self._spacing:
+            pairs = zip(self._edge, self._common, strict=True)
+            self._inside.append((self.contact_radius_m, self._time, [v - c for v, c in pairs]))
+
+    def _recede(self, excess: float) -> None:
+        """Let go springs at the edge until the load there is no longer below the limit."""
+        while self._inside:
+            x, since, kept = self._inside[-1]
+            elapsed = since - self._time
+            terms = zip(self._common, self._times, kept, strict=True)
+            v = [c + w * exp(elapsed / tau) for c, tau, w in terms]
+            load = self._load(x, v)
+            a = self.contact_radius_m
+            self._let_go(force=not self._outside)
+            if load >= 0:
+                share = load / (load - excess)
+                new = sqrt(x * x + share * (a * a - x * x))
+                pairs = zip(v, self._edge, strict=True)
+                edge = [(1 - share) * inner + share * outer for inner, outer in pairs]
+                parts = _segment(new, a, edge, self._edge)
+                self._sum = [s - part for s, part in zip(self._sum, parts, strict=True)]
+                self.contact_radius_m, self._edge = new, edge
+                return
+            parts = _segment(x, a, v, self._edge)
+            self._sum = [s - part for s, part in zip(self._sum, parts, strict=True)]
+            self.contact_radius_m, self._edge, excess = x, v, load
+            self._inside.pop()
+        self._let_go(force=True)
+        self._touching = False
+
+    def _let_go(self, *, force: bool) -> None:
+        """Make the present edge a node of the free surface, where the next is far enough."""
+        x = self.contact_radius_m
+        if force or self._outside[-1][0] - x >= self._spacing:
+            u = self.depth_m - x * x / self._radius
+            self._outside.append((x, self._time, self._free.state([u - v for v in self._edge])))
+
+    def _update_force(self) -> float:
+        stress, a = 0.0, self.contact_radius_m
+        if self._touching:
+            stress = self._einf * a * (self.depth_m - a * a / (3 * self._radius))
+            for modulus, total in zip(self._moduli, self._sum, strict=True):
+                stress += modulus * total
+            if stress < 0 and self._pull == 0:
+                stress = 0.0  # rounding of the profile when hardly anything touches
+        self.force_n = self._scale * stress
+        return self.force_n
+
+
+class SprungIndenter:
+    """An indenter at the end of the beam: static stiffness and first mode between base and tip.
+
+    One mass on a spring, ``m x'' = k (b - x) + c (b' - x') - F(x)``, x the depth of the tip, b that
+    which it would have with the beam straight. Each sub-step is the exact motion for the tangent
+    of F and a base at constant speed.
+
+    Parameters
+    ----------
+    indenter : Indenter
+    stiffness_n_per_m, mass_kg, damping_ns_per_m : float
+        k, m, c.
+
+    Attributes
+    ----------
+    indenter : Indenter
+    tip_depth_m : float
+        x [m].
+    force_n : float
+        At the base, along the outward normal [N]; the inertia of the beam beyond that of its
+        first mode is left out.
+    """
+
+    def __init__(
+        self,
+        indenter: Indenter,
+        *,
+        stiffness_n_per_m: float,
+        mass_kg: float,
+        damping_ns_per_m: float,
+    ) -> None:
+        k, m, c = stiffness_n_per_m, mass_kg, damping_ns_per_m
+        require(0 < k < np.inf, "stiffness_n_per_m", k, "a number above 0")
+        require(0 < m < np.inf, "mass_kg", m, "a number above 0")
+        good = 0 <= c < 2 * sqrt(k * m)
+        require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
+        self.indenter = indenter
+        self._stiffness, self._mass, self._damping = k, m, c
+        self.reset()
+
+    @classmethod
+    def on_beam(cls, indenter: Indenter, modes: BeamModes) -> SprungIndenter:
+        """Return the tip of a bimorph: ``k = 3 EI / L^3``, frequency and damping of mode 1."""
+        stiffness, natural = modes.static_stiffness_n_per_m, float(modes.natural_rad_s[0])
+        mass = stiffness / natural**2
+        return cls(
+            indenter,
+            stiffness_n_per_m=stiffness,
+            mass_kg=mass,
+            damping_ns_per_m=2 * modes.damping_ratio * natural * mass,
+        )
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue; the next step begins at rest, with the beam straight."""
+        self.indenter.reset()
+        self.force_n = 0.0
+        self.tip_depth_m = -np.inf
+        self._speed = 0.0
+        self._base: float | None = None
+
+    def step(self, base_depth_m: float, dt_s: float) -> float:
+        """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""
+        if not dt_s > 0:
+            require(False, "dt_s", dt_s, "a number above 0")
+        base = self._base
+        if base is None:
+            base = self.tip_depth_m = base_depth_m
+        count = ceil(dt_s / SUBSTEP_S - 1e-9)
+        interval, rate = dt_s / count, (base_depth_m - base) / dt_s
+        for n in range(count):
+            self._substep(base + n * interval * rate, rate, interval)
+        self._base = base_depth_m
+        self.force_n = self._stiffness * (base_depth_m - self.tip_depth_m) + self._damping * (
+            rate - self._speed
+        )
+        return self.force_n
+
+    def _substep(self, base: float, rate: float, h: float) -> None:
+        k, c, m = self._stiffness, self._damping, self._mass
+        held, tangent = self.indenter.tangent(h)
+        whole = k + tangent
+        # motion of equilibrium: offset + drift t
+        drift = k * rate / whole
+        offset = k * base + c * (rate - drift) - held + tangent * self.tip_depth_m
+        offset /= whole
+        y, dy = self.tip_depth_m - offset, self._speed - drift
+        half = c / (2 * m)
+        omega = sqrt(whole / m - half * half)
+        fall, turn, lift = exp(-half * h), cos(omega * h), sin(omega * h) / omega
+        self.tip_depth_m = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
+        self._speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
+        self.indenter.step(self.tip_depth_m, h)
+
+
+def _segment(x0: float, x1: float, v0: Values, v1: Values) -> Values:
+    """Return ``integral v dx`` from x0 to x1 for every v linear in x^2 between its ends."""
+    width = x1 - x0
+    # mean of (x^2 - x0^2) / (x1^2 - x0^2) over the way
+    share = (x1 + 2 * x0) / (3 * (x1 + x0)) if x1 > 0 else 0.0
+    return [width * (a + share * (b - a)) for a, b in zip(v0, v1, strict=True)]

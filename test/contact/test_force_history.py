@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The force of a block and its stated uncertainty against known noise."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tactile_resonance.contact.force_history import ForceHistory
+
+STEP_NS = 2_000_000
+
+
+def filled(forces):
+    history = ForceHistory()
+    for k, force in enumerate(forces):
+        history.add(k * STEP_NS, force)
+    return history
+
+
+def test_only_the_time_of_the_block_counts():
+    forces = np.concatenate([np.zeros(100), np.full(100, 0.01), np.full(100, 5.0)])
+    assert filled(forces).mean(100 * STEP_NS, 199 * STEP_NS) == (pytest.approx(0.01), 0.0)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.8])
+def test_stated_uncertainty_is_that_of_the_mean_of_correlated_noise(pole):
+    rng = np.random.default_rng(1)
+    errors, stated = [], []
+    for _ in range(400):
+        noise = lfilter([1 - pole], [1, -pole], 1e-3 * rng.standard_normal(400))[200:]
+        mean, std = filled(0.01 + noise).mean(0, 10**12)
+        errors.append(mean - 0.01)
+        stated.append(std)
+    # the variance of a ratio of 400 runs is known to sqrt(2/400) = 7 %; three of them, both ways,
+    # and the batches of strongly correlated noise are a little short
+    assert np.mean(np.square(stated)) / np.var(errors) == pytest.approx(1.0, abs=0.25)
+
+
+def test_what_was_not_heard_is_unknown():
+    assert np.isnan(ForceHistory().mean(0, 10**9)).all()
+    assert np.isnan(filled([0.01] * 5).mean(10**12, 2 * 10**12)).all()
+    mean, std = filled([0.01] * 5).mean(0, 10**9)
+    assert mean == pytest.approx(0.01)
+    assert np.isnan(std)
+
+
+def test_a_clock_set_back_forgets_what_was_before():
+    history = filled([0.5] * 10)
+    history.add(0, 0.01)
+    assert history.newest() == (0, 0.01)
+    assert history.mean(0, 10**12)[0] == pytest.approx(0.01)
