@@ -56,7 +56,7 @@ def test_the_cell_is_read(tmp_path, monkeypatch, capsys):
             share_path("config/force/can_simulated.yaml").read_text(encoding="utf-8")
         )
         content["bus"].update(host=HOST, port=bus.port)
-        content["limits"]["silent_s"] = 0.25
+        content["limits"]["silent_s"] = 1.0
         Path("mine.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
         exec(compile(block_with("cell.read()"), str(PAGE), "exec"), {})
     finally:
