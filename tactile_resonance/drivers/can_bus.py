@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import threading
 from typing import Any
@@ -33,6 +34,8 @@ def open_bus(settings: dict[str, Any], where: str) -> can.BusABC:
         `LINK_LOST`.
     """
     if settings["interface"] == "socketcand":
+        # a message in two pieces is no fault, but python-can warns of each
+        logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)
         # python-can would try for ten seconds, without a pause
         address = (settings.get("host"), settings.get("port"))
         try:

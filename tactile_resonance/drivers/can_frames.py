@@ -165,14 +165,14 @@ class Assembler:
 
 
 def read_can_description(path: Path) -> CanDescription:
-    """Read a description; a bare name is one of ``config/force/frames``.
+    """Read a description; a bare name that is no file here is one of ``config/force/frames``.
 
     Raises
     ------
     ValueError
         Names the field, its value, and what is accepted.
     """
-    if not path.is_absolute() and len(path.parts) == 1:
+    if len(path.parts) == 1 and not path.is_file():
         path = share_path(Path("config/force/frames") / path)
     content = read_yaml(path)
     try:

@@ -116,7 +116,7 @@ class CanWrench:
             return samples
         if self._thread is None:
             raise ForceError(ForceFault.LINK_LOST, f"{self._where}: not started")
-        if time.monotonic() - self._alive_s > READER_HUNG_S:
+        if time.monotonic() - self._alive_s > self._config.limits.silent_s + READER_HUNG_S:
             raise ForceError(ForceFault.LINK_LOST, f"{self._where}: the interface hangs")
         return []
 
@@ -222,12 +222,13 @@ class CanWrench:
         assert bus is not None
         request = self._can.description.request
         period_s = 1 / self._config.info.rate_hz
-        wait_s = silent_s / 2 if request is None else min(silent_s / 2, period_s)
+        longest_s = silent_s if request is None else period_s
         last_s = due_s = time.monotonic()
         flow = Flow(self._config.info.rate_hz, last_s)
         try:
             while not self._ended.is_set():
-                message = bus.recv(wait_s)
+                left_s = last_s + silent_s - time.monotonic()
+                message = bus.recv(min(longest_s, max(0.0, left_s) + 1e-4))
                 now_s = self._alive_s = time.monotonic()
                 if request is not None and now_s >= due_s:
                     due_s = max(due_s + period_s, now_s)
@@ -259,9 +260,9 @@ class CanWrench:
         text = f"{self._where}: silent for {since_s * 1e3:.0f} ms"
         if stop is not None:
             try:
-                for _ in range(2):
-                    self._send(bus, stop.data)
-                    time.sleep(0.002)
+                self._send(bus, stop.data)
+                time.sleep(0.001)
+                self._send(bus, stop.data)
             except (can.CanError, OSError) as error:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)

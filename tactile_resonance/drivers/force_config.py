@@ -94,7 +94,7 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     Parameters
     ----------
     path : Path
-        A bare name is one of ``config/force``.
+        A bare name that is no file here is one of ``config/force``.
     force_n : float or None
         Contact force that will be asked of it [N]; None: not known yet.
 
@@ -104,7 +104,7 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
         Names the field, its value, and what is accepted; or says with which figures the source cannot
         control this force.
     """
-    if not path.is_absolute() and len(path.parts) == 1:
+    if len(path.parts) == 1 and not path.is_file():
         path = share_path(Path("config/force") / path)
     content = read_yaml(path)
     try:

@@ -23,7 +23,7 @@ can = pytest.importorskip("can", reason="python-can is not installed")
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
 
 HOST = "127.0.6.2"
-PATIENCE_S = 10.0
+PATIENCE_S = 30.0
 
 
 class CellProcess:
@@ -64,7 +64,7 @@ def cell():
 def config_for(port, **changes):
     """The shipped configuration; slower to call the cell silent, since tests share their machine."""
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-    config = replace(config, limits=replace(config.limits, silent_s=0.25))
+    config = replace(config, limits=replace(config.limits, silent_s=1.0))
     bus = {**config.can.bus, "host": HOST, "port": port}
     return replace(config, can=replace(config.can, bus=bus, **changes))
 

@@ -35,7 +35,7 @@ class Talk:
     def __init__(self, bus):
         self.bus = bus
         self.socket = socket.create_connection((HOST, bus.port))
-        self.socket.settimeout(0.05)
+        self.socket.settimeout(0.02)
         self.frames = []
 
     def hear(self):

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Python in docs/force_sensors.md does what the page says."""
+
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.payload import Payload
+from tactile_resonance.simulation.cell_loop import CellLoop
+from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.transducer import CellParameters
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "force_sensors.md"
+HOST = "127.0.6.6"
+
+
+def block_with(word):
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    (found,) = [block for block in blocks if word in block]
+    return found
+
+
+def test_the_payload_is_found(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    turns = [[0, 0, 0], [0.9, 0, 0], [-0.9, 0, 0], [0, 0.9, 0], [0, -0.9, 0]]
+    rotations = Rotation.from_rotvec(turns).as_matrix()
+    payload = Payload(0.06, np.array([0.0, 0.004, 0.03]))
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((5, 1000, 6)) * np.repeat([1e-3, 5e-5], 3)
+    readings = payload.wrench(rotations)[:, None] + [0.02, 0, 0.03, 0, 0, 0] + noise
+    np.savez("payload.npz", rotations=rotations, readings=readings)
+    exec(compile(block_with("identify_payload"), str(PAGE), "exec"), {})
+    text = capsys.readouterr().out
+    mass, error = map(float, re.search(r"mass (\S+) \+- (\S+) g", text).groups())
+    assert abs(mass - 60) < 5 * error < 0.1
+    assert "consistent: True" in text
+
+
+def test_the_cell_is_read(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("can", reason="python-can is not installed")
+    monkeypatch.chdir(tmp_path)
+    bus = SocketcandServer(HOST, 0)
+    loop = CellLoop(LoadCell(CellParameters.from_yaml()), bus, lambda _: np.zeros(6))
+    ended = threading.Event()
+    thread = threading.Thread(target=loop.run, args=(ended.is_set,))
+    thread.start()
+    try:
+        content = yaml.safe_load(
+            share_path("config/force/can_simulated.yaml").read_text(encoding="utf-8")
+        )
+        content["bus"].update(host=HOST, port=bus.port)
+        content["limits"]["silent_s"] = 1.0
+        Path("mine.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+        exec(compile(block_with("cell.read()"), str(PAGE), "exec"), {})
+    finally:
+        ended.set()
+        thread.join()
+        bus.close()
+    lines = re.findall(r"^\d{19} \[", capsys.readouterr().out, re.MULTILINE)
+    assert len(lines) > 500
