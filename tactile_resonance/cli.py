@@ -37,14 +37,14 @@ def _parser() -> OneLineParser:
     # give. Before numpy is imported, which reads it once.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from tactile_resonance.commands import analyze, benchmark, demo, figures
+    from tactile_resonance.commands import analyze, benchmark, demo, figures, report
 
     parser = OneLineParser(
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze, figures, benchmark):
+    for command in (demo, analyze, report, figures, benchmark):
         command.add_parser(commands)
     return parser
 
