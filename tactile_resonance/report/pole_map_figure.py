@@ -59,7 +59,7 @@ def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float
     scale = pole_map.ellipse_scale(probability)
     lines = pole_map.ellipses(scale, probability)[..., :2] * MM  # (e, segments, 2, 2)
     above.add_collection(
-        LineCollection(lines.reshape(-1, 2, 2), colors="black", linewidths=0.9, zorder=4)
+        LineCollection(list(lines.reshape(-1, 2, 2)), colors="black", linewidths=0.9, zorder=4)
     )
     _draw_failures(above, pole_map)
     _label(
