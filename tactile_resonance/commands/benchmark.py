@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-NAMES = ("frf", "poles")
+NAMES = ("frf", "poles", "recording")
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
