@@ -43,6 +43,7 @@ def _parser() -> OneLineParser:
         check_robot,
         demo,
         figures,
+        report,
         simulate_cell,
         simulate_ur,
     )
@@ -52,7 +53,10 @@ def _parser() -> OneLineParser:
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (demo, analyze, figures, benchmark, simulate_ur, simulate_cell, check_robot):
+    for command in (
+        *(demo, analyze, report, figures, benchmark),
+        *(simulate_ur, simulate_cell, check_robot),
+    ):
         command.add_parser(commands)
     return parser
 

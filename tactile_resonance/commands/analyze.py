@@ -21,7 +21,8 @@ from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
-from tactile_resonance.recording.store_recording import read_store_recording
+from tactile_resonance.recording.recording import Recording
+from tactile_resonance.recording.store_recording import read_store_recording, recording_of
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -32,7 +33,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Estimate the frequency response of a periodic record and the poles of one band of it.",
     )
     parser.add_argument(
-        "record", type=Path, help=".npz, .mat or .csv file, or a folder of records of the nodes"
+        "record", type=Path, help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run"
     )
     parser.add_argument(
         "--measurement", type=int, metavar="ID", help="which one of a folder with several"
@@ -104,6 +105,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run)
 
 
+def _read_folder(options: argparse.Namespace) -> Recording:
+    """One measurement of a store of records, or of a scan's run."""
+    if not (options.record / "run.json").is_file():
+        return read_store_recording(options.record, options.measurement, options.periods)
+    try:
+        from tactile_resonance.scan.recorded import read_recorded
+    except ImportError as error:
+        raise ValueError(f"analyze: {error.name} not found; pip install rosbags") from error
+    measurement = read_recorded(options.record, options.measurement)
+    return recording_of(measurement, options.periods)
+
+
 def parse_segments(text: str) -> list[tuple[int, int]]:
     """'0:10,20:30' as [(0, 10), (20, 30)]."""
     try:
@@ -124,7 +137,7 @@ def run(options: argparse.Namespace) -> int:
         for name in ("sample_rate", "samples_per_period", "segments"):
             if getattr(options, name) is not None:
                 raise ValueError(f"{name}: not for a folder of records, which say it themselves")
-        recording = read_store_recording(options.record, options.measurement, options.periods)
+        recording = _read_folder(options)
     else:
         if options.measurement is not None:
             raise ValueError("measurement: only for a folder of records")

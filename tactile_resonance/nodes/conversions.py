@@ -9,8 +9,6 @@ times slower.
 from __future__ import annotations
 
 import array
-from enum import Enum
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,25 +20,22 @@ from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.multisine import Excitation, Grid
-from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
-from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Contact, Origin, Record
+from tactile_resonance.recording.from_messages import (
+    BETWEEN_SAMPLES,
+    GRIDS,
+    INPUT_KINDS,
+    array_of,
+    contact_from_message,  # noqa: F401 - for those who convert both ways
+    excitation_from_message,  # noqa: F401 - for those who convert both ways
+    key_of,
+    origin_from_message,
+    record_from_message,  # noqa: F401 - for those who convert both ways
+    time_from_message,  # noqa: F401 - for those who convert both ways
+)
 from tactile_resonance.simulation.truth import Truth
 
-GRIDS = {
-    Grid.CUSTOM: msg.Excitation.GRID_CUSTOM,
-    Grid.FULL: msg.Excitation.GRID_FULL,
-    Grid.ODD: msg.Excitation.GRID_ODD,
-    Grid.ODD_RANDOM: msg.Excitation.GRID_ODD_RANDOM,
-}
-INPUT_KINDS = {
-    InputKind.MEASURED: msg.Record.INPUT_MEASURED,
-    InputKind.COMMANDED: msg.Record.INPUT_COMMANDED,
-}
-BETWEEN_SAMPLES = {
-    BetweenSamples.BAND_LIMITED: msg.Record.BAND_LIMITED,
-    BetweenSamples.ZERO_ORDER_HOLD: msg.Record.ZERO_ORDER_HOLD,
-}
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 POLES_STATUS = {status: getattr(msg.Poles, f"STATUS_{status.name}") for status in PolesStatus}
 
@@ -50,8 +45,6 @@ FRF_ARRAYS = (
     *("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"),
     *COVARIANCE_ARRAYS,
 )
-
-E = TypeVar("E", bound=Enum)
 
 
 def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -> msg.Excitation:
@@ -78,32 +71,6 @@ def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -
     return message
 
 
-def excitation_from_message(message: msg.Excitation) -> Excitation:
-    """Excitation of a message.
-
-    Raises
-    ------
-    ValueError
-        If its fields contradict each other.
-    """
-    return Excitation(
-        harmonics=_view(message.harmonics),
-        amplitude_v=_view(message.amplitude_v),
-        phase_rad=_view(message.phase_rad),
-        sample_rate_hz=message.sample_rate_hz,
-        samples_per_period=message.samples_per_period,
-        periods=message.periods,
-        realisation=message.realisation,
-        realisations=message.realisations,
-        grid=_key(GRIDS, message.grid, "grid"),
-        seed=message.seed,
-        random_phases=message.random_phases,
-        measurement_id=message.measurement_id,
-        excitation_id=message.excitation_id,
-        label=message.label,
-    )
-
-
 def record_to_message(record: Record) -> msg.Record:
     """Message of a record."""
     message = msg.Record(
@@ -127,42 +94,6 @@ def record_to_message(record: Record) -> msg.Record:
             _fill(getattr(message, f"{name}_v"), channel.samples, float)
     _write_origin(message, record.origin)
     return message
-
-
-def record_from_message(message: msg.Record) -> Record:
-    """Record of a message; its samples are views of the message's memory."""
-    if not MIN_RATE_HZ <= message.sample_rate_hz <= MAX_RATE_HZ:
-        raise ValueError(
-            f"sample_rate_hz: {message.sample_rate_hz:g}, expected {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz"
-        )
-    channels = []
-    for name in ("actuator", "sensor"):
-        counts = _view(getattr(message, f"{name}_counts"))
-        volts = _view(getattr(message, f"{name}_v"))
-        if (counts.size > 0) == (volts.size > 0):
-            raise ValueError(
-                f"{name}: {counts.size} counts and {volts.size} voltages, expected one of the two"
-            )
-        saturated = getattr(message, f"{name}_saturated")
-        if counts.size:
-            scale_v = getattr(message, f"{name}_scale_v")
-            offset_v = getattr(message, f"{name}_offset_v")
-            channels.append(Channel(counts, scale_v, offset_v, saturated))
-        else:
-            channels.append(Channel(volts, saturated=saturated))
-    return Record(
-        actuator=channels[0],
-        sensor=channels[1],
-        sample_rate_hz=message.sample_rate_hz,
-        samples_per_period=message.samples_per_period,
-        realisation=message.realisation,
-        block_index=message.block_index,
-        input_kind=_key(INPUT_KINDS, message.input_kind, "input_kind"),
-        between_samples=_key(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
-        channel_delay_s=message.channel_delay_s,
-        anti_alias_filter=message.anti_alias_filter,
-        origin=origin_from_message(message),
-    )
 
 
 def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
@@ -215,12 +146,12 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         cross = _complex(message, "covariance_")
         covariance = np.array(
             [
-                [_view(message.sensor_variance), cross],
-                [cross.conj(), _view(message.actuator_variance)],
+                [array_of(message.sensor_variance), cross],
+                [cross.conj(), array_of(message.actuator_variance)],
             ]
         )
     frf = FRF(
-        frequency_hz=_view(message.frequency_hz),
+        frequency_hz=array_of(message.frequency_hz),
         g=_complex(message, ""),
         variance_noise=_optional(message.variance_noise),
         variance_total=_optional(message.variance_total),
@@ -232,7 +163,7 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         periods=message.periods,
         realisations=message.realisations,
         method=message.method,
-        status=_key(FRF_STATUS, message.status, "status"),
+        status=key_of(FRF_STATUS, message.status, "status"),
         message=message.message,
     )
     return frf, origin_from_message(message)
@@ -269,20 +200,20 @@ def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
 
 def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
     """Poles of a message, and what they belong to; the fitted model itself does not travel."""
-    real = _view(message.real_rad_s)
+    real = array_of(message.real_rad_s)
     n = real.size
 
     def blocks(values: array.array) -> npt.NDArray[np.float64] | None:
-        return _view(values).reshape(n, 2, 2) if len(values) else None
+        return array_of(values).reshape(n, 2, 2) if len(values) else None
 
     structure = ModelStructure()
     if message.order:
         structure = ModelStructure(message.order, message.numerator_order)
     poles = Poles(
-        poles_rad_s=real + 1j * _view(message.imag_rad_s),
-        f0_hz=_view(message.f0_hz),
-        damping_ratio=_view(message.damping_ratio),
-        residues=_view(message.residue_real) + 1j * _view(message.residue_imag),
+        poles_rad_s=real + 1j * array_of(message.imag_rad_s),
+        f0_hz=array_of(message.f0_hz),
+        damping_ratio=array_of(message.damping_ratio),
+        residues=array_of(message.residue_real) + 1j * array_of(message.residue_imag),
         covariance=blocks(message.covariance),
         total_covariance=blocks(message.total_covariance),
         structure=structure,
@@ -292,7 +223,7 @@ def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
         expected_cost=message.expected_cost,
         condition_number=message.condition_number,
         method=message.method,
-        status=_key(POLES_STATUS, message.status, "status"),
+        status=key_of(POLES_STATUS, message.status, "status"),
         message=message.message,
     )
     return poles, origin_from_message(message)
@@ -326,11 +257,6 @@ def time_message(time_ns: int) -> Time:
     return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
 
 
-def time_from_message(stamp: Time) -> int:
-    """Stamp as UNIX time [ns]."""
-    return stamp.sec * 10**9 + stamp.nanosec
-
-
 def pose_to_message(contact: Contact) -> PoseStamped:
     """Tip pose; an empty frame where the position is unknown."""
     message = PoseStamped()
@@ -342,21 +268,6 @@ def pose_to_message(contact: Contact) -> PoseStamped:
     point.x, point.y, point.z = contact.position_m
     turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
     return message
-
-
-def contact_from_message(message: PoseStamped, force_n: float, force_std_n: float) -> Contact:
-    """Contact of a tip pose and a force."""
-    if not message.header.frame_id:
-        return Contact(force_n, force_std_n)
-    point, turn = message.pose.position, message.pose.orientation
-    return Contact(
-        force_n,
-        force_std_n,
-        (point.x, point.y, point.z),
-        (turn.x, turn.y, turn.z, turn.w),
-        message.header.frame_id,
-        time_from_message(message.header.stamp),
-    )
 
 
 def _write_bins(message: msg.FRF, bins: BandBins) -> None:
@@ -380,7 +291,7 @@ def _bins(message: msg.FRF) -> BandBins | None:
         message.bins_first,
         _complex(message, "bins_actuator_"),
         _complex(message, "bins_sensor_"),
-        _view(message.bins_harmonics).astype(np.int64),
+        array_of(message.bins_harmonics).astype(np.int64),
         message.bins_sample_rate_hz,
         message.bins_samples_per_period,
         message.bins_periods,
@@ -397,22 +308,6 @@ def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> 
     message.contact_force_std_n = float(origin.contact.force_std_n)
 
 
-def origin_from_message(message: msg.Record | msg.FRF | msg.Poles) -> Origin:
-    """What a record, FRF or poles belong to."""
-    return Origin(
-        measurement_id=message.measurement_id,
-        excitation_id=message.excitation_id,
-        time_ns=time_from_message(message.header.stamp),
-        final=message.final,
-        frame_id=message.header.frame_id,
-        label=message.label,
-        simulated=message.simulated,
-        contact=contact_from_message(
-            message.tip_pose, message.contact_force_n, message.contact_force_std_n
-        ),
-    )
-
-
 def _fill(target: array.array, values: npt.NDArray, dtype: npt.DTypeLike) -> None:
     target.frombytes(np.ascontiguousarray(values, dtype).ravel().view(np.uint8))
 
@@ -422,21 +317,10 @@ def _fill_complex(message: object, prefix: str, values: npt.NDArray[np.complex12
     _fill(getattr(message, f"{prefix}imag"), values.imag, float)
 
 
-def _view(values: array.array) -> npt.NDArray:
-    return np.frombuffer(values, dtype=values.typecode)
-
-
 def _optional(values: array.array) -> npt.NDArray[np.float64] | None:
-    return _view(values) if len(values) else None
+    return array_of(values) if len(values) else None
 
 
 def _complex(message: object, prefix: str) -> npt.NDArray[np.complex128]:
-    real = _view(getattr(message, f"{prefix}real"))
-    return real + 1j * _view(getattr(message, f"{prefix}imag"))
-
-
-def _key(table: dict[E, int], value: int, name: str) -> E:
-    for key, number in table.items():
-        if number == value:
-            return key
-    raise ValueError(f"{name}: {value}, accepted are {sorted(table.values())}")
+    real = array_of(getattr(message, f"{prefix}real"))
+    return real + 1j * array_of(getattr(message, f"{prefix}imag"))

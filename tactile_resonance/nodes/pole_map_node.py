@@ -21,7 +21,7 @@ from tactile_resonance.nodes.pole_map_messages import (
     marker_message,
     surface_message,
 )
-from tactile_resonance.nodes.running import LATCHED, RESULTS, run_node
+from tactile_resonance.nodes.running import LATCHED, POLES, run_node
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, map_point
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.references import read_classes
@@ -82,6 +82,10 @@ class PoleMapNode(ManagedNode):
     subscribed, at the latest when somebody does.
     """
 
+    # diagnostics ask for them from the beginning
+    _map = PoleMap()
+    _left_out = 0
+
     def __init__(self) -> None:
         super().__init__("pole_map_node", PARAMETERS)
 
@@ -99,7 +103,9 @@ class PoleMapNode(ManagedNode):
             name: self.publish_on(kind, f"pole_map{name}", LATCHED) for name, kind in kinds.items()
         }
         self._old: set[str] = set()  # outputs that show less than is known
-        self.listen(msg.Poles, "poles", self._on_poles, RESULTS)
+        # heard from the configuration on: what came before comes right after it, and only then
+        subscription = self.create_subscription(msg.Poles, "poles", self._on_poles, POLES)
+        self.resources.callback(self.destroy_subscription, subscription)
         self.serve(Trigger, "pole_map/clear", self._on_clear)
         self.every(PUBLISH_PERIOD_S, self._publish)
 
@@ -112,6 +118,7 @@ class PoleMapNode(ManagedNode):
         }
 
     def _on_poles(self, message: msg.Poles) -> None:
+        self.health.saw("poles")
         try:
             poles, origin = poles_from_message(message)
             (level,) = values(self, "unknown_level")

@@ -15,7 +15,7 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import RESULTS, run_node
+from tactile_resonance.nodes.running import POLES, RESULTS, run_node
 
 PARAMETERS = (
     Parameter("band_low_hz", 200.0, "Lower end of the band of the fit [Hz].", 0.0, 1e6),
@@ -47,7 +47,7 @@ class PolesNode(ManagedNode):
 
     def configure(self) -> None:
         """Topics in and out."""
-        self._publisher = self.publish_on(msg.Poles, "poles", RESULTS)
+        self._publisher = self.publish_on(msg.Poles, "poles", POLES)
         self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 
     def _on_frf(self, message: msg.FRF) -> None:

@@ -41,6 +41,13 @@ EXCITATIONS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+# Poles: small, and a map that is started or restarted in mid-scan gets those it missed.
+POLES = QoSProfile(
+    depth=1024,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 # Poses and wrenches: the newest counts.
 STREAM = QoSProfile(
     depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT

@@ -174,7 +174,7 @@ def read_measurement(entry: StoredEntry) -> StoredMeasurement:
         entry.measurement_id,
         tuple(excitations),
         tuple(records),
-        tuple(_gaps(excitations, records)),
+        tuple(gaps_of(excitations, records)),
         tuple(problems),
     )
 
@@ -197,7 +197,7 @@ def _check_name(path: Path, found: tuple[int, ...], named: tuple[int, ...]) -> N
         raise ValueError(f"{path.name}: holds what belongs to {found}, its name says {named}")
 
 
-def _gaps(excitations: list[Excitation], records: list[Record]) -> list[tuple[int, int]]:
+def gaps_of(excitations: list[Excitation], records: list[Record]) -> list[tuple[int, int]]:
     """(realisation, block) of what is missing before the last record."""
     if not records:
         return []

@@ -47,7 +47,17 @@ def read_store_recording(
     OSError
         If the folder cannot be listed.
     """
-    measurement = read_measurement(_choose(folder, measurement_id))
+    return recording_of(read_measurement(_choose(folder, measurement_id)), periods)
+
+
+def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> Recording:
+    """A measurement that was read, as `read_store_recording` gives it.
+
+    Raises
+    ------
+    ValueError
+        If no realisation is complete.
+    """
     key = measurement.measurement_id
     if not measurement.excitations:
         raise ValueError(f"measurement {key}: holds no readable excitation {measurement.problems}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -209,19 +209,34 @@ def read_content(path: Path) -> FileContent:
 
 
 def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
-    """(time [ns], type, CDR) of each message of a topic of one file or of a whole bag, in order.
+    """(time [ns], topic, CDR) of each message of a topic of one file or of a whole bag, in order.
 
     Raises
     ------
     ValueError
         If the file is damaged.
     """
+    return _read(path, lambda connection: connection.topic == topic)
+
+
+def read_messages_of_type(path: Path, type_name: str) -> Iterator[tuple[int, str, bytes]]:
+    """(time [ns], topic, CDR) of each message of a type, under whatever namespace, in order.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    return _read(path, lambda connection: connection.msgtype == type_name)
+
+
+def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[int, str, bytes]]:
     try:
         with Reader(path) as reader:
-            wanted = [connection for connection in reader.connections if connection.topic == topic]
-            if wanted:
-                for connection, time_ns, cdr in reader.messages(connections=wanted):
-                    yield time_ns, connection.msgtype, bytes(cdr)
+            connections = [connection for connection in reader.connections if wanted(connection)]
+            if connections:
+                for connection, time_ns, cdr in reader.messages(connections=connections):
+                    yield time_ns, connection.topic, bytes(cdr)
     except _DAMAGE as error:
         raise _damaged(path, error) from error
 

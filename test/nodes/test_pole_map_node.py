@@ -21,7 +21,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.pole_map_node import PoleMapNode
-from tactile_resonance.nodes.running import LATCHED, RESULTS
+from tactile_resonance.nodes.running import LATCHED, POLES
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
@@ -55,7 +55,7 @@ class Bench:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.map_node)
         self.executor.add_node(self.user)
-        self.publisher = self.user.create_publisher(msg.Poles, "poles", RESULTS)
+        self.publisher = self.user.create_publisher(msg.Poles, "poles", POLES)
         self.map_node.trigger_configure()
         self.map_node.trigger_activate()
         self.until(lambda: self.publisher.get_subscription_count() == 1)
@@ -125,6 +125,16 @@ def test_a_late_reader_gets_the_whole_map(bench):
     assert set(rows["tissue_class"]) == {255}
     wanted = "x y z f0_hz damping_ratio f0_std_hz damping_std force_n tissue_class tissue_probability status"
     assert set(wanted.split()) == {f.name for f in cloud.fields}
+
+
+def test_a_map_that_is_started_anew_gets_what_it_missed(bench):
+    bench.send(*[poles(k, 0.004 * k, 250.0 + k) for k in range(1, 5)])
+    bench.map_node.trigger_deactivate()
+    bench.map_node.trigger_cleanup()
+    bench.map_node.trigger_configure()
+    bench.until(lambda: len(bench.map_node._map.points) == 4)
+    bench.map_node.trigger_activate()
+    assert bench.read(PointCloud2, "pole_map")[0].width == 4
 
 
 def test_what_is_new_replaces_what_was_there(bench):

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance report`: page and picture of a run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tactile_resonance.analysis import write_whole
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "report",
+        help="page and picture of a scan's run",
+        description="Write report.html, which needs nothing else, and pole_map.png into the folder of a run; "
+        "of a run that is going on, too.",
+    )
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the run, draw, write both files whole."""
+    # only here: the command answers --help without the library for recordings
+    try:
+        from tactile_resonance.scan.run_content import read_run
+    except ImportError as error:
+        raise ValueError(f"report: {error.name} not found; pip install rosbags") from error
+    from tactile_resonance.report.drawing import figure_bytes
+    from tactile_resonance.report.pole_map_figure import draw_pole_map
+    from tactile_resonance.report.run_report import as_page, pole_map_of, skipped_lines, summary
+
+    content = read_run(options.run_folder)
+    pole_map = pole_map_of(content)
+    picture = None
+    if pole_map.points:
+        title = f"Pole map, {options.run_folder.resolve().name}"
+        picture = figure_bytes(draw_pole_map(pole_map, title), ".png")
+        write_whole(options.run_folder / "pole_map.png", picture)
+    write_whole(options.run_folder / "report.html", as_page(content, picture).encode())
+    for line in (*summary(content), *(f"left out: {line}" for line in skipped_lines(content))):
+        print(line)
+    for problem in content.problems:
+        print(f"damaged: {problem}")
+    print(f"page and picture in {options.run_folder}")
+    return 0

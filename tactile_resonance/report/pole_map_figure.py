@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pole map as a figure: what rviz shows, for people without it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+
+from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
+from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
+from tactile_resonance.scan.pole_map import MapSurface, PoleMap
+
+COLOURS = LinearSegmentedColormap.from_list(
+    "pole_map", [np.array(LOW_RGB) / 255, np.array(HIGH_RGB) / 255]
+)
+MM = 1e3
+_MARKS = "osD^vP*X"
+
+
+def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float = 0.95) -> Figure:
+    """Map of f0 with ellipses and failures, its uncertainty between the points, and the poles.
+
+    Parameters
+    ----------
+    pole_map : PoleMap
+        With one point or more.
+    """
+    if not pole_map.points:
+        raise ValueError("pole_map: got no points; accepted is one or more")
+    figure = new_figure(16, 6.2)
+    figure.suptitle(title + (f" ({SIMULATED})" if pole_map.simulated else ""))
+    above, unsure, plane = figure.subplots(1, 3, width_ratios=(1.1, 1.1, 1))
+    if not pole_map.estimated:
+        _draw_failures(above, pole_map)
+        _label(above, "no point has a pole")
+        for axes in (unsure, plane):
+            axes.set_axis_off()
+        return figure
+    f0 = pole_map.f0_hz
+    colour = Normalize(f0.min(), f0.max() if np.ptp(f0) else f0.min() + 1)
+    surface = pole_map.surface(80)
+    if surface is not None:
+        _draw_surface(above, surface, surface.f0_hz, colour)
+    where = np.array([point.position_m for point in pole_map.estimated]) * MM
+    dots = above.scatter(
+        *where.T[:2],
+        c=f0,
+        cmap=COLOURS,
+        norm=colour,
+        s=60,
+        edgecolors="white",
+        linewidths=0.8,
+        zorder=3,
+    )
+    figure.colorbar(dots, ax=above, label="natural frequency f0 [Hz]", shrink=0.9)
+    scale = pole_map.ellipse_scale(probability)
+    lines = pole_map.ellipses(scale, probability)[..., :2] * MM  # (e, segments, 2, 2)
+    above.add_collection(
+        LineCollection(list(lines.reshape(-1, 2, 2)), colors="black", linewidths=0.9, zorder=4)
+    )
+    _draw_failures(above, pole_map)
+    _label(
+        above,
+        f"f0 and {100 * probability:g} % ellipses: 1 mm along x = {1e-3 / scale.m_per_hz:.2g} Hz of f0,\n"
+        f"along y = {1e-3 / scale.m_per_damping:.2g} of the damping ratio",
+    )
+    if surface is None:
+        unsure.set_axis_off()
+    else:
+        shown = _draw_surface(unsure, surface, surface.f0_std_hz, None)
+        figure.colorbar(shown, ax=unsure, label="standard deviation of f0 [Hz]", shrink=0.9)
+        unsure.plot(*where.T[:2], ".", color="white", ms=4)
+        _label(unsure, "uncertainty of f0 between the points")
+        unsure.set(xlim=above.get_xlim(), ylim=above.get_ylim())
+    _draw_plane(plane, pole_map, probability)
+    return figure
+
+
+def _draw_surface(
+    axes: Axes, surface: MapSurface, values: np.ndarray, colour: Normalize | None
+) -> QuadMesh:
+    x, y = surface.position_m[0, :, 0] * MM, surface.position_m[:, 0, 1] * MM
+    cmap = "viridis" if colour is None else COLOURS
+    return axes.pcolormesh(x, y, values, cmap=cmap, norm=colour, shading="nearest", rasterized=True)
+
+
+def _draw_failures(axes: Axes, pole_map: PoleMap) -> None:
+    if pole_map.failures:
+        where = np.array([point.position_m for point in pole_map.failures]) * MM
+        axes.plot(*where.T[:2], "x", color="red", ms=9, mew=2, label="failed", zorder=5)
+        axes.legend(loc="upper right")
+
+
+def _draw_plane(axes: Axes, pole_map: PoleMap, probability: float) -> None:
+    """Poles by tissue class."""
+    groups = pole_map.classes() or ("",)
+    for k, name in enumerate(groups):
+        points = [p for p in pole_map.estimated if p.tissue_class == name]
+        x = np.array([p.estimate for p in points])
+        axes.plot(*x.T, _MARKS[k % len(_MARKS)], color=f"C{k}", ms=4, label=name or "poles")
+        for p in points:
+            if np.all(np.isfinite(p.covariance)):
+                draw_ellipse(axes, p.estimate, p.covariance, probability, color=f"C{k}", lw=0.8)
+    axes.set(xlabel="f0 [Hz]", ylabel="damping ratio")
+    axes.set_title(f"poles with {100 * probability:g} % ellipses", fontsize="medium")
+    axes.ticklabel_format(useOffset=False)
+    axes.legend(loc="upper left")
+
+
+def _label(axes: Axes, title: str) -> None:
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    axes.set_title(title, fontsize="medium")

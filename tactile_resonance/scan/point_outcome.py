@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what happened at a point to its result."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.record import Origin
+from tactile_resonance.scan.decision import Decision
+from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.pole_map import map_point
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import ScanScene
+
+
+def measured_result(
+    point: ScanPoint,
+    attempt: int,
+    scene: ScanScene,
+    poles: Poles,
+    origin: Origin,
+    decision: Decision,
+    *,
+    time_ns: int,
+    duration_s: float,
+    notes: str = "",
+) -> PointResult:
+    """Result of a point that was measured; `FAILED` where there is no pole.
+
+    Parameters
+    ----------
+    origin : Origin
+        Of the poles; its contact must tell where the tip was.
+    decision : Decision
+        That ended the measurement.
+    time_ns : int
+        When the point was finished (UNIX time) [ns].
+    duration_s : float
+        From the move to the point until the tip was free again [s].
+    """
+    found = map_point(poles, origin, scene.tissue_classes)
+    pole = complex("nan+nanj")
+    for candidate, f0_hz in zip(poles.poles_rad_s, poles.f0_hz, strict=True):
+        if f0_hz == found.estimate[0]:
+            pole = complex(candidate)
+    std = found.std
+    blank = unmeasured_result(
+        point,
+        attempt,
+        scene,
+        Outcome.FAILED if found.failed else Outcome.DONE,
+        poles.message,
+        time_ns=time_ns,
+        duration_s=duration_s,
+        notes=notes,
+    )
+    return replace(
+        blank,
+        force_n=origin.contact.force_n,
+        force_std_n=origin.contact.force_std_n,
+        f0_hz=float(found.estimate[0]),
+        f0_std_hz=float(std[0]),
+        damping_ratio=float(found.estimate[1]),
+        damping_ratio_std=float(std[1]),
+        f0_damping_covariance_hz=float(found.covariance[0, 1]),
+        pole_real_rad_s=pole.real,
+        pole_imag_rad_s=pole.imag,
+        cost=float(poles.cost),
+        expected_cost=float(poles.expected_cost),
+        poles_status=poles.status.value,
+        tissue_class=found.tissue_class,
+        tissue_probability=found.tissue_probability,
+        blocks=decision.blocks,
+        blocks_saved=decision.blocks_saved,
+        verdict=decision.verdict.value,
+        saved_s=decision.saved_s,
+        measurement_id=origin.measurement_id,
+        simulated=origin.simulated,
+    )
+
+
+def unmeasured_result(
+    point: ScanPoint,
+    attempt: int,
+    scene: ScanScene,
+    outcome: Outcome,
+    reason: str,
+    *,
+    time_ns: int,
+    duration_s: float,
+    notes: str = "",
+) -> PointResult:
+    """Result of a point that failed before it had poles, or was skipped."""
+    x_m, y_m, z_m = point.position_m
+    normal_x, normal_y, normal_z = point.normal
+    return PointResult(
+        point.index,
+        attempt,
+        point.label,
+        outcome,
+        reason,
+        *(x_m, y_m, z_m, normal_x, normal_y, normal_z),
+        duration_s=duration_s,
+        notes=notes,
+        time_ns=time_ns,
+        frame_id=scene.frame_id,
+    )

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Excitations and records out of a run's recording, bit by bit what the nodes sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Record
+from tactile_resonance.recording.from_messages import excitation_from_message, record_from_message
+from tactile_resonance.recording.store import StoredMeasurement, gaps_of
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.run_content import RECORDING, read_run
+
+EXCITATION = "tactile_resonance/msg/Excitation"
+RECORD = "tactile_resonance/msg/Record"
+_MOST_LISTED = 20
+
+
+def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasurement:
+    """One measurement of a run, ready for `recording_of` or to be played again.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of a run.
+    measurement_id : int, optional
+        Column of ``results.csv``; not needed where there is only one.
+
+    Raises
+    ------
+    ValueError
+        If it is no run, or the measurement is not told or not there.
+    """
+    content = read_run(run)
+    keys = {r.measurement_id: r for r in content.results if r.measurement_id}
+    ids = ", ".join(str(key) for key in list(keys)[:_MOST_LISTED])
+    if len(keys) > _MOST_LISTED:
+        ids += f" and {len(keys) - _MOST_LISTED} more"
+    if measurement_id is None and len(keys) == 1:
+        measurement_id = next(iter(keys))
+    if measurement_id is None:
+        raise ValueError(f"measurement_id: not told which, {run} holds {ids or 'none'}")
+    if measurement_id not in keys:
+        raise ValueError(f"measurement_id: {measurement_id}, {run} holds {ids or 'none'}")
+    result = keys[measurement_id]
+    path = Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"
+    for measurement in measurements_of_file(path):
+        if measurement.measurement_id == measurement_id:
+            return measurement
+    raise ValueError(f"measurement_id: {measurement_id}, {path.name} has no record of it")
+
+
+def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
+    """Every measurement of one file of a recording, in the order of its first message.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    store = message_types()
+    excitations: dict[int, dict[int, Excitation]] = {}
+    records: dict[int, dict[tuple[int, int], Record]] = {}
+    problems: dict[int, list[str]] = {}
+    for _, _, cdr in read_messages_of_type(path, EXCITATION):
+        excitation = excitation_from_message(store.deserialize_cdr(cdr, EXCITATION))
+        excitations.setdefault(excitation.measurement_id, {})[excitation.realisation] = excitation
+    for _, _, cdr in read_messages_of_type(path, RECORD):
+        message: Any = store.deserialize_cdr(cdr, RECORD)
+        key = int(message.measurement_id)
+        try:
+            record = record_from_message(message)
+        except ValueError as error:
+            problems.setdefault(key, []).append(f"{path.name}: {error}")
+            continue
+        place = (record.realisation, record.block_index)
+        records.setdefault(key, {})[place] = record
+    for key in dict.fromkeys([*excitations, *records, *problems]):
+        played = [excitations[key][m] for m in sorted(excitations.get(key, {}))]
+        taken = [records[key][place] for place in sorted(records.get(key, {}))]
+        yield StoredMeasurement(
+            key,
+            tuple(played),
+            tuple(taken),
+            tuple(gaps_of(played, taken)),
+            tuple(problems.get(key, [])),
+        )

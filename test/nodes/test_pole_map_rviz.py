@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rviz view asks for what the node offers, in the colours of the legend."""
+
+import pytest
+import yaml
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
+from tactile_resonance.scan.scene import read_scan_scene
+
+
+@pytest.fixture
+def view():
+    return yaml.safe_load(share_path("config/pole_map.rviz").read_text())["Visualization Manager"]
+
+
+def test_topics_and_their_quality_are_those_of_the_node(view):
+    topics = {
+        d["Topic"]["Value"]: (d["Class"].split("/")[1], d["Topic"])
+        for d in view["Displays"]
+        if "Topic" in d
+    }
+    assert {topic: kind for topic, (kind, _) in topics.items()} == {
+        "/pole_map": "PointCloud2",
+        "/pole_map/markers": "MarkerArray",
+        "/pole_map/legend": "MarkerArray",
+        "/pole_map/surface": "PointCloud2",
+    }
+    for _, topic in topics.values():
+        assert topic["Durability Policy"] == "Transient Local"
+        assert topic["Reliability Policy"] == "Reliable"
+
+
+def test_clouds_are_coloured_by_f0_as_the_legend_is(view):
+    clouds = [d for d in view["Displays"] if d["Class"].endswith("PointCloud2")]
+    for cloud in clouds:
+        assert cloud["Channel Name"] == "f0_hz"
+        assert cloud["Color Transformer"] == "Intensity"
+        assert cloud["Use rainbow"] is False
+        assert cloud["Autocompute Intensity Bounds"] is True
+        assert cloud["Min Color"] == "; ".join(map(str, LOW_RGB))
+        assert cloud["Max Color"] == "; ".join(map(str, HIGH_RGB))
+
+
+def test_the_fixed_frame_is_that_of_the_scene(view):
+    scene = read_scan_scene(share_path("config/scenes/inclusion_scan.yaml"))
+    assert view["Global Options"]["Fixed Frame"] == scene.frame_id
