@@ -117,6 +117,10 @@ def identify_batch(
     if variance is not None and selected.dof > 0 and bool(np.all((variance > 0) | ~usable)):
         gain = np.where(usable, np.abs(g) ** 2, 0.0)
         known = model_variance(np.where(usable, variance, np.nan), selected.dof, gain)
+        if frf.variance_total is None and frf.periods > 1:
+            # noise is from bins between lines: neighbours share them where periods are few
+            bins = (frf.periods - 1) * frf.realisations
+            known = replace(known, independent_dof=min(selected.dof, bins))
         weights = known.variance
     else:
         count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)

@@ -38,17 +38,22 @@ class VarianceModel:
         Complex degrees of freedom of the variance of each line.
     kind : (batch,) int
         Index into `KINDS`.
+    independent_dof : float or None
+        Degrees of freedom that a line adds to the pool; `dof` where absent. Fewer where lines share
+        the bins between them that their variances are from.
     """
 
     variance: FloatArray
     lines: npt.NDArray[np.int64]
     dof: int
     kind: npt.NDArray[np.int64]
+    independent_dof: float | None = None
 
     @property
     def pooled_dof(self) -> FloatArray:
         """(batch,) of the whole curve; equals `dof` for ``per line``."""
-        return np.where(self.kind == 2, 1, self.lines) * float(self.dof)
+        each = self.dof if self.independent_dof is None else self.independent_dof
+        return np.where(self.kind == 2, float(self.dof), self.lines * float(each))
 
     @property
     def information_correction(self) -> FloatArray:
