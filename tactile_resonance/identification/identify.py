@@ -30,6 +30,9 @@ from tactile_resonance.identification.result import (
 )
 from tactile_resonance.identification.structure import ModelStructure
 
+# Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
+FEWEST_BINS = 16
+
 
 def identify_poles(
     frf: FRF, band_hz: tuple[float, float] | None = None, structure: ModelStructure | None = None
@@ -67,7 +70,23 @@ def identify_poles(
         notes.append(f"{left_out} lines without a finite response left out")
     if frf.status is not FrfStatus.OK or frf.variance_noise is None:
         notes.append(frf.message)
+    notes.append(_light_damping(frf, batch))
     return single(batch, notes=notes)
+
+
+def _light_damping(frf: FRF, batch: PolesBatch) -> str:
+    """Where the transient of a mode is too narrow for the local polynomials that removed it."""
+    if "local polynomial" not in frf.method or frf.periods < 2 or frf.frequency_hz.size < 2:
+        return ""
+    bin_hz = float(np.diff(frf.frequency_hz).min()) / frf.periods
+    half_width = batch.damping_ratio * batch.f0_hz / bin_hz
+    if not np.any(half_width < FEWEST_BINS):
+        return ""
+    return (
+        f"half the width of the mode is {np.nanmin(half_width):.1f} bins, less than {FEWEST_BINS}: "
+        "unless the record began settled, what the local polynomial method leaves of the transient "
+        "biases the poles"
+    )
 
 
 def identify_batch(
@@ -98,6 +117,10 @@ def identify_batch(
     if variance is not None and selected.dof > 0 and bool(np.all((variance > 0) | ~usable)):
         gain = np.where(usable, np.abs(g) ** 2, 0.0)
         known = model_variance(np.where(usable, variance, np.nan), selected.dof, gain)
+        if frf.variance_total is None and frf.periods > 1:
+            # noise is from bins between lines: neighbours share them where periods are few
+            bins = (frf.periods - 1) * frf.realisations
+            known = replace(known, independent_dof=min(selected.dof, bins))
         weights = known.variance
     else:
         count = np.maximum(usable.sum(axis=-1, keepdims=True), 1)

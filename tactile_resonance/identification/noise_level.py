@@ -38,17 +38,22 @@ class VarianceModel:
         Complex degrees of freedom of the variance of each line.
     kind : (batch,) int
         Index into `KINDS`.
+    independent_dof : float or None
+        Degrees of freedom that a line adds to the pool; `dof` where absent. Fewer where lines share
+        the bins between them that their variances are from.
     """
 
     variance: FloatArray
     lines: npt.NDArray[np.int64]
     dof: int
     kind: npt.NDArray[np.int64]
+    independent_dof: float | None = None
 
     @property
     def pooled_dof(self) -> FloatArray:
         """(batch,) of the whole curve; equals `dof` for ``per line``."""
-        return np.where(self.kind == 2, 1, self.lines) * float(self.dof)
+        each = self.dof if self.independent_dof is None else self.independent_dof
+        return np.where(self.kind == 2, float(self.dof), self.lines * float(each))
 
     @property
     def information_correction(self) -> FloatArray:
@@ -141,9 +146,9 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
             spread = np.log(mean[:, 0]) - log_mean
         else:
             model = _two_channels(known, gain, usable)
-            ratio = np.where(usable, known / model, 0.0)
-            spread = np.log(ratio.sum(axis=-1) / count) - log_mean
-            spread += np.where(usable, np.log(model), 0.0).sum(axis=-1) / count
+            ratio = known / model  # 0 where a line is left out
+            log_model = np.log(model) if whole else np.where(usable, np.log(model), 0.0)
+            spread = np.log(ratio.sum(axis=-1) / count) - log_mean + log_model.sum(axis=-1) / count
         unequal = spread > _bartlett_limit(lines, dof, 1 if gain is None else 2)
     if unequal.any():
         model = model.copy()
@@ -188,23 +193,29 @@ def _two_channels(
     Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
     variable is proportional to its squared mean.
     """
-    scale = variance.sum(axis=-1, keepdims=True) / np.maximum(usable.sum(axis=-1)[:, None], 1)
-    level = np.where(usable, gain, 0.0)
+    lines = np.maximum(usable.sum(axis=-1), 1)
+    whole = bool(usable.all())
+    scale = variance.sum(axis=-1, keepdims=True) / lines[:, None]
+    level = gain if whole else np.where(usable, gain, 0.0)
     level = level / np.maximum(level.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
     sample = variance / scale
-    model = np.ones_like(sample)
+    weight = usable.astype(float)
     for _ in range(REWEIGHTINGS):
-        weight = np.where(usable, model**-2, 0.0)
         by_level = weight * level
-        s0, s1, s2 = weight.sum(-1), by_level.sum(-1), np.einsum("bf,bf->b", by_level, level)
-        t0 = np.einsum("bf,bf->b", weight, sample)
-        t1 = np.einsum("bf,bf->b", by_level, sample)
+        s0, s1 = weight.sum(axis=-1), by_level.sum(axis=-1)
+        s2, t0, t1 = (
+            np.einsum("bf,bf->b", first, second)
+            for first, second in ((by_level, level), (weight, sample), (by_level, sample))
+        )
         determinant = s0 * s2 - s1**2
         b = np.where(determinant > 1e-9 * s0 * s2, (s0 * t1 - s1 * t0) / determinant, 0.0)
         a = (t0 - b * s1) / s0
         b = np.where(b < 0, 0.0, np.where(a < 0, t1 / s2, b))
         a = np.maximum((t0 - b * s1) / s0, 0.0)
         model = np.maximum(a[:, None] + b[:, None] * level, LEAST_VARIANCE)
+        weight = 1 / model**2
+        if not whole:
+            weight[~usable] = 0.0
     return model * scale
 
 

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,3 +115,13 @@ def test_ratio_variance_is_the_first_order_propagation():
     ratio = (mean[0] + errors[0]) / (mean[1] + errors[1]) - mean[0] / mean[1]
     stated = ratio_variance(mean, (root @ root.conj().T)[..., None])
     assert np.mean(np.abs(ratio) ** 2) == pytest.approx(stated[0], rel=4 / np.sqrt(200_000))
+
+
+@pytest.mark.parametrize(("periods", "said"), [(2, True), (8, False)])
+@pytest.mark.parametrize("method", ["fast local polynomial method, order 2", "mean of 7 of 8"])
+def test_a_transient_too_narrow_for_local_polynomials_is_said(periods, said, method):
+    """Half the width is 7.5 Hz: 6 bins of two periods, 24 of eight."""
+    rng = np.random.default_rng(1)
+    frf = replace(noisy(rng, 1e-4, 6, LINES_HZ), periods=periods, method=method)
+    message = identify_poles(frf, structure=BARE).message
+    assert ("half the width of the mode is 6.0 bins" in message) == (said and "local" in method)

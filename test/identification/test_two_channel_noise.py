@@ -5,9 +5,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.poles import MARGIN_HZ, local_polynomial_spectra
+from benchmarks.poles_plant import BAND_HZ, Plant
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.noise_level import model_variance
+from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
 LINES_HZ = np.arange(200.0, 300.1, 2.5)
@@ -71,3 +75,21 @@ def test_other_shapes_are_still_seen():
     ]
     assert np.all(kinds[0] == 1)
     assert np.all(kinds[1] == 2)
+
+
+def test_two_periods_raise_no_more_alarms_than_stated():
+    """Lines share the bins between them: ten of a pattern, but one new one a line."""
+    plant, runs = Plant(0.1, 20.0, 2), 1000
+    wide = plant.bins(BAND_HZ[0] - MARGIN_HZ, BAND_HZ[1] + MARGIN_HZ)
+    u, y = plant.noisy(np.random.default_rng(3), runs, wide)
+    lines_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
+    frf = FRF(
+        lines_hz,
+        spectra[:, 0] / spectra[:, 1],
+        variance_noise=ratio_variance(spectra, covariance),
+        noise_dof=dof,
+        periods=2,
+    )
+    result = identify_batch(frf, structure=ModelStructure(2, 2))
+    alarms = result.has_status(PolesStatus.MODEL_ERROR).sum()
+    assert stats.binom.sf(alarms - 1, runs, 3e-3) > 0.0005
