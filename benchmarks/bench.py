@@ -73,7 +73,7 @@ def run(output: Path, quick: bool) -> str:
         Few repetitions: shows that everything works, figures are rough.
     """
     setup = Setup()
-    timing = measure_timing(setup, 3 if quick else 15)
+    timing = measure_timing(setup, 3 if quick else 12)
     linear, spectra, errors = measure_accuracy(setup, 2 if quick else 12)
     text = _report(timing, linear, errors)
     output.mkdir(parents=True, exist_ok=True)
@@ -134,7 +134,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
     for repetition in range(repetitions + 1):
         for name, (task, _) in tasks.items():
             slow = name.startswith(("scipy", "nonlinear"))
-            if name.startswith("scipy") and repetition > 2:
+            if name.startswith("scipy") and repetition > 4:
                 continue
             reference = _best(transform, 4)
             least = min(least, reference)
