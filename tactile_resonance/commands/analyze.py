@@ -33,7 +33,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Estimate the frequency response of a periodic record and the poles of one band of it.",
     )
     parser.add_argument(
-        "record", type=Path, help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run"
+        "record",
+        type=Path,
+        help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run",
     )
     parser.add_argument(
         "--measurement", type=int, metavar="ID", help="which one of a folder with several"

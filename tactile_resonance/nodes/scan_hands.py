@@ -40,6 +40,8 @@ POLL_S = 0.005
 # A node that was started anew needs so long at most until it takes goals again.
 NODE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
+# A measurement that is cancelled ends with its block.
+GOAL_ENDS_WITHIN_S = 15.0
 RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
 PLACE_FOR_S = 0.2
@@ -132,19 +134,22 @@ class NodeHands:
             seen: list[msg.Poles] = []
             stopping = [False]
 
-            def each_poll() -> None:
+            def take_poles() -> None:
                 for message in self._new_poles():
                     seen.append(message)
                     if enough(poles_from_message(message)[0], len(seen)) and not stopping[0]:
                         stopping[0] = True
                         handle.cancel_goal_async()
+
+            def each_poll() -> None:
+                take_poles()
                 self._check_contact()
 
             result = self._follow(self._measure, handle, "excitation_node", check, each_poll)
             if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
                 raise PointFailed(f"measurement: {result.message}")
             self._wait_for_results(result, check)
-            seen += self._new_poles()
+            take_poles()
         finally:
             self._recorder.record_into(None)
         mine = [m for m in seen if m.measurement_id == result.measurement_id]
@@ -259,7 +264,7 @@ class NodeHands:
         except (PointFailed, Interrupted):
             if client.server_is_ready():
                 handle.cancel_goal_async()
-                self._done(future, 5.0)
+                self._done(future, GOAL_ENDS_WITHIN_S)
             raise
         return future.result().result
 
