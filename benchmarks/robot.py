@@ -203,8 +203,8 @@ def _simulated_robot(priority: int) -> Iterator[subprocess.Popen]:
     )
     try:
         assert robot.stdout is not None
-        ready, _, _ = select.select([robot.stdout], [], [], 30)
-        line = robot.stdout.readline() if ready else "no answer within 30 s"
+        ready, _, _ = select.select([robot.stdout], [], [], 60)
+        line = robot.stdout.readline() if ready else "no answer within 60 s"
         if "ready at" not in line:
             raise ValueError(f"benchmark robot: the simulated robot does not start: {line.strip()}")
         yield robot
