@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `UrArm` and its client process share: one page of memory, and names of faults.
 
-The client writes its newest state, the owner a sign of life; neither waits for the other. A state that
-was read while it was written is told by its checksum.
+The client writes its newest state, the owner a sign of life; neither waits for the other. States go to two
+places in turn: where the client is stopped or killed in the middle of one, told by its checksum, the state
+before it is still whole.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import zlib
 from dataclasses import astuple, dataclass, fields
 
 SIZE = mmap.PAGESIZE
-_STATE_AT, _HEARTBEAT_AT = 0, SIZE - 8
+_PLACES, _HEARTBEAT_AT = (0, SIZE // 2), SIZE - 8
 _STATE = struct.Struct("<qdq18d4i2?2Q2d")
 _CHECKSUM = struct.Struct("<I")
 _HEARTBEAT = struct.Struct("<q")
@@ -80,6 +81,7 @@ class Exchange:
 
     def __init__(self, descriptor: int) -> None:
         self._page = mmap.mmap(descriptor, SIZE)
+        self._next = 0
 
     def write(self, state: ClientState) -> None:
         """Client: hand out a state."""
@@ -87,19 +89,27 @@ class Exchange:
         for value in astuple(state):
             flat.extend(value) if isinstance(value, tuple) else flat.append(value)
         data = _STATE.pack(*flat)
-        self._page[_STATE_AT : _STATE_AT + len(data) + 4] = data + _CHECKSUM.pack(zlib.crc32(data))
+        at = _PLACES[self._next]
+        self._next = 1 - self._next
+        self._page[at : at + len(data) + 4] = data + _CHECKSUM.pack(zlib.crc32(data))
 
     def read(self) -> ClientState | None:
-        """Owner: the newest state; None before the first."""
-        for _ in range(100):
-            block = self._page[_STATE_AT : _STATE_AT + _STATE.size + 4]
-            data = block[: _STATE.size]
-            if _CHECKSUM.unpack(block[_STATE.size :])[0] == zlib.crc32(data):
-                v = _STATE.unpack(data)
-                return ClientState(*v[:3], v[3:9], v[9:15], v[15:21], *v[21:])
-            if not any(block):
-                return None
-        raise RuntimeError("robot client: its memory is never in order")
+        """Owner: the newest whole state; None before the first."""
+        # the client may overwrite one place while the other is read: look again then
+        for _ in range(3):
+            found = [state for at in _PLACES if (state := self._at(at)) is not None]
+            if found:
+                return max(found, key=lambda state: state.received_ns)
+        return None
+
+    def _at(self, at: int) -> ClientState | None:
+        block = self._page[at : at + _STATE.size + 4]
+        data = block[: _STATE.size]
+        # the checksum of nothing but zeros is not zero
+        if _CHECKSUM.unpack(block[_STATE.size :])[0] != zlib.crc32(data):
+            return None
+        v = _STATE.unpack(data)
+        return ClientState(*v[:3], v[3:9], v[9:15], v[15:21], *v[21:])
 
     def beat(self) -> None:
         """Owner: be alive."""

@@ -150,7 +150,8 @@ class StateReader:
     def lose(self) -> None:
         """Hand out that the link is lost."""
         if self._newest is not None:
-            self._hand_out(replace(self._newest, connected=False))
+            now_ns = time.monotonic_ns()
+            self._hand_out(replace(self._newest, connected=False, received_ns=now_ns))
 
     def _hand_out(self, state: ClientState) -> None:
         with self._lock:

@@ -56,8 +56,8 @@ class Robot:
         )
 
     def wait(self):
-        ready, _, _ = select.select([self.process.stdout], [], [], 30)
-        assert ready, "the simulated robot says nothing for 30 s"
+        ready, _, _ = select.select([self.process.stdout], [], [], 60)
+        assert ready, "the simulated robot says nothing for 60 s"
         line = self.process.stdout.readline()
         assert "ready at" in line, line
 

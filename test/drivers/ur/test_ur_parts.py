@@ -2,6 +2,7 @@
 """Parts of the arm's driver that need no robot: its page of memory, its configuration, its fault names."""
 
 import dataclasses
+import struct
 import tempfile
 import threading
 
@@ -45,6 +46,19 @@ def test_sign_of_life_ages(exchanges):
     owner.beat()
     first = client.silence_s()
     assert 0 <= first <= client.silence_s()
+
+
+def test_a_client_killed_while_it_writes_leaves_the_state_before(exchanges):
+    client, owner = exchanges
+    states = [dataclasses.replace(STATE, received_ns=n, done=n) for n in (1, 2, 3)]
+    for state in states:
+        client.write(state)
+    page = client._page
+    at = page.find(struct.pack("<qd", 3, STATE.robot_time_s))
+    page[at + 40 : at + 48] = b"unfinish"
+    assert owner.read() == states[1]
+    client.write(states[2])  # elsewhere: nothing newer is whole, but this is
+    assert owner.read() == states[2]
 
 
 def test_no_state_is_ever_read_half_written(exchanges):
