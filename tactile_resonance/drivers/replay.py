@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,6 +25,28 @@ from tactile_resonance.recording.store import (
 )
 
 
+class SourceEntry(Protocol):
+    """One measurement that can be read."""
+
+    @property
+    def measurement_id(self) -> int:
+        """Its id."""
+        ...
+
+
+class MeasurementSource(Protocol):
+    """Measurements in the order in which they were taken."""
+
+    @property
+    def entries(self) -> Sequence[SourceEntry]:
+        """All of them."""
+        ...
+
+    def read(self, entry: Any) -> StoredMeasurement:
+        """One of `entries`; ValueError where it is damaged."""
+        ...
+
+
 class ReplayDevice:
     """Plays back what was recorded, whatever it is asked for; keeps `AcquisitionDevice`.
 
@@ -36,6 +59,8 @@ class ReplayDevice:
         and delay stay unknown, and its blocks carry the time of the replay.
     speed : float
         Signal time over real time; 0: as fast as possible.
+    source : MeasurementSource, optional
+        Where the measurements are where `path` is neither: the run of a scan, for example.
 
     Raises
     ------
@@ -45,7 +70,9 @@ class ReplayDevice:
         If it cannot be opened.
     """
 
-    def __init__(self, path: Path, speed: float = 1.0) -> None:
+    def __init__(
+        self, path: Path, speed: float = 1.0, source: MeasurementSource | None = None
+    ) -> None:
         if not speed >= 0:
             raise ValueError(f"speed: {speed}, expected 0 (as fast as possible) or above")
         self._path = path
@@ -61,7 +88,13 @@ class ReplayDevice:
         self._index = 0
         self._stopped = threading.Event()
         self._closed = False
-        if path.is_dir():
+        self._read: Callable[[Any], StoredMeasurement] = read_measurement
+        self._entries: Sequence[SourceEntry] = ()
+        if source is not None:
+            self._entries, self._read = source.entries, source.read
+            if not self._entries:
+                raise ValueError(f"{path}: no measurement in it, expected a run with one")
+        elif path.is_dir():
             self._entries, problems = list_measurements(path)
             if not self._entries:
                 raise ValueError(
@@ -195,7 +228,7 @@ class ReplayDevice:
                 if entry.measurement_id == measurement_id:
                     # out of turn: the turn of the others stays what it is
                     self._next_after = self._next
-                    measurement = read_measurement(entry)
+                    measurement = self._read(entry)
                     if measurement.records:
                         return measurement
                     raise DeviceError(
@@ -204,7 +237,7 @@ class ReplayDevice:
                     )
             raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
         for position in range(self._next, len(self._entries)):
-            measurement = read_measurement(self._entries[position])
+            measurement = self._read(self._entries[position])
             if measurement.records:
                 self._next_after = position + 1
                 return measurement

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from tactile_resonance.drivers.acquisition import AcquisitionDevice
 from tactile_resonance.drivers.nidaq import NiDaqDevice
 from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.replay import ReplayDevice
+from tactile_resonance.drivers.replay import MeasurementSource, ReplayDevice
 from tactile_resonance.nodes.bench_device import BenchDevice
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.recording.store import RecordStore
@@ -72,10 +72,24 @@ def make_device(node: Node) -> AcquisitionDevice:
         raise ValueError(f"device_config: empty, expected a path for the device {device}")
     path = Path(config).expanduser().absolute()
     if device == "replay":
-        return ReplayDevice(path, speed)
+        return ReplayDevice(path, speed, _source_of(path))
     if device == "nidaqmx":
         return NiDaqDevice(read_nidaq_config(path))
     raise ValueError(f"device: {device!r}, accepted are bench, replay, nidaqmx")
+
+
+def _source_of(path: Path) -> MeasurementSource | None:
+    """The measurements of a scan's run; None for what the device reads by itself."""
+    if not (path / "run.json").is_file():
+        return None
+    try:
+        # only here: everything else works without the library for recordings
+        from tactile_resonance.scan.recorded import RunSource
+    except ImportError as error:
+        raise ValueError(
+            f"device: replay of a run: {error.name} not found; pip install rosbags"
+        ) from error
+    return RunSource(path)
 
 
 def open_store(

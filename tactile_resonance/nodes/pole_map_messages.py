@@ -122,7 +122,9 @@ def legend_message(
     for share in (0.0, 0.5, 1.0):
         write(f"{f0.min() + share * np.ptp(f0):.2f} Hz", 0.17, share)
     write("natural frequency f0", 0.12, 1.09)
-    write(legend_text(pole_map, scale, probability, names), 0.12, -0.25)
+    text = legend_text(pole_map, scale, probability, names)
+    # a text hangs about its middle
+    write(text, 0.12, -0.06 - 0.03 * (text.count("\n") + 1))
     return MarkerArray(markers=markers)
 
 

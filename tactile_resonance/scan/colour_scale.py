@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The colours of a map: the same in rviz, its legend and the figure.
 
-rviz mixes two colours linearly over the range of a field; these two, dark blue and yellow, grow steadily
+rviz mixes two colours linearly over the range of a field; these two, blue and yellow, grow steadily
 lighter on the way, also for those who do not tell red from green.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-LOW_RGB = (36, 30, 130)
+LOW_RGB = (64, 105, 255)
 HIGH_RGB = (255, 210, 50)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from tactile_resonance.recording.from_messages import excitation_from_message, r
 from tactile_resonance.recording.store import StoredMeasurement, gaps_of
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import RECORDING, read_run
 
 EXCITATION = "tactile_resonance/msg/Excitation"
@@ -35,23 +37,63 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     ValueError
         If it is no run, or the measurement is not told or not there.
     """
-    content = read_run(run)
-    keys = {r.measurement_id: r for r in content.results if r.measurement_id}
-    ids = ", ".join(str(key) for key in list(keys)[:_MOST_LISTED])
-    if len(keys) > _MOST_LISTED:
-        ids += f" and {len(keys) - _MOST_LISTED} more"
-    if measurement_id is None and len(keys) == 1:
-        measurement_id = next(iter(keys))
+    source = RunSource(run)
+    by_id = {entry.measurement_id: entry for entry in source.entries}
+    ids = ", ".join(str(key) for key in list(by_id)[:_MOST_LISTED])
+    if len(by_id) > _MOST_LISTED:
+        ids += f" and {len(by_id) - _MOST_LISTED} more"
+    if measurement_id is None and len(by_id) == 1:
+        measurement_id = next(iter(by_id))
     if measurement_id is None:
         raise ValueError(f"measurement_id: not told which, {run} holds {ids or 'none'}")
-    if measurement_id not in keys:
+    if measurement_id not in by_id:
         raise ValueError(f"measurement_id: {measurement_id}, {run} holds {ids or 'none'}")
-    result = keys[measurement_id]
-    path = Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"
-    for measurement in measurements_of_file(path):
-        if measurement.measurement_id == measurement_id:
-            return measurement
-    raise ValueError(f"measurement_id: {measurement_id}, {path.name} has no record of it")
+    return source.read(by_id[measurement_id])
+
+
+@dataclass(frozen=True)
+class RecordedEntry:
+    """One measurement of a run: its id and file."""
+
+    measurement_id: int
+    path: Path
+
+
+class RunSource:
+    """The measurements of a run, by point and attempt, for a device that plays them again.
+
+    Parameters
+    ----------
+    run : Path
+
+    Raises
+    ------
+    ValueError
+        If it is no run.
+    """
+
+    def __init__(self, run: Path) -> None:
+        content = read_run(run)
+        self.entries = [
+            RecordedEntry(result.measurement_id, _file_of(run, result))
+            for result in content.results
+            if result.measurement_id
+        ]
+
+    def read(self, entry: RecordedEntry) -> StoredMeasurement:
+        """One of `entries`.
+
+        Raises
+        ------
+        ValueError
+            If its file is damaged or holds no record of it.
+        """
+        for measurement in measurements_of_file(entry.path):
+            if measurement.measurement_id == entry.measurement_id:
+                return measurement
+        raise ValueError(
+            f"measurement_id: {entry.measurement_id}, {entry.path.name} has no record of it"
+        )
 
 
 def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
@@ -89,3 +131,7 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
             tuple(gaps_of(played, taken)),
             tuple(problems.get(key, [])),
         )
+
+
+def _file_of(run: Path, result: PointResult) -> Path:
+    return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"

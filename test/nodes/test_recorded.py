@@ -3,6 +3,7 @@
 
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -10,12 +11,17 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+import rclpy
 from rclpy.serialization import serialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.cli import main
+from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.multisine import Grid, design_multisine
 from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
+from tactile_resonance.nodes.devices import PARAMETERS, make_device
+from tactile_resonance.nodes.parameters import declare
+from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording import from_messages
 from tactile_resonance.recording.store_recording import recording_of
@@ -103,6 +109,32 @@ def test_excitation_and_records_come_back_bit_by_bit(run):
         assert len(back.records) == 3
         assert all(same(a, b) for a, b in zip(back.records, records, strict=True))
         assert back.gaps == back.problems == ()
+
+
+def test_a_replay_plays_the_run_again_bit_by_bit(run):
+    given = {"device": "replay", "device_config": run, "replay_speed": 0.0}
+    arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
+    with rclpy.init(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
+        node = rclpy.create_node("replay_test")
+        declare(node, PARAMETERS)
+        device = make_device(node)
+        node.destroy_node()
+    for key in (11, 12):
+        excitation, records = measurement(key)
+        (planned,) = device.plan([design_multisine(label="asked for")])
+        assert planned.measurement_id == key
+        device.configure(planned.sample_rate_hz)
+        device.arm(planned)
+        device.play()
+        blocks = [device.read_block(1.0) for _ in range(planned.periods)]
+        device.stop()
+        assert same(planned.phase_rad, excitation.phase_rad)
+        for block, record in zip(blocks, records, strict=True):
+            assert same(block.actuator, record.actuator)
+            assert same(block.sensor, record.sensor)
+            assert same(block.contact, record.origin.contact)
+    with pytest.raises(DeviceError, match="recording is over: all 2 measurements"):
+        device.plan([design_multisine()])
 
 
 def test_analyze_reads_a_run(run, tmp_path, capsys):
