@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.envelope import Envelope, Place
 from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
-from tactile_resonance.contact.law import Aim, HoldMode, force_speed, place_speed
+from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
-from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
 
 FloatArray = NDArray[np.float64]
 
@@ -51,53 +51,8 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 """After these the tip is not drawn back by itself: the arm moves again only when told to."""
 
 
-class State(str, Enum):
-    """Where in its life a contact is."""
-
-    IDLE = "idle"
-    TRAVEL = "travel"
-    TARE = "tare"
-    APPROACH = "approach"
-    CONTACT = "contact"
-    SETTLE = "settle"
-    HOLD = "hold"
-    RETRACT = "retract"
-    FAULT = "fault"
-
-
 TOUCHING = (State.CONTACT, State.SETTLE, State.HOLD)
 TARED = (State.APPROACH, *TOUCHING)
-
-
-@dataclass(frozen=True)
-class ContactGoal:
-    """What is asked for.
-
-    Attributes
-    ----------
-    touch : Pose
-        Of the frame `tip` in the base where the ball just touches the expected surface, +z out of
-        the tissue (see `geometry.touch_pose`).
-    aim : Aim
-    """
-
-    touch: Pose
-    aim: Aim
-
-
-@dataclass(frozen=True)
-class Command:
-    """What the arm is told: a twist (6,) in the base and its acceleration limit, or to stop.
-
-    Attributes
-    ----------
-    twist : (6,) array or None
-        None: stop.
-    acceleration_m_s2 : float
-    """
-
-    twist: FloatArray | None
-    acceleration_m_s2: float
 
 
 class ContactController:
