@@ -8,6 +8,7 @@ Over tip radius, modulus, relaxation time, height and tilt of the surface, with 
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,10 @@ def _report(outcomes: dict[str, list[Outcome]], series: np.ndarray, count: int) 
         for what, goal, value, unit in found:
             verdict = "met" if value <= goal else "missed"
             rows.append(f"| {name}: {what} | {goal:g} {unit} | {value:.2f} {unit} | {verdict} |")
+    causes = Counter(
+        f"{name}: {o.cause}" for name in outcomes for o in outcomes[name] if o.cause != "none"
+    )
+    rows += ["", *(f"Failed, {cause} ({count})." for cause, count in causes.items())]
     stated = np.array([o.stated_error for name in outcomes for o in outcomes[name]])
     stated = stated[~np.isnan(stated)]
     std = np.array([o.stated_std for o in outcomes[REFERENCE.name]])
@@ -189,7 +194,8 @@ def _draw(
     )
     for place, (label, value, scale, goal) in zip(axes.flat[:3], parts, strict=True):
         for row, name in enumerate(names):
-            values = np.array([scale * value(o) for o in outcomes[name]])
+            made = [o for o in outcomes[name] if np.isfinite(o.ready_s)]
+            values = np.array([scale * value(o) for o in made])
             values = values[np.isfinite(values)]
             if values.size == 0:
                 continue
@@ -203,7 +209,7 @@ def _draw(
         place.set_yticks(range(len(names)), names if place is not axes[0, 1] else [])
         place.invert_yaxis()
         place.set_xlabel(label)
-        if value(outcomes[names[-1]][0]) is not None and label.startswith("from"):
+        if label.startswith("from"):
             place.set_xscale("log")
     _draw_example(axes[1, 1], chosen)
     figure.suptitle(

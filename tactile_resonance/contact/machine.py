@@ -312,12 +312,6 @@ class ContactController:
         model = self._observer.model
         if model is not None:
             self._contact_ns = now_ns
-            surface = model.estimate(place.height_m).surface_m
-            if surface > p.early_m:
-                text = f"touched {1e3 * surface:.2f} mm above the expected surface"
-                text += f", accepted are {1e3 * p.early_m:g} mm"
-                self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
-                return None
             self._enter(State.CONTACT, now_ns)
             return self._press(now_ns, arm, self._place(arm))
         if place.height_m < -p.search_m:
@@ -333,6 +327,12 @@ class ContactController:
         if self._lost(now_ns):
             return None
         estimate = model.estimate(place.height_m)
+        sure = now_ns - self._contact_ns > 1e9 * (self.limits.lost_s + LOST_GRACE_S)
+        if self.state is not State.HOLD and sure and estimate.surface_m > p.early_m:
+            text = f"touched {1e3 * estimate.surface_m:.2f} mm above the expected surface"
+            text += f", accepted are {1e3 * p.early_m:g} mm"
+            self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
+            return None
         off = abs(estimate.force_n - goal.aim.force_n) / goal.aim.force_n
         if self.state is State.CONTACT and off < 4 * p.tolerance:
             self._enter(State.SETTLE, now_ns)
@@ -341,7 +341,7 @@ class ContactController:
                 self._within_ns = -1
             elif self._within_ns < 0:
                 self._within_ns = now_ns
-            elif now_ns - self._within_ns >= 1e9 * p.settle_s:
+            elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
                 self._hold_height_m = place.height_m
                 self._observer.begin_mean()
                 self._result = self._new_result(Breach(Cause.NONE, ""), now_ns, estimate)

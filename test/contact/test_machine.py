@@ -129,6 +129,15 @@ def test_goals_beyond_the_limits_are_refused(goal, message):
     assert np.abs(made.speed_m_s).max() == 0
 
 
+@pytest.mark.parametrize("tissue", [SOFT, stiffer(SOFT, 4.0)])
+def test_surface_higher_than_accepted_is_refused(tissue):
+    made = contact(tissue, parameters=replace(QUICK, early_m=0.5e-3))
+    result = made.loop.make(made.goal)
+    assert result.cause is Cause.SURFACE_EARLY
+    assert made.run_until(State.IDLE, 3.0)
+    assert max(made.force_n) < 1.2 * FORCE_N
+
+
 def test_hold_ends_after_its_time():
     made = contact(limits=Limits(hold_s=0.2))
     assert made.loop.make(made.goal).reached
