@@ -114,6 +114,9 @@ class Envelope:
         if stale is not None:
             return stale
         x, y, z = (float(value) for value in watch.force_n)
+        if z > limits.hard_force_n:
+            text = f"{1e3 * z:.1f} mN on the tip, beyond the hard limit"
+            return Breach(Cause.FORCE_HARD, f"{text} of {1e3 * limits.hard_force_n:g} mN")
         if z > limits.abort_force_n:
             text = f"{1e3 * z:.1f} mN on the tip, limit {1e3 * limits.abort_force_n:g} mN"
             return Breach(Cause.FORCE_ABORT, text)

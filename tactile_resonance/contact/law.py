@@ -69,6 +69,8 @@ def force_speed(
     time = parameters.hold_time_constant_s if holding else parameters.time_constant_s
     # relaxation takes the force away: at constant force u goes as C^(-2/3)
     creep = 2 / 3 * model.c_rate_per_s * hertz.depth(aim_n, model.c)
+    # what is under way will be gone by then, and the target will have moved on
+    target += creep * (parameters.arm_dead_time_s + parameters.arm_lag_s)
     return (target - height_m - pending_m) / time + creep
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,8 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ArmError, ForceError, ForceSource
-from tactile_resonance.contact.machine import ContactController, ContactGoal, State
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 
@@ -42,6 +44,20 @@ class Cycle:
     late_s: float
     bias_n: NDArray[np.float64]  # (3,) of the last tare, not taken off the wrenches
     fault: ArmError | ForceError | None  # what a device raised in this cycle
+
+
+class WallClock:
+    """The machine's clock, that of `WrenchSample` and `ArmSample`."""
+
+    def now_ns(self) -> int:
+        """Time now [ns]."""
+        return time.time_ns()
+
+    def wait_until(self, time_ns: int) -> None:
+        """Sleep until a time; at once where it has passed."""
+        left = time_ns - time.time_ns()
+        if left > 0:
+            time.sleep(left * 1e-9)
 
 
 class ContactLoop:

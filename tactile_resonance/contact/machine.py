@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.envelope import Envelope, Place
 from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
-from tactile_resonance.contact.law import Aim, HoldMode, force_speed, place_speed
+from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
-from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
 
 FloatArray = NDArray[np.float64]
 
@@ -51,53 +51,8 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 """After these the tip is not drawn back by itself: the arm moves again only when told to."""
 
 
-class State(str, Enum):
-    """Where in its life a contact is."""
-
-    IDLE = "idle"
-    TRAVEL = "travel"
-    TARE = "tare"
-    APPROACH = "approach"
-    CONTACT = "contact"
-    SETTLE = "settle"
-    HOLD = "hold"
-    RETRACT = "retract"
-    FAULT = "fault"
-
-
 TOUCHING = (State.CONTACT, State.SETTLE, State.HOLD)
 TARED = (State.APPROACH, *TOUCHING)
-
-
-@dataclass(frozen=True)
-class ContactGoal:
-    """What is asked for.
-
-    Attributes
-    ----------
-    touch : Pose
-        Of the frame `tip` in the base where the ball just touches the expected surface, +z out of
-        the tissue (see `geometry.touch_pose`).
-    aim : Aim
-    """
-
-    touch: Pose
-    aim: Aim
-
-
-@dataclass(frozen=True)
-class Command:
-    """What the arm is told: a twist (6,) in the base and its acceleration limit, or to stop.
-
-    Attributes
-    ----------
-    twist : (6,) array or None
-        None: stop.
-    acceleration_m_s2 : float
-    """
-
-    twist: FloatArray | None
-    acceleration_m_s2: float
 
 
 class ContactController:
@@ -362,12 +317,6 @@ class ContactController:
         model = self._observer.model
         if model is not None:
             self._contact_ns = now_ns
-            surface = model.estimate(place.height_m).surface_m
-            if surface > p.early_m:
-                text = f"touched {1e3 * surface:.2f} mm above the expected surface"
-                text += f", accepted are {1e3 * p.early_m:g} mm"
-                self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
-                return None
             self._enter(State.CONTACT, now_ns)
             return self._press(now_ns, arm, self._place(arm))
         if place.height_m < -p.search_m:
@@ -383,6 +332,12 @@ class ContactController:
         if self._lost(now_ns):
             return None
         estimate = model.estimate(place.height_m)
+        sure = now_ns - self._contact_ns > 1e9 * (self.limits.lost_s + LOST_GRACE_S)
+        if self.state is not State.HOLD and sure and estimate.surface_m > p.early_m:
+            text = f"touched {1e3 * estimate.surface_m:.2f} mm above the expected surface"
+            text += f", accepted are {1e3 * p.early_m:g} mm"
+            self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
+            return None
         off = abs(estimate.force_n - goal.aim.force_n) / goal.aim.force_n
         if self.state is State.CONTACT and off < 4 * p.tolerance:
             self._enter(State.SETTLE, now_ns)
@@ -391,7 +346,7 @@ class ContactController:
                 self._within_ns = -1
             elif self._within_ns < 0:
                 self._within_ns = now_ns
-            elif now_ns - self._within_ns >= 1e9 * p.settle_s:
+            elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
                 self._hold_height_m = place.height_m
                 self._observer.begin_mean()
                 self._result = self._new_result(Breach(Cause.NONE, ""), now_ns, estimate)

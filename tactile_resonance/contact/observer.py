@@ -58,6 +58,7 @@ class Observer:
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW_SAMPLES)
         self._detector: TouchDetector | None = None
         self._model_ns = 0
+        self._inflation = 1.0
         self._sum_n, self._count = 0.0, 0
 
     def begin_tare(self) -> None:
@@ -81,6 +82,8 @@ class Observer:
         self.watch.set_bias(zero.force_n)
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.force_std_n[2])
+        # neighbouring forces that are alike make means less certain than white noise would
+        self._inflation = max(1.0, self.bias_std_n * math.sqrt(len(self._unloaded)) / noise)
         self.seek_touch()
         return None
 
@@ -88,7 +91,7 @@ class Observer:
         """Forget the contact and look for a touch."""
         self.model = None
         self._window.clear()
-        self._detector = TouchDetector(self.noise_n, self.bias_std_n)
+        self._detector = TouchDetector(self._inflation * self.noise_n, self.bias_std_n)
 
     def begin_mean(self) -> None:
         """Average the force from now on."""

@@ -13,6 +13,7 @@ class Cause(str, Enum):
     NONE = "none"
     CANCELLED = "cancelled"
     FORCE_ABORT = "force_abort"
+    FORCE_HARD = "force_hard"
     FORCE_RATE = "force_rate"
     FORCE_PULL = "force_pull"
     FORCE_LATERAL = "force_lateral"

@@ -18,9 +18,9 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
-from tactile_resonance.contact.machine import ContactGoal, State
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult

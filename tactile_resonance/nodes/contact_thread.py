@@ -7,26 +7,15 @@ import threading
 import time
 from collections.abc import Callable
 
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ForceSource
-from tactile_resonance.contact.loop import ContactLoop, Cycle
-from tactile_resonance.contact.machine import ContactController, ContactGoal, State
+from tactile_resonance.contact.loop import ContactLoop, Cycle, WallClock
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0
 POLL_S = 0.01
-
-
-class MachineClock:
-    """`contact.loop.Clock` on this machine's clock."""
-
-    def now_ns(self) -> int:
-        """UNIX time [ns]."""
-        return time.time_ns()
-
-    def wait_until(self, time_ns: int) -> None:
-        """Sleep until then."""
-        time.sleep(max(0, time_ns - time.time_ns()) * 1e-9)
 
 
 class ContactThread:
@@ -50,7 +39,7 @@ class ContactThread:
         listener: Callable[[Cycle], None],
     ) -> None:
         self.controller = ContactController(parameters, limits)
-        self.loop = ContactLoop(arm, force, MachineClock(), self.controller, listener)
+        self.loop = ContactLoop(arm, force, WallClock(), self.controller, listener)
         self.error: Exception | None = None
         self._lock = threading.Lock()
         self._running = True

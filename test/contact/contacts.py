@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.loop import ContactLoop
-from tactile_resonance.contact.machine import ContactController, ContactGoal
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
@@ -66,8 +67,8 @@ def contact(
     return Contact(rig, controller, loop, goal, force, speed)
 
 
-def started(**options):
-    made = contact(**options)
+def started(tissue=SOFT, **options):
+    made = contact(tissue, **options)
     made.loop.start(made.goal)
     return made
 

@@ -162,6 +162,7 @@ def watched(forces, period_ns=2_000_000):
     ("forces", "cause"),
     [
         ([[0, 0, 0.0301]], Cause.FORCE_ABORT),
+        ([[0, 0, 0.0501]], Cause.FORCE_HARD),
         ([[0, 0, -0.0081]], Cause.FORCE_PULL),
         ([[0.011, 0.011, 0.01]], Cause.FORCE_LATERAL),
         ([[0, 0, 0.0]] * 8 + [[0, 0, 0.02]] * 3, Cause.FORCE_RATE),

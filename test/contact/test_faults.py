@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
-from tactile_resonance.contact.machine import State
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 
@@ -240,3 +240,19 @@ def test_arm_that_does_not_start_is_named_and_nothing_moves(fault):
     assert result.cause is Cause.ARM_LINK
     assert fault.value in result.message
     assert np.abs(made.speed_m_s).max() == 0
+
+
+@pytest.mark.parametrize("state", [State.APPROACH, State.CONTACT, State.SETTLE])
+@pytest.mark.parametrize(
+    "inject", [set_fault(stuck=True), set_fault(silent=True), ARM_FAULTS["link lost"][0]]
+)
+def test_on_stiff_tissue_the_way_to_rest_costs_little_force(inject, state):
+    made = started(stiffer(SOFT, 40 / 8.8), seed=3)
+    assert made.run_until(state)
+    if state is State.APPROACH:  # a few samples before the touch
+        touch_m = contacts.RADIUS_M + 1e-3
+        position = made.bench.clock.motion
+        made.loop.run_while(lambda: position.reported.position_m[2] > touch_m + 2e-5)
+    inject(made)
+    made.run(0.3)
+    assert max(made.force_n) < 2.0 * contacts.FORCE_N

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, touch_pose
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.machine import ContactGoal, State
+from tactile_resonance.contact.loop import WallClock
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -128,6 +129,15 @@ def test_goals_beyond_the_limits_are_refused(goal, message):
     assert np.abs(made.speed_m_s).max() == 0
 
 
+@pytest.mark.parametrize("tissue", [SOFT, stiffer(SOFT, 4.0)])
+def test_surface_higher_than_accepted_is_refused(tissue):
+    made = contact(tissue, parameters=replace(QUICK, early_m=0.5e-3))
+    result = made.loop.make(made.goal)
+    assert result.cause is Cause.SURFACE_EARLY
+    assert made.run_until(State.IDLE, 3.0)
+    assert max(made.force_n) < 1.2 * FORCE_N
+
+
 def test_hold_ends_after_its_time():
     made = contact(limits=Limits(hold_s=0.2))
     assert made.loop.make(made.goal).reached
@@ -221,3 +231,11 @@ def test_touch_pose_puts_the_ball_on_the_point():
 
 def test_defaults_of_the_code_are_within_their_ranges():
     Limits().check(ContactParameters())
+
+
+def test_wall_clock_returns_at_the_time_and_at_once_after_it():
+    clock = WallClock()
+    time_ns = clock.now_ns() + 3_000_000
+    clock.wait_until(time_ns)
+    assert clock.now_ns() >= time_ns
+    clock.wait_until(time_ns - 10**12)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a contact is asked to do, where in its life it is, and what the arm is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.samples import Pose
+
+FloatArray = NDArray[np.float64]
+
+
+class State(str, Enum):
+    """Where in its life a contact is."""
+
+    IDLE = "idle"
+    TRAVEL = "travel"
+    TARE = "tare"
+    APPROACH = "approach"
+    CONTACT = "contact"
+    SETTLE = "settle"
+    HOLD = "hold"
+    RETRACT = "retract"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True)
+class ContactGoal:
+    """What is asked for.
+
+    Attributes
+    ----------
+    touch : Pose
+        Of the frame `tip` in the base where the ball just touches the expected surface, +z out of
+        the tissue (see `geometry.touch_pose`).
+    aim : Aim
+    """
+
+    touch: Pose
+    aim: Aim
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the arm is told: a twist (6,) in the base and its acceleration limit, or to stop.
+
+    Attributes
+    ----------
+    twist : (6,) array or None
+        None: stop.
+    acceleration_m_s2 : float
+    """
+
+    twist: FloatArray | None
+    acceleration_m_s2: float
