@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Sequence
 
@@ -19,11 +20,13 @@ from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
+from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
@@ -34,6 +37,14 @@ from tactile_resonance.nodes.running import STREAM, run_node
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
+    Parameter(
+        "publish_every",
+        5,
+        "Pose, wrench and state are published every so many cycles of the loop; the wrench is the mean since "
+        "the last one.",
+        1,
+        500,
+    ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
     *contact_parameters(),
@@ -64,6 +75,7 @@ class ContactNode(ManagedNode):
     def configure(self) -> None:
         """Connect arm and force source."""
         self._frame_id, self._base_frame = values(self, "frame_id", "base_frame")
+        (self._publish_every,) = values(self, "publish_every")
         self._settings, self._limits = read_parameters(self)
         self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = self.publish_on(PoseStamped, "tcp_pose", STREAM)
@@ -78,7 +90,9 @@ class ContactNode(ManagedNode):
         self._force.start()
         self._goal: ServerGoalHandle | None = None
         self._finished: Future | None = None
-        self._dead = self._polls = 0
+        self._fault: ArmError | ForceError | None = None
+        self._dead = self._polls = self._unpublished = 0
+        self._wrenches: list[WrenchSample] = []
         self.serve(Trigger, "retract", self._on_retract)
         self.every(POLL_S, self._poll)
         server = ActionServer(
@@ -93,6 +107,9 @@ class ContactNode(ManagedNode):
 
     def activate(self) -> None:
         """Start the loop."""
+        # a search through all that was imported would hold the loop up for tens of milliseconds
+        gc.collect()
+        gc.freeze()
         self._thread = ContactThread(
             self._arm, self._force, self._settings, self._limits, self._on_cycle
         )
@@ -133,7 +150,9 @@ class ContactNode(ManagedNode):
         return SetParametersResult(successful=True)
 
     def _on_request(self, _: MakeContact.Goal) -> GoalResponse:
-        return GoalResponse.ACCEPT if self.active and self._goal is None else GoalResponse.REJECT
+        """Goals are taken one at a time, and only while both devices are well."""
+        ready = self.active and self._goal is None and self._fault is None
+        return GoalResponse.ACCEPT if ready else GoalResponse.REJECT
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = MakeContact.Result(cause="refused")
@@ -235,19 +254,30 @@ class ContactNode(ManagedNode):
     def _on_cycle(self, cycle: Cycle) -> None:
         self._dead = self._dead + 1 if cycle.fault is not None else 0
         self._fault = cycle.fault
+        self._wrenches += cycle.wrenches
+        self._unpublished += 1
+        if self._unpublished < self._publish_every:
+            return
+        self._unpublished = 0
+        wrenches, self._wrenches = self._wrenches, []
         if cycle.arm is not None and self._pose.get_subscription_count():
             self._pose.publish(self._pose_message(cycle))
-        if cycle.wrenches and self._wrench.get_subscription_count():
-            for sample in cycle.wrenches:
-                wrench = WrenchStamped()
-                wrench.header.stamp = time_message(sample.time_ns)
-                wrench.header.frame_id = self._frame_id
-                force, torque = wrench.wrench.force, wrench.wrench.torque
-                force.x, force.y, force.z = (sample.force_n - cycle.bias_n).tolist()
-                torque.x, torque.y, torque.z = sample.torque_nm.tolist()
-                self._wrench.publish(wrench)
+        if wrenches and self._wrench.get_subscription_count():
+            self._wrench.publish(self._wrench_message(wrenches, cycle))
         if self._state.get_subscription_count():
             self._state.publish(self._state_message(cycle))
+
+    def _wrench_message(self, wrenches: list[WrenchSample], cycle: Cycle) -> WrenchStamped:
+        """Mean of these, less the tare, at the middle of their times."""
+        wrench = WrenchStamped()
+        wrench.header.stamp = time_message((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
+        wrench.header.frame_id = self._frame_id
+        count, parts = len(wrenches), wrench.wrench
+        force_n = sum(sample.force_n for sample in wrenches) / count - cycle.bias_n
+        torque_nm = sum(sample.torque_nm for sample in wrenches) / count
+        parts.force.x, parts.force.y, parts.force.z = force_n.tolist()
+        parts.torque.x, parts.torque.y, parts.torque.z = torque_nm.tolist()
+        return wrench
 
     def _pose_message(self, cycle: Cycle) -> PoseStamped:
         pose = PoseStamped()

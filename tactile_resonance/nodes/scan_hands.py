@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact, Measure
+from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
@@ -44,6 +45,15 @@ RESULTS_WITHIN_S = 10.0
 GOAL_ENDS_WITHIN_S = 15.0
 RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
+# What says nothing of the point: the contact is tried again.
+DEVICE_CAUSES = frozenset(
+    cause.value
+    for cause in (
+        *(Cause.FORCE_SOURCE, Cause.FORCE_STALE),
+        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
+    )
+)
+ATTEMPTS = 3
 PLACE_FOR_S = 0.2
 
 
@@ -97,10 +107,15 @@ class NodeHands:
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         self._touching = True
-        handle = self._send(self._contact, goal, "make_contact", check)
-        result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
-        if not result.reached:
-            raise PointFailed(f"contact: {result.cause}: {result.message}")
+        for attempt in range(1, ATTEMPTS + 1):
+            handle = self._send(self._contact, goal, "make_contact", check)
+            result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
+            if result.reached:
+                break
+            if result.cause not in DEVICE_CAUSES or attempt == ATTEMPTS:
+                raise PointFailed(f"contact: {result.cause}: {result.message}")
+            self.retract()
+            self._touching = True
         deadline = time.monotonic() + STATE_WITHIN_S
         while self._state is None or self._state.state != msg.ContactState.STATE_HOLD:
             if time.monotonic() > deadline:

@@ -109,6 +109,10 @@ class Tabletop:
         self._library = library
         self._tissue: Tissue | None = library[setup.tissue]
         self._scene = laid
+        if laid is not None:
+            laid.tissue_at(
+                laid.table.position_m
+            )  # what is computed once must not hold up the first touch
         modes, radius_m = sensor_modes(sensor), sensor.tip.radius_m
 
         def tip(tissue: Tissue) -> TipOnTissue:
