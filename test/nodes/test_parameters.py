@@ -14,12 +14,14 @@ from rclpy.parameter import Parameter as RosParameter
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes import (
+    contact_node,
     excitation_node,
     fake_hardware_node,
     frf_node,
     manager_node,
     pole_map_node,
     poles_node,
+    scan_node,
 )
 from tactile_resonance.processes import free_domain_id
 
@@ -29,6 +31,8 @@ NODES = {
     "poles_node": poles_node.PolesNode,
     "fake_hardware_node": fake_hardware_node.FakeHardwareNode,
     "manager_node": manager_node.ManagerNode,
+    "contact_node": contact_node.ContactNode,
+    "scan_node": scan_node.ScanNode,
     "pole_map_node": pole_map_node.PoleMapNode,
 }
 DECLARED = {
@@ -37,6 +41,11 @@ DECLARED = {
     "poles_node": poles_node.PARAMETERS,
     "fake_hardware_node": fake_hardware_node.PARAMETERS,
     "manager_node": manager_node.PARAMETERS,
+    # the rest of its parameters is that of config/contact.yaml, where the defaults come from
+    "contact_node": [
+        p for p in contact_node.PARAMETERS if not p.name.startswith(("contact.", "limits."))
+    ],
+    "scan_node": scan_node.PARAMETERS,
     "pole_map_node": pole_map_node.PARAMETERS,
 }
 
