@@ -171,9 +171,9 @@ class NodeHands:
         if not mine:
             raise PointFailed("measurement: it ended before its first block")
         poles, origin = poles_from_message(mine[-1])
-        return Measured(
-            poles, origin.contact, result.blocks, result.measurement_id, origin.simulated
-        )
+        if origin.contact.position_m is None:
+            raise PointFailed("measurement: nobody told where the tip is (tcp_pose)")
+        return Measured(poles, origin)
 
     def retract(self) -> None:
         """Draw the tip back and wait until it is free."""

@@ -8,7 +8,6 @@ import os
 import threading
 import time
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,14 @@ from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
 from tactile_resonance.action import Scan
-from tactile_resonance.configuration import PACKAGE_NAME, share_path
+from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
+from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.plan import Plan, make_plan
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import Controls, Progress, Request, ScanRunner, Summary
@@ -214,24 +214,10 @@ class ScanNode(ManagedNode):
 
     def _facts(self, scene: ScanScene, plan: Plan, seed: int) -> dict[str, Any]:
         """What a reader of the run should know beside its plan."""
-        parameters = {name: p.value for name, p in self.get_parameters_by_prefix("").items()}
-        return {
-            "name": scene.name,
-            "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "seed": seed,
-            "versions": {
-                name: _version(name) for name in (PACKAGE_NAME, "numpy", "scipy", "rosbags")
-            },
-            "parameters": {
-                name: list(value)
-                if isinstance(value, (list, tuple)) or hasattr(value, "tolist")
-                else value
-                for name, value in parameters.items()
-            },
-            "skipped": [{"what": s.what, "why": s.why, "saved_s": s.saved_s} for s in plan.skipped],
-            "shortest_s": plan.shortest_s,
-            "longest_s": plan.longest_s,
-        }
+        names = ("contact", "table_in_base", "base_frame")
+        own = dict(zip(names, values(self, *names), strict=True))
+        own["table_in_base"] = list(own["table_in_base"])
+        return run_facts(plan, seed, {"name": scene.name, "scan_node": own})
 
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
         last = [("", -math.inf)]
@@ -308,13 +294,6 @@ def _fill(result: Scan.Result, summary: Summary) -> None:
     result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
     for name in ("message", "done", "failed", "skipped", "blocks", "blocks_saved", "saved_s"):
         setattr(result, name, getattr(summary, name))
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def main() -> None:

@@ -16,17 +16,18 @@ from typing import Protocol
 import numpy as np
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.record import Contact
+from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision, decide
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.plan import Plan
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
+from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording, RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold, OnFailure, ScanScene
-from tactile_resonance.tissue.classify import classify
 
 PAUSE_POLL_S = 0.05
+SKIPPED = "skipped on request"
 Recording = PointRecording | ReferenceRecording
 
 
@@ -58,18 +59,12 @@ class Measured:
     ----------
     poles : Poles
         Of all blocks.
-    contact : Contact
-        While it was measured.
-    blocks : int
-    measurement_id : int
-    simulated : bool
+    origin : Origin
+        Of the poles; its contact is that of the measurement.
     """
 
     poles: Poles
-    contact: Contact
-    blocks: int
-    measurement_id: int
-    simulated: bool
+    origin: Origin
 
 
 class Hands(Protocol):
@@ -254,7 +249,17 @@ class ScanRunner:
             return self._run.content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
-                self._keep(recording, point, Outcome.SKIPPED, "skipped on request", 0.0)
+                recording.finish(
+                    unmeasured_result(
+                        point,
+                        recording.attempt,
+                        self._scene,
+                        Outcome.SKIPPED,
+                        SKIPPED,
+                        time_ns=time.time_ns(),
+                        duration_s=0.0,
+                    )
+                )
             return self._next()
         return point
 
@@ -274,7 +279,7 @@ class ScanRunner:
                 raise PointFailed(f"time_limits.point_s: {scene.time_limits.point_s:g} s are over")
 
         with self._run.begin_point(point.index) as recording:
-            measured, outcome, reason = None, Outcome.DONE, ""
+            measured, outcome, reason = None, Outcome.FAILED, ""
             try:
                 self._say(point, "contact")
                 self._hands.touch(point, scene.force_n, scene.hold, check)
@@ -287,28 +292,43 @@ class ScanRunner:
                     recording,
                     check,
                 )
-                if not measured.poles.f0_hz.size:
-                    raise PointFailed(
-                        f"{measured.poles.status.value}: {measured.poles.message}".strip(": ")
-                    )
             except PointFailed as error:
-                outcome, reason = Outcome.FAILED, str(error)
+                reason = str(error)
             except Interrupted:
-                request = self._controls.take()
-                if (
-                    request is not Request.SKIP
-                ):  # cancelled or to be repeated: nothing is kept of it
-                    self._hands.retract()
+                if self._controls.take() is not Request.SKIP:
+                    self._hands.retract()  # cancelled or to be repeated: nothing is kept of it
                     return
-                outcome, reason = Outcome.SKIPPED, "skipped on request"
+                outcome, reason = Outcome.SKIPPED, SKIPPED
             self._say(point, "retract")
             self._hands.retract()
             duration_s = time.monotonic() - begun_s
-            decision = decisions[-1] if decisions else None
-            self._keep(recording, point, outcome, reason, duration_s, measured, decision)
+            if measured is None:
+                result = unmeasured_result(
+                    point,
+                    recording.attempt,
+                    scene,
+                    outcome,
+                    reason,
+                    time_ns=time.time_ns(),
+                    duration_s=duration_s,
+                )
+            else:
+                result = measured_result(
+                    point,
+                    recording.attempt,
+                    scene,
+                    measured.poles,
+                    measured.origin,
+                    decisions[-1],
+                    time_ns=time.time_ns(),
+                    duration_s=duration_s,
+                )
+            recording.finish(result)
         self._durations_s.append(duration_s)
-        if outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
-            raise ScanEnded(f"point {point.index + 1} failed and on_failure is stop: {reason}")
+        if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
+            raise ScanEnded(
+                f"point {point.index + 1} failed and on_failure is stop: {result.reason}"
+            )
 
     def _decide(self, poles: Poles, blocks: int) -> Decision:
         known = poles.f0_hz.size > 0
@@ -320,79 +340,6 @@ class ScanRunner:
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
         return decide(estimate, noise, total, blocks, wanted, limits, block_s)
-
-    def _keep(
-        self,
-        recording: PointRecording,
-        point: ScanPoint,
-        outcome: Outcome,
-        reason: str,
-        duration_s: float,
-        measured: Measured | None = None,
-        decision: Decision | None = None,
-    ) -> None:
-        """Write the result behind the messages and make the point durable."""
-        x, y, z = point.position_m
-        normal_x, normal_y, normal_z = point.normal
-        result = PointResult(
-            index=point.index,
-            attempt=recording.attempt,
-            label=point.label,
-            outcome=outcome,
-            reason=reason,
-            x_m=x,
-            y_m=y,
-            z_m=z,
-            normal_x=normal_x,
-            normal_y=normal_y,
-            normal_z=normal_z,
-            duration_s=duration_s,
-            time_ns=time.time_ns(),
-            frame_id=self._scene.frame_id,
-        )
-        if measured is not None:
-            result = replace(
-                result,
-                force_n=measured.contact.force_n,
-                force_std_n=measured.contact.force_std_n,
-                poles_status=measured.poles.status.value,
-                cost=measured.poles.cost,
-                expected_cost=measured.poles.expected_cost,
-                blocks=measured.blocks,
-                measurement_id=measured.measurement_id,
-                simulated=measured.simulated,
-            )
-            if measured.poles.f0_hz.size:
-                result = self._with_poles(result, measured.poles)
-        if decision is not None:
-            result = replace(
-                result,
-                verdict=decision.verdict.value,
-                blocks_saved=decision.blocks_saved,
-                saved_s=decision.saved_s,
-            )
-        recording.finish(result)
-
-    def _with_poles(self, result: PointResult, poles: Poles) -> PointResult:
-        pole = poles.poles_rad_s[0]
-        covariance = (
-            poles.total_covariance if poles.total_covariance is not None else poles.covariance
-        )
-        spread = np.full((2, 2), np.nan) if covariance is None else covariance[0]
-        result = replace(
-            result,
-            f0_hz=float(poles.f0_hz[0]),
-            damping_ratio=float(poles.damping_ratio[0]),
-            f0_std_hz=float(np.sqrt(spread[0, 0])),
-            damping_ratio_std=float(np.sqrt(spread[1, 1])),
-            f0_damping_covariance_hz=float(spread[0, 1]),
-            pole_real_rad_s=float(pole.real),
-            pole_imag_rad_s=float(pole.imag),
-        )
-        if self._scene.tissue_classes and covariance is not None:
-            call = classify(result.estimate, spread, self._scene.tissue_classes)
-            result = replace(result, tissue_class=call.name, tissue_probability=call.probability)
-        return result
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan."""

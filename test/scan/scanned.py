@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from tactile_resonance.identification.joint import identify_poles_from_records
+from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide

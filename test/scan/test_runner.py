@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.record import Contact
+from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.plan import make_plan
@@ -63,6 +63,7 @@ class Bench:
                 poles_rad_s=np.array([-50 + 1600j]),
                 f0_hz=np.array([254.0]),
                 damping_ratio=np.array([0.03]),
+                residues=np.array([100 + 0j]),
                 covariance=covariance[None],
                 total_covariance=covariance[None],
             )
@@ -71,7 +72,8 @@ class Bench:
             if enough(poles, blocks):
                 break
         self.log.append(("measure", label, seed, blocks))
-        return Measured(poles, Contact(0.01, 1e-4), blocks, 1000 + seed, simulated=True)
+        contact = Contact(0.01, 1e-4, (0.0, 0.0, 0.0), frame_id="base", time_ns=1)
+        return Measured(poles, Origin(measurement_id=1000 + seed, contact=contact, simulated=True))
 
     def retract(self):
         self.holding = False
