@@ -44,6 +44,7 @@ def _parser() -> OneLineParser:
         demo,
         figures,
         report,
+        scan,
         simulate_cell,
         simulate_ur,
     )
@@ -55,7 +56,7 @@ def _parser() -> OneLineParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
         *(demo, analyze, report, figures, benchmark),
-        *(simulate_ur, simulate_cell, check_robot),
+        *(scan, simulate_ur, simulate_cell, check_robot),
     ):
         command.add_parser(commands)
     return parser

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A client of scan_node: one goal, its progress, its result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.executors import SingleThreadedExecutor
+
+from tactile_resonance.action import Scan
+from tactile_resonance.nodes.scan_session import NoAnswer
+
+
+class ScanClient:
+    """Context that joins the nodes' domain; not for use beside another executor.
+
+    Parameters
+    ----------
+    check : callable
+        Called while waiting; raises when waiting has become pointless.
+    """
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self._check = check
+        self._context = rclpy.Context()
+        self.states: dict[str, str] = {}
+
+    def __enter__(self) -> ScanClient:
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("scan_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._client = ActionClient(self._node, Scan, "scan")
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._client.destroy()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def wait_until_up(self, timeout_s: float) -> None:
+        """Until the manager tells that all nodes are active.
+
+        Raises
+        ------
+        NoAnswer
+            If they are not in time, with what the diagnostics say.
+        """
+
+        def up() -> bool:
+            return self.states.get("manager_node", "").startswith("active")
+
+        self.wait(up, timeout_s, "the nodes to come up")
+
+    def start(self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None]) -> ClientGoalHandle:
+        """Ask for a scan until the node takes it."""
+        deadline = time.monotonic() + 30.0
+        while time.monotonic() < deadline:
+            if self._client.server_is_ready():
+                future = self._client.send_goal_async(
+                    goal, feedback_callback=lambda message: feedback(message.feedback)
+                )
+                self.wait(future.done, 10.0, "the goal to be taken")
+                if future.result().accepted:
+                    return future.result()
+            self.spin(0.1)
+        raise NoAnswer("scan: no node takes the goal")
+
+    def result(self, handle: ClientGoalHandle, timeout_s: float) -> Scan.Result:
+        """Result of a scan."""
+        future = handle.get_result_async()
+        self.wait(future.done, timeout_s, "the scan")
+        return future.result().result
+
+    def scan(
+        self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None], timeout_s: float
+    ) -> Scan.Result:
+        """Ask for a scan and wait for its result."""
+        return self.result(self.start(goal, feedback), timeout_s)
+
+    def wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Spin until something holds."""
+        deadline = time.monotonic() + timeout_s
+        while not done():
+            self._check()
+            if time.monotonic() > deadline:
+                told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
+                raise NoAnswer(f"waited {timeout_s:g} s for {what} ({told or 'no diagnostics'})")
+            self.spin(0.05)
+
+    def spin(self, seconds: float) -> None:
+        """Let messages in for at most so long."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = Path(status.name).name
+            # why a node does not come up is told for seconds, that it does not for longer
+            refused = self.states.get(name, "").startswith(f"{status.message}: ")
+            if status.level == DiagnosticStatus.ERROR or not refused:
+                self.states[name] = status.message
