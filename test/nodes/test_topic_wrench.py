@@ -16,7 +16,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 import rclpy
 from geometry_msgs.msg import WrenchStamped
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
@@ -30,7 +30,7 @@ PATIENCE_S = 30.0
 
 
 class Driver:
-    """Publishes noise of 1 mN about 10 mN, as fast as it can up to 1 kHz, from a thread of its own."""
+    """Publishes noise of 1 mN about 10 mN, as fast as it can up to 500 Hz, from a thread of its own."""
 
     def __init__(self, node):
         self._publisher = node.create_publisher(WrenchStamped, CONFIG.topic, 100)  # reliable
@@ -48,7 +48,7 @@ class Driver:
 
     def _run(self):
         rng = np.random.default_rng(1)
-        while not self._ended.wait(0.001):
+        while not self._ended.wait(0.002):
             if not self.speaking:
                 continue
             message = WrenchStamped()
@@ -64,7 +64,7 @@ class Driver:
 def driver_and_source():
     with rclpy.init(domain_id=free_domain_id(os.environ)):
         node = Node("topic_wrench_test")
-        executor = MultiThreadedExecutor(2)
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         spinning = threading.Thread(target=executor.spin)
         spinning.start()

@@ -247,9 +247,9 @@ SCAN = """
     from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.runner import Controls, ScanRunner
-    path, made = Path(sys.argv[1]), t.scene(12)
+    path, made = Path(sys.argv[1]), t.scene(8)
     run = RunDirectory.open(path) if path.exists() else t.begin(path, made)[1]
-    bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(6e-3))
+    bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(3e-3))
     with run:
         print("running", flush=True)
         ScanRunner(made, make_plan(made), run, bench, Controls(), lambda progress: None).run()
@@ -269,7 +269,7 @@ def test_killed_at_random_moments_no_finished_point_is_lost_or_repeated(tmp_path
         )
         process.stdout.readline()
         try:
-            process.wait(rng.uniform(0.0, 0.5))
+            process.wait(rng.uniform(0.0, 0.15))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             kills += 1
@@ -282,6 +282,6 @@ def test_killed_at_random_moments_no_finished_point_is_lost_or_repeated(tmp_path
         finished = now
         if ended:
             break
-    assert kills >= 3
+    assert kills >= 2
     # every point once: none was repeated after it was finished
-    assert finished == [(index, 0) for index in range(12)]
+    assert finished == [(index, 0) for index in range(8)]
