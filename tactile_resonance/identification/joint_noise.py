@@ -17,6 +17,8 @@ IntArray = npt.NDArray[np.int64]
 
 # Bins whose powers are averaged before their variances are compared with each other.
 BINS_PER_BAND = 8
+# Fewer are not tested for being equal.
+FEWEST_PIECES = 4
 TINY = float(np.finfo(float).tiny)
 NAMES = np.array(KINDS)
 
@@ -167,7 +169,7 @@ def _pieces(
     Flat unless a test says otherwise.
     """
     mean = mean_power * factor
-    if bands.starts.size < 4:
+    if bands.starts.size < FEWEST_PIECES:
         return mean, np.zeros(values.shape[0], np.int64)
     power = values.real**2 + values.imag**2
     sample = np.add.reduceat(power, bands.starts, axis=-1) / bands.counts

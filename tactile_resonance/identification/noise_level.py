@@ -174,12 +174,13 @@ def is_flat(variance: FloatArray, dof: int) -> bool:
     lines = variance.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.log(variance.sum(axis=-1) / lines) - np.log(variance).sum(axis=-1) / lines
-    limit = _flat_limit(lines, dof)
+    limit = flat_limit(lines, dof)
     return bool((spread <= limit).all())  # NaN, where a variance is not positive, is not flat
 
 
 @lru_cache(maxsize=256)
-def _flat_limit(lines: int, dof: int) -> float:
+def flat_limit(lines: int, dof: int) -> float:
+    """Largest ``log mean - mean log`` that `is_flat` lets pass."""
     return float(_bartlett_limit(np.array(lines), dof, 1))
 
 
