@@ -105,7 +105,7 @@ class OnePoint:
     def linearise(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Cost (groups,), half its gradient (n,), normals (groups, n, n) at theta (n,)."""
         basis = self._basis
-        a, b, c = self._values(theta)
+        a, b, c = (self._value(which, theta) for which in range(3))
         inverse = 1 / a
         g = b * inverse
         model = g * self._u
@@ -145,7 +145,7 @@ class OnePoint:
         right = -self._y * basis.last
         theta = np.empty(0)
         for iteration in range(iterations):
-            scale = root if iteration == 0 else root / np.abs(self._values(theta)[0])
+            scale = root if iteration == 0 else root / np.abs(self._value(0, theta))
             real = self._weighted_jacobian(self._y, scale)
             theta = solve_one(real @ real.T, real @ (right * scale).view(float))
         return theta
@@ -159,12 +159,13 @@ class OnePoint:
         np.multiply(rows[for_c], -weight, out=jacobian[for_c])
         return jacobian.view(float)
 
-    def _values(self, theta: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """A, B and C, each (K,)."""
-        basis = self._basis
-        a, b, c = ((theta[kind] @ basis.real[kind]).view(complex) for kind in basis.kinds)
-        a += basis.last
-        return a, b, c
+    def _value(self, which: int, theta: FloatArray) -> ComplexArray:
+        """(K,) of A (0), B (1) or C (2)."""
+        kind = self._basis.kinds[which]
+        value = (theta[kind] @ self._basis.real[kind]).view(complex)
+        if which == 0:
+            value += self._basis.last
+        return value
 
 
 def solve_one(normal: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:

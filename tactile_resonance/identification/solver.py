@@ -120,12 +120,15 @@ class Problem:
         inverse_a = np.conj(a)
         inverse_a *= inverse_2
         g = None
-        y = np.zeros_like(inverse_a)
-        if group.numerator is not None:
-            g = group.evaluate(1, beta) * inverse_a
-            y = g if data.u is None else g * data.u
         if group.transient is not None:
-            y = y + group.evaluate(2, gamma) * inverse_a
+            y = group.evaluate(2, gamma)
+            y *= inverse_a
+        else:
+            y = np.zeros_like(inverse_a)
+        if group.numerator is not None:
+            g = group.evaluate(1, beta)
+            g *= inverse_a
+            y += g if data.u is None else g * data.u
         return inverse_a, inverse_2, y, g
 
     def linearise(
