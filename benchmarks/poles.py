@@ -264,10 +264,10 @@ def _row(frf: FRF, k: int) -> FRF:
 
 
 def _timed(call: Callable) -> tuple[PolesBatch, float]:
-    """Result, and the least processor time of five calls after a first one."""
+    """Result, and the least processor time of fifteen calls after a first one."""
     result = call()
     times = []
-    for _ in range(5):
+    for _ in range(15):
         start = time.process_time()
         call()
         times.append(time.process_time() - start)

@@ -45,33 +45,70 @@ def _evaluate(basis_re, basis_im, coefficients, re, im):
 
 
 @compiled
+def _dot(x, y):
+    total = 0.0
+    for k in range(x.size):
+        total += x[k] * y[k]
+    return total
+
+
+@compiled
+def _scaled(out, x, weight, factor):
+    """``factor weight x``."""
+    for k in range(x.size):
+        out[k] = factor * weight[k] * x[k]
+
+
+@compiled
+def _difference(out, x, y, factor):
+    """``factor (x - y)``."""
+    for k in range(x.size):
+        out[k] = factor * (x[k] - y[k])
+
+
+@compiled
+def _add(out, x):
+    for k in range(x.size):
+        out[k] += x[k]
+
+
+@compiled
+def _invert(re, im, last_re, last_im):
+    """``1 / (x + last)`` in place."""
+    for k in range(re.size):
+        p, q = re[k] + last_re[k], im[k] + last_im[k]
+        scale = 1 / (p * p + q * q)
+        re[k], im[k] = p * scale, -q * scale
+
+
+@compiled
+def _multiply(re, im, by_re, by_im, factor):
+    """``factor x by`` in place."""
+    for k in range(re.size):
+        p, q = factor * re[k], factor * im[k]
+        re[k], im[k] = p * by_re[k] - q * by_im[k], p * by_im[k] + q * by_re[k]
+
+
+@compiled
 def _fill(jacobian, first, basis_re, basis_im, terms, w_re, w_im):
     """Rows ``weight basis[i]``, real parts before imaginary ones."""
     size = w_re.size
     for i in range(terms):
-        row = jacobian[first + i]
+        re, im = jacobian[first + i, :size], jacobian[first + i, size:]
         b_re, b_im = basis_re[i], basis_im[i]
         for k in range(size):
-            row[k] = b_re[k] * w_re[k] - b_im[k] * w_im[k]
-            row[size + k] = b_re[k] * w_im[k] + b_im[k] * w_re[k]
+            re[k] = b_re[k] * w_re[k] - b_im[k] * w_im[k]
+            im[k] = b_re[k] * w_im[k] + b_im[k] * w_re[k]
 
 
 @compiled
 def _products(jacobian, error, places, normal, gradient):
     """Set ``J J^T`` (n, n) of rows that stand at `places`, add ``J error``."""
     normal[:] = 0.0
-    width = error.size
     for i in range(places.size):
-        row = jacobian[i]
-        total = 0.0
-        for k in range(width):
-            total += row[k] * error[k]
-        gradient[places[i]] += total
+        gradient[places[i]] += _dot(jacobian[i], error)
         for j in range(i + 1):
-            other = jacobian[j]
-            total = 0.0
-            for k in range(width):
-                total += row[k] * other[k]
+            total = _dot(jacobian[i], jacobian[j])
             normal[places[i], places[j]] = total
             normal[places[j], places[i]] = total
 
@@ -134,6 +171,34 @@ def _linearise_group(
 
 
 @compiled
+def _linearise_others(
+    group, places, sizes, theta, variance, data, work, jacobian, normal, gradient
+):
+    """As `_linearise_group`, without input and with one variance: loops that become vectors."""
+    a, b, _ = sizes
+    size = data.shape[1]
+    d_re, d_im, _, _, t_re, t_im = group
+    a_re, a_im, c_re, c_im = work[0], work[1], work[2], work[3]
+    work[:4] = 0.0
+    root = 1 / np.sqrt(variance)
+    error = work[10:12].reshape(-1)[: 2 * size]
+    _evaluate(d_re, d_im, theta[:a], a_re, a_im)
+    _evaluate(t_re, t_im, theta[a + b :], c_re, c_im)
+    _invert(a_re, a_im, d_re[a], d_im[a])
+    _multiply(c_re, c_im, a_re, a_im, 1.0)
+    _difference(error[:size], data[0], c_re, root)
+    _difference(error[size:], data[1], c_im, root)
+    _multiply(c_re, c_im, a_re, a_im, root)
+    _fill(jacobian, 0, d_re, d_im, a, c_re, c_im)
+    for k in range(size):
+        a_re[k] *= -root
+        a_im[k] *= -root
+    _fill(jacobian, a, t_re, t_im, t_re.shape[0], a_re, a_im)
+    _products(jacobian, error, places, normal, gradient)
+    return _dot(error, error)
+
+
+@compiled
 def _start_group(group, places, sizes, theta, first, data, work, jacobian, normal, gradient):
     """Normal equations of a Sanathanan-Koerner iteration; see `OnePoint.start`."""
     a, _, _ = sizes
@@ -145,16 +210,25 @@ def _start_group(group, places, sizes, theta, first, data, work, jacobian, norma
     if not first:
         _evaluate(d_re, d_im, theta[:a], a_re, a_im)
     error = work[10:12].reshape(-1)[: 2 * size]
-    for k in range(size):
-        w = 1.0
-        if not first:
-            p, q = a_re[k] + d_re[a, k], a_im[k] + d_im[a, k]
-            w = 1 / np.sqrt(p * p + q * q)
-        a_re[k], a_im[k] = y_re[k] * w, y_im[k] * w
-        b_re[k], b_im[k] = -u_re[k] * w, -u_im[k] * w
-        c_re[k], c_im[k] = -w, 0.0
-        error[k] = -w * (y_re[k] * d_re[a, k] - y_im[k] * d_im[a, k])
-        error[size + k] = -w * (y_re[k] * d_im[a, k] + y_im[k] * d_re[a, k])
+    weight, right = work[6], work[7]
+    weight[:] = 1.0
+    if not first:
+        last_re, last_im = d_re[a], d_im[a]
+        for k in range(size):
+            p, q = a_re[k] + last_re[k], a_im[k] + last_im[k]
+            weight[k] = 1 / np.sqrt(p * p + q * q)
+    _scaled(a_re, y_re, weight, 1.0)
+    _scaled(a_im, y_im, weight, 1.0)
+    _scaled(b_re, u_re, weight, -1.0)
+    _scaled(b_im, u_im, weight, -1.0)
+    c_re[:] = 0.0
+    c_im[:] = 0.0
+    _difference(c_re, c_im, weight, 1.0)
+    for half in range(2):
+        # minus y times the fixed term of A
+        _scaled(error[half * size : (half + 1) * size], a_re, d_im[a] if half else d_re[a], -1.0)
+        _scaled(right, a_im, d_re[a] if half else d_im[a], -1.0 if half else 1.0)
+        _add(error[half * size : (half + 1) * size], right)
     inputs = n_re.shape[0]
     _fill(jacobian, 0, d_re, d_im, a, a_re, a_im)
     _fill(jacobian, a, n_re, n_im, inputs, b_re, b_im)
@@ -297,8 +371,8 @@ def _linearise(theta, groups, places, sizes, variances, memory):
     """Costs of both groups; gradient in vectors[1], normals in normal[:2]."""
     data, work, jacobian, normal, vectors, _ = memory
     vectors[1] = 0.0
-    others = _linearise_group(
-        groups[0], places[0], sizes, theta, (variances[0], 0.0), data[0], work[0], jacobian[0],
+    others = _linearise_others(
+        groups[0], places[0], sizes, theta, variances[0], data[0], work[0], jacobian[0],
         normal[0], vectors[1],
     )  # fmt: skip
     excited = _linearise_group(
@@ -336,18 +410,15 @@ def _rough(theta, groups, places, sizes, pieces, limits, input_o, memory):
     _evaluate(d_re, d_im, theta[:a], a_re, a_im)
     _evaluate(t_re, t_im, theta[a + b :], c_re, c_im)
     size = y.shape[1]
-    power_y, power_u, cross_re, cross_im = 0.0, 0.0, 0.0, 0.0
-    for k in range(size):
-        p, q = a_re[k] + d_re[a, k], a_im[k] + d_im[a, k]
-        scale = 1 / (p * p + q * q)
-        e_re = y[0, k] - (c_re[k] * p + c_im[k] * q) * scale
-        e_im = y[1, k] - (c_im[k] * p - c_re[k] * q) * scale
-        c_re[k], c_im[k] = e_re, e_im
-        u_re, u_im = input_o[0, k], input_o[1, k]
-        power_y += e_re * e_re + e_im * e_im
-        power_u += u_re * u_re + u_im * u_im
-        cross_re += e_re * u_re + e_im * u_im
-        cross_im += e_im * u_re - e_re * u_im
+    _invert(a_re, a_im, d_re[a], d_im[a])
+    _multiply(c_re, c_im, a_re, a_im, 1.0)
+    _difference(c_re, y[0], c_re, 1.0)
+    _difference(c_im, y[1], c_im, 1.0)
+    u_re, u_im = input_o[0], input_o[1]
+    power_y = _dot(c_re, c_re) + _dot(c_im, c_im)
+    power_u = _dot(u_re, u_re) + _dot(u_im, u_im)
+    cross_re = _dot(c_re, u_re) + _dot(c_im, u_im)
+    cross_im = _dot(c_im, u_re) - _dot(c_re, u_im)
     squared = (cross_re * cross_re + cross_im * cross_im) / max(power_y * power_u, TINY)
     if not squared <= limits[0]:
         return nothing
