@@ -3,7 +3,8 @@
 
 `numba` is an optional dependency (``pip install tactile_resonance[compiled]``); the first fit of a
 process loads the compiled code, the first one after an installation compiles it, which takes some
-ten seconds.
+ten seconds. numba keeps it beside the source or, where that cannot be written, in its own cache
+(NUMBA_CACHE_DIR).
 """
 
 from __future__ import annotations
