@@ -76,8 +76,10 @@ class CompiledJointPlan(JointPlan):
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records; see `JointPlan.from_bins`."""
-        if u.shape != y.shape or u.shape[-1:] != self.bins.shape:
-            return super().from_bins(u, y)
+        if u.shape[-1:] != self.bins.shape or y.shape[-1:] != self.bins.shape:
+            return super().from_bins(u, y)  # which says what is wrong
+        if u.shape != y.shape:
+            u, y = np.broadcast_arrays(u, y)
         kernel = _kernel()
         shape = y.shape[:-1]
         flat_u, flat_y = (

@@ -70,6 +70,15 @@ def test_one_point_and_more_axes():
     )
 
 
+def test_one_input_for_many_outputs_and_wrong_shapes():
+    plain, compiled = plans(8, BARE)
+    u, y = points(Plant(0.02, 40.0, 8))
+    u = np.broadcast_to(u[0], y.shape)
+    assert_same(compiled.from_bins(u[0], y), plain.from_bins(u, y))
+    with pytest.raises(ValueError, match="y: shape"):
+        compiled.from_bins(u, y[:, :-1])
+
+
 def test_points_that_are_not_ordinary_come_out_as_ever():
     plant = Plant(0.02, 40.0, 8)
     plain, compiled = plans(8, BARE)
