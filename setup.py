@@ -67,6 +67,7 @@ setup(
     # what drives hardware is installed by those who have it
     extras_require={
         "nidaqmx": ["nidaqmx>=1.0,<2"],
+        "compiled": ["numba>=0.68.1,<0.69"],
         "robot": ["ur-rtde>=1.6.5,<1.7"],
         "can": ["python-can>=4.5,<5"],
         "recording": ["rosbags>=0.11.1,<0.12"],

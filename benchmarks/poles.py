@@ -37,6 +37,7 @@ from tactile_resonance.identification.identify import (
     identify_spectra,
 )
 from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.result import PolesBatch, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -103,10 +104,12 @@ class Cell:
     settled_bound: npt.NDArray[np.float64]
 
 
-def joint_plan(plant: Plant, structure: ModelStructure = BARE) -> JointPlan:
+def joint_plan(
+    plant: Plant, structure: ModelStructure = BARE, kind: type[JointPlan] = JointPlan
+) -> JointPlan:
     """Joint estimator for a plant."""
     variance_y, variance_u = plant.noise
-    return JointPlan(
+    return kind(
         SAMPLE_RATE_HZ,
         SAMPLES_PER_PERIOD,
         plant.periods,
@@ -206,12 +209,22 @@ def compare_methods(quick: bool) -> list[Method]:
 
     few_frfs = [_row(frf, k) for k in range(50)]
     for structure, model in ((BARE, "2nd order"), (ModelStructure(), "mode + 6 residual terms")):
-        plan = joint_plan(plant, structure)
-        result, seconds = _timed(lambda p=plan: p.from_bins(joint_u, joint_y))
-        estimates = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
-        add(f"joint, {model}, batched", seconds / runs, estimates)
-        _, seconds = _timed(lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)])
-        add(f"joint, {model}, single", seconds / 50, estimates)
+        for kind, name in ((JointPlan, "joint"), (CompiledJointPlan, "joint compiled")):
+            try:
+                plan = joint_plan(plant, structure, kind)
+            except ImportError as error:
+                nothing = np.full(2, np.nan)
+                methods.append(
+                    Method(f"{name}, {model}", np.nan, nothing, f"not measured: {error}")
+                )
+                continue
+            result, seconds = _timed(lambda p=plan: p.from_bins(joint_u, joint_y))
+            estimates = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
+            add(f"{name}, {model}, batched", seconds / runs, estimates)
+            _, seconds = _timed(
+                lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)]
+            )
+            add(f"{name}, {model}, single", seconds / 50, estimates)
         batch = _repeated(frf, max(1, 5000 // runs))
         result, seconds = _timed(lambda b=batch, s=structure: identify_batch(b, structure=s))
         size = batch.g.shape[0]
@@ -251,10 +264,10 @@ def _row(frf: FRF, k: int) -> FRF:
 
 
 def _timed(call: Callable) -> tuple[PolesBatch, float]:
-    """Result, and the least processor time of five calls after a first one."""
+    """Result, and the least processor time of fifteen calls after a first one."""
     result = call()
     times = []
-    for _ in range(5):
+    for _ in range(15):
         start = time.process_time()
         call()
         times.append(time.process_time() - start)

@@ -86,6 +86,15 @@ class PolynomialBasis:
             ) / scale
         return values, slopes
 
+    def values_at(self, x: ComplexArray) -> ComplexArray:
+        """(..., n + 1) values at other points x (...), without derivatives."""
+        values = np.zeros((*np.shape(x), self.degree + 1), complex)
+        values[..., 0] = 1.0
+        for k in range(self.degree):
+            new = x * values[..., k] - values[..., : k + 1] @ self.hessenberg[: k + 1, k]
+            values[..., k + 1] = new / self.hessenberg[k + 1, k]
+        return values
+
     def second_derivative(self, x: ComplexArray) -> ComplexArray:
         """(..., n + 1) second derivatives at points x (...)."""
         _, slopes = self.at(x)

@@ -34,11 +34,13 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     n = normal.shape[-1]
     diagonal = np.einsum("...ii->...i", normal)
-    bad = ~np.isfinite(normal).all(axis=(-2, -1)) | ~(diagonal > 0).all(axis=-1)
+    # finite as a whole only where every entry is
+    bad = ~(np.isfinite(normal.sum(axis=(-2, -1))) & (diagonal > 0).all(axis=-1))
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(diagonal)
         scaled = normal * scale[..., :, None] * scale[..., None, :]
-    scaled[bad] = np.eye(n)
+    if bad.any():
+        scaled[bad] = np.eye(n)
     try:
         inverse = np.linalg.inv(scaled)
     except np.linalg.LinAlgError:
@@ -48,13 +50,17 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
         bad |= singular
     # rounding can leave a negative variance where the matrix is singular to working precision
     bad |= ~(np.einsum("...ii->...i", inverse) > 0).all(axis=-1)
-    condition = np.sqrt(
-        np.linalg.norm(scaled, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
-    )
+    condition = (_squares(scaled) * _squares(inverse)) ** 0.25
     with np.errstate(invalid="ignore"):
         inverse *= scale[..., :, None] * scale[..., None, :]
-    inverse[bad] = np.nan
-    return inverse, np.where(bad, np.inf, condition)
+    if bad.any():
+        inverse[bad], condition[bad] = np.nan, np.inf
+    return inverse, condition
+
+
+def _squares(matrices: FloatArray) -> FloatArray:
+    """(batch,) sum of the squares of matrices (batch, n, n)."""
+    return np.asarray(np.einsum("bij,bij->b", matrices, matrices))
 
 
 def modes_in_band(

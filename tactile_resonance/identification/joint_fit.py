@@ -219,8 +219,13 @@ def _with_noise(
     """Data with the noise that the bins between harmonics show, its variances, its kind."""
     problem, others = layout.problem, data[0]
     inverse_a, _, model, _ = problem.model(problem.groups[0], others, rough)
-    g = problem.split(rough)[1] @ layout.numerator_on_others.T * inverse_a
-    noise = noise_between_harmonics(others.y - model, u_o, g, layout.noise_bands, problem.sizes[2])
+
+    def response() -> ComplexArray:
+        return np.asarray(problem.split(rough)[1] @ layout.numerator_on_others.T * inverse_a)
+
+    noise = noise_between_harmonics(
+        others.y - model, u_o, response, layout.noise_bands, problem.sizes[2]
+    )
     excited = BinData(
         data[1].y,
         data[1].u,

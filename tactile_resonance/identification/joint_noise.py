@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,10 @@ IntArray = npt.NDArray[np.int64]
 
 # Bins whose powers are averaged before their variances are compared with each other.
 BINS_PER_BAND = 8
+# Fewer are not tested for being equal.
+FEWEST_PIECES = 4
+TINY = float(np.finfo(float).tiny)
+NAMES = np.array(KINDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +88,11 @@ class JointNoise:
 
 
 def noise_between_harmonics(
-    error: ComplexArray, u: ComplexArray, g: ComplexArray, bands: NoiseBands, terms: int
+    error: ComplexArray,
+    u: ComplexArray,
+    response: Callable[[], ComplexArray],
+    bands: NoiseBands,
+    terms: int,
 ) -> JointNoise:
     """Variances of both channels, and what they have in common.
 
@@ -91,8 +100,8 @@ def noise_between_harmonics(
     ----------
     error, u : (batch, K_o) complex
         Y without its transient, and U, between harmonics of the excitation.
-    g : (batch, K_o) complex
-        Response there, from a first fit.
+    response : callable
+        (batch, K_o) response there, from a first fit; asked for only where the channels are alike.
     bands : NoiseBands
     terms : int
         Real coefficients that the transient has taken from `error`.
@@ -106,19 +115,27 @@ def noise_between_harmonics(
     size = error.shape[1]
     dof = max(size - terms / 2, 1.0)
     through = covariance = None
-    power_u = _mean_power(u)
-    cross = np.mean(error * u.conj(), axis=-1, keepdims=True)  # (batch, 1)
-    tiny = np.finfo(float).tiny
-    squared = np.abs(cross) ** 2 / np.maximum(_mean_power(error) * power_u, tiny)
+    power_u, power_error = _mean_power(u), _mean_power(error)
+    cross = (error[:, None] @ u.conj()[..., None])[..., 0] / size  # (batch, 1)
+    squared = np.abs(cross) ** 2 / np.maximum(power_error * power_u, TINY)
     # a squared correlation of n complex samples exceeds x by chance with (1 - x)^(n - 1)
     correlated = squared > 1 - FALSE_ALARM ** (1 / max(size - 1, 1))
-    by_g = g * u
-    explained_g = _mean_power(error) - _mean_power(error - by_g)
+    if not correlated.any():
+        total_power, kind_y = _pieces(error, power_error, bands, size / dof)
+        input_power, kind_u = _pieces(u, power_u, bands, 1.0)
+        variance_y = np.where(total_power > TINY, total_power, 1.0)  # no noise: any weights do
+        means = [power_error * (size / dof), input_power.mean(-1, keepdims=True)]
+        kind = NAMES[np.maximum(kind_y, kind_u)]
+        return JointNoise(
+            variance_y, input_power, variance_y, None, None, np.concatenate(means, -1), kind
+        )
+    by_g = response() * u
+    explained_g = power_error - _mean_power(error - by_g)
     generator = correlated & (explained_g > 0)
     common = correlated & ~generator
     if common.any():
-        gain = cross / np.maximum(power_u, tiny)
-        alike = _mean_power(error) - _mean_power(error - gain * u)
+        gain = cross / np.maximum(power_u, TINY)
+        alike = power_error - _mean_power(error - gain * u)
         generator &= explained_g >= 0.9 * alike
         common = correlated & ~generator
         covariance = np.where(common, cross, 0.0)
@@ -126,32 +143,33 @@ def noise_between_harmonics(
     if generator.any():
         through = np.where(generator, by_g, 0.0 if through is None else through)
     rest = error if through is None else error - through
-    total_power, kind_y = _pieces(error, bands, size / dof)
-    rest_power, kind_rest = (
-        (total_power, kind_y) if through is None else _pieces(rest, bands, size / dof)
-    )
-    input_power, kind_u = _pieces(u, bands, 1.0)
+    power_rest = _mean_power(rest)
+    total_power, _ = _pieces(error, power_error, bands, size / dof)
+    rest_power, kind_rest = _pieces(rest, power_rest, bands, size / dof)
+    input_power, kind_u = _pieces(u, power_u, bands, 1.0)
     kind = np.maximum(kind_rest, np.where(generator[:, 0], 0, kind_u))
     measured = np.where(generator, rest_power, np.where(common, total_power, rest_power))
     variance_u = np.where(generator, 0.0, input_power)
     return JointNoise(
-        np.where(measured > tiny, measured, 1.0),  # no noise at all: any weights do
+        np.where(measured > TINY, measured, 1.0),
         variance_u,
-        np.where(rest_power > tiny, rest_power, 1.0),
+        np.where(rest_power > TINY, rest_power, 1.0),
         covariance,
         through,
-        np.concatenate([_mean_power(rest) * (size / dof), variance_u.mean(-1, keepdims=True)], -1),
-        np.array(KINDS)[kind],
+        np.concatenate([power_rest * (size / dof), variance_u.mean(-1, keepdims=True)], -1),
+        NAMES[kind],
     )
 
 
-def _pieces(values: ComplexArray, bands: NoiseBands, factor: float) -> tuple[FloatArray, IntArray]:
+def _pieces(
+    values: ComplexArray, mean_power: FloatArray, bands: NoiseBands, factor: float
+) -> tuple[FloatArray, IntArray]:
     """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
 
     Flat unless a test says otherwise.
     """
-    mean = _mean_power(values) * factor
-    if bands.starts.size < 4:
+    mean = mean_power * factor
+    if bands.starts.size < FEWEST_PIECES:
         return mean, np.zeros(values.shape[0], np.int64)
     power = values.real**2 + values.imag**2
     sample = np.add.reduceat(power, bands.starts, axis=-1) / bands.counts

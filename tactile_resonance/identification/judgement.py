@@ -200,18 +200,18 @@ def assemble(
         Leading axes, of as many points as the batch has.
     """
     fit = evidence.fit
-    hopeless = ~(
-        fit.converged & evidence.enough & (fit.condition_number < LARGEST_CONDITION_NUMBER)
-    )
+    conditioned = fit.condition_number < LARGEST_CONDITION_NUMBER
+    # a model that the lines do not determine has no poles worth a number
+    undetermined = ~(evidence.enough & conditioned)
+    hopeless = undetermined | ~fit.converged
     covariance, total = evidence.covariance, evidence.total_covariance
     if hopeless.any():
         covariance, total = covariance.copy(), total.copy()
         covariance[hopeless] = total[hopeless] = np.nan
     quantities = pole_quantities(fit.model, band_hz, covariance)
-    # a model that the lines do not determine has no poles worth a number
-    undetermined = ~(evidence.enough & (fit.condition_number < LARGEST_CONDITION_NUMBER))
-    for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
-        quantities[name][undetermined] = np.nan
+    if undetermined.any():
+        for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
+            quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
     total_f0_damping = np.full_like(quantities["covariance"], np.nan)
     rows = np.flatnonzero(np.isfinite(total).any(axis=(-2, -1)))
@@ -229,7 +229,7 @@ def assemble(
             (evidence.suspect, PolesStatus.MODEL_ERROR),
             ((poles.real >= 0).any(axis=-1), PolesStatus.UNSTABLE_POLE),
             (~np.isfinite(poles).any(axis=-1), PolesStatus.NO_RESONANCE),
-            (~(fit.condition_number < LARGEST_CONDITION_NUMBER), PolesStatus.ILL_CONDITIONED),
+            (~conditioned, PolesStatus.ILL_CONDITIONED),
             (~fit.converged, PolesStatus.NOT_CONVERGED),
             (~evidence.enough, PolesStatus.TOO_FEW_LINES),
         ):

@@ -101,8 +101,8 @@ class RationalModel:
     def response(self, frequency_hz: FloatArray) -> ComplexArray:
         """(..., F) the model at any frequencies (F,)."""
         x = self.variable.of_frequency(frequency_hz)
-        a = self.denominator @ self.denominator_basis.at(x)[0].T
-        b = self.numerator @ self.numerator_basis.at(x)[0].T
+        a = self.denominator @ self.denominator_basis.values_at(x).T
+        b = self.numerator @ self.numerator_basis.values_at(x).T
         phase = 2 * np.pi * np.asarray(frequency_hz) * np.asarray(self.delay_s)[..., None]
         return b / a * np.exp(-1j * phase)
 
@@ -124,7 +124,7 @@ class RationalModel:
         values, slopes = self.denominator_basis.at(x)
         # A(x; a) = 0 along the root: dx = - dA / A'
         factor = self.variable.to_s(x)[1] / _dot(slopes, self.denominator)
-        residues = _dot(self.numerator_basis.at(x)[0], self.numerator) * factor
+        residues = _dot(self.numerator_basis.values_at(x), self.numerator) * factor
         return residues, values[..., :-1] * -factor[..., None]
 
     def zero_sensitivity(self, zeros_rad_s: ComplexArray) -> ComplexArray:

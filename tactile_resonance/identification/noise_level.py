@@ -9,6 +9,7 @@ lines, or changes slowly, one smooth curve over the band is far better known.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -170,10 +171,17 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
 
 def is_flat(variance: FloatArray, dof: int) -> bool:
     """Whether the test of `model_variance` finds every point of (batch, F) variances flat."""
+    lines = variance.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread = np.log(variance.mean(axis=-1)) - np.log(variance).mean(axis=-1)
-    limit = _bartlett_limit(np.array(variance.shape[-1]), dof, 1)
+        spread = np.log(variance.sum(axis=-1) / lines) - np.log(variance).sum(axis=-1) / lines
+    limit = flat_limit(lines, dof)
     return bool((spread <= limit).all())  # NaN, where a variance is not positive, is not flat
+
+
+@lru_cache(maxsize=256)
+def flat_limit(lines: int, dof: int) -> float:
+    """Largest ``log mean - mean log`` that `is_flat` lets pass."""
+    return float(_bartlett_limit(np.array(lines), dof, 1))
 
 
 def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> FloatArray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,6 @@ from tactile_resonance.identification.bins import BinData, BinGroup
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,22 +31,26 @@ class StackedBasis:
         Of the free coefficients of A, then B, then C; 0 where a group has none.
     last : (K,) complex
         Of the fixed coefficient of A.
-    kind : (n,) int
-        0 for A, 1 for B, 2 for C.
+    real, conjugate : (n, 2 K) float
+        The rows, and their conjugates, as real and imaginary parts in turn.
+    kinds : tuple of slice
+        Rows of A, of B, of C.
     parts : tuple of slice
         Bins of each group.
     """
 
     rows: ComplexArray
     last: ComplexArray
-    kind: IntArray
+    real: FloatArray
+    conjugate: FloatArray
+    kinds: tuple[slice, slice, slice]
     parts: tuple[slice, ...]
 
     @classmethod
     def of(cls, groups: Sequence[BinGroup], sizes: tuple[int, int, int]) -> StackedBasis:
         """Stack of groups with these numbers of free coefficients."""
         edges = np.cumsum([0] + [group.size for group in groups])
-        parts = tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
+        parts = tuple(slice(int(a), int(b)) for a, b in pairwise(edges))
         offset = np.cumsum([0, *sizes])
         rows = np.zeros((offset[3], edges[-1]), complex)
         for group, part in zip(groups, parts, strict=True):
@@ -55,7 +59,8 @@ class StackedBasis:
                 if block is not None:
                     rows[first:end, part] = block.T
         last = np.concatenate([group.denominator[:, -1] for group in groups])
-        return cls(rows, last, np.repeat(np.arange(3), sizes), parts)
+        a, b, c = (slice(int(i), int(j)) for i, j in pairwise(offset))
+        return cls(rows, last, rows.view(float), rows.conj().view(float), (a, b, c), parts)
 
 
 class OnePoint:
@@ -70,83 +75,97 @@ class OnePoint:
 
     def __init__(self, basis: StackedBasis, data: Sequence[BinData]) -> None:
         self._basis = basis
-        sizes = [part.stop - part.start for part in basis.parts]
-        self._y = data[0].y[0] if len(data) == 1 else np.concatenate([v.y[0] for v in data])
-        inputs = [
-            np.ones(size, complex) if v.u is None else v.u[0]
-            for v, size in zip(data, sizes, strict=True)
-        ]
-        self._u = np.concatenate(inputs)
-        self._variance_y = _stacked([v.variance_y for v in data], sizes)
+        size = basis.last.size
+        self._y = np.empty(size, complex)
+        self._u = np.ones(size, complex)
+        self._variance_y = np.empty(size)
         self._variance_u: FloatArray | None = None
         self._covariance: ComplexArray | None = None
-        if any(v.variance_u is not None for v in data):
-            self._variance_u = _stacked([v.variance_u for v in data], sizes)
-        if any(v.covariance_yu is not None for v in data):
-            self._covariance = _stacked([v.covariance_yu for v in data], sizes)
-        self._columns = np.empty((3, self._y.size), complex)
-        self._columns[1] = -self._u
-        self._columns[2] = -1.0
+        for values, part in zip(data, basis.parts, strict=True):
+            self._y[part] = values.y[0]
+            self._variance_y[part] = values.variance_y[0]
+            if values.u is not None:
+                self._u[part] = values.u[0]
+            if values.variance_u is not None:
+                if self._variance_u is None:
+                    self._variance_u = np.zeros(size)
+                self._variance_u[part] = values.variance_u[0]
+            if values.covariance_yu is not None:
+                if self._covariance is None:
+                    self._covariance = np.zeros(size, complex)
+                self._covariance[part] = values.covariance_yu[0]
+        self._jacobian = np.empty(basis.rows.shape, complex)
+
+    @property
+    def weighted_power(self) -> float:
+        """``sum |y|^2 / s_Y^2``."""
+        y = self._y
+        return float((y.real**2 + y.imag**2) @ (1 / self._variance_y))
 
     def linearise(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (1, groups), half its gradient (1, n), normals (1, groups, n, n) at theta (1, n)."""
+        """Cost (groups,), half its gradient (n,), normals (groups, n, n) at theta (n,)."""
         basis = self._basis
-        values = self._values(theta[0])
-        inverse = 1 / values[0]
-        g = values[1] * inverse
-        model = (values[1] * self._u + values[2]) * inverse
-        weight = 1 / self._variance_y
+        a, b, c = (self._value(which, theta) for which in range(3))
+        inverse = 1 / a
+        g = b * inverse
+        model = g * self._u
+        model += c * inverse
+        variance = self._variance_y
         if self._variance_u is not None:
-            variance = self._variance_y + self._variance_u * (g.real**2 + g.imag**2)
+            variance = variance + self._variance_u * (g.real**2 + g.imag**2)
             if self._covariance is not None:
                 variance -= 2 * np.real(self._covariance * g.conj())
-            weight = 1 / variance
-        root = np.sqrt(weight)
-        error = (self._y - model) * root
-        self._columns[0] = model
-        jacobian = (self._columns * (inverse * root))[basis.kind]
-        jacobian *= basis.rows
-        real, flat = jacobian.view(float), error.view(float)
+        root = 1 / np.sqrt(variance)
+        error = self._y - model
+        error *= root
+        real = self._weighted_jacobian(model, inverse * root)
+        flat = error.view(float)
         gradient = real @ flat
         if self._variance_u is not None:
             slope = self._variance_u * g.conj()
             if self._covariance is not None:
                 slope -= self._covariance.conj()
-            h = (error.real**2 + error.imag**2) * weight * slope * inverse
-            by_kind = np.array([h * g, -h, np.zeros_like(h)])
-            gradient += np.einsum("nk,nk->n", by_kind[basis.kind], basis.rows).real
+            h = (error.real**2 + error.imag**2) / variance * slope * inverse
+            for_a, for_b, _ = basis.kinds
+            gradient[for_a] += basis.conjugate[for_a] @ (h * g).view(float)
+            gradient[for_b] -= basis.conjugate[for_b] @ h.view(float)
         n = gradient.size
-        normal = np.empty((1, len(basis.parts), n, n))
-        cost = np.empty((1, len(basis.parts)))
+        normal = np.empty((len(basis.parts), n, n))
+        cost = np.empty(len(basis.parts))
         for k, part in enumerate(basis.parts):
             here = slice(2 * part.start, 2 * part.stop)
-            np.matmul(real[:, here], real[:, here].T, out=normal[0, k])
-            cost[0, k] = flat[here] @ flat[here]
-        return cost, gradient[None], normal
+            np.matmul(real[:, here], real[:, here].T, out=normal[k])
+            cost[k] = flat[here] @ flat[here]
+        return cost, gradient, normal
 
     def start(self, iterations: int) -> FloatArray:
-        """(1, n) coefficients by Sanathanan-Koerner iterations."""
+        """(n,) coefficients by Sanathanan-Koerner iterations."""
         basis = self._basis
         root = 1 / np.sqrt(self._variance_y)
-        self._columns[0] = self._y
         right = -self._y * basis.last
         theta = np.empty(0)
         for iteration in range(iterations):
-            scale = root if iteration == 0 else root / np.abs(self._values(theta)[0])
-            jacobian = (self._columns * scale)[basis.kind]
-            jacobian *= basis.rows
-            real = jacobian.view(float)
+            scale = root if iteration == 0 else root / np.abs(self._value(0, theta))
+            real = self._weighted_jacobian(self._y, scale)
             theta = solve_one(real @ real.T, real @ (right * scale).view(float))
-        return theta[None]
+        return theta
 
-    def _values(self, theta: FloatArray) -> ComplexArray:
-        """(3, K) A, B and C."""
-        basis = self._basis
-        coefficients = np.zeros((3, theta.size))
-        coefficients[basis.kind, np.arange(theta.size)] = theta
-        values = (coefficients @ basis.rows.view(float)).view(complex)
-        values[0] += basis.last
-        return values
+    def _weighted_jacobian(self, y: ComplexArray, weight: npt.NDArray) -> FloatArray:
+        """(n, 2 K) real and imaginary parts of ``weight (y p, -u q, -t)``; valid until the next call."""
+        rows, jacobian = self._basis.rows, self._jacobian
+        for_a, for_b, for_c = self._basis.kinds
+        np.multiply(rows[for_a], y * weight, out=jacobian[for_a])
+        np.multiply(rows[for_b], -self._u * weight, out=jacobian[for_b])
+        np.multiply(rows[for_c], -weight, out=jacobian[for_c])
+        return jacobian.view(float)
+
+    def _value(self, which: int, theta: FloatArray) -> ComplexArray:
+        """(K,) of A (0), B (1) or C (2)."""
+        kind = self._basis.kinds[which]
+        value = (theta[kind] @ self._basis.real[kind]).view(complex)
+        if which == 0:
+            value += self._basis.last
+        return value
 
 
 def solve_one(normal: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:
@@ -157,15 +176,3 @@ def solve_one(normal: FloatArray, gradient: FloatArray, damping: float = 0.0) ->
     scaled.flat[:: scale.size + 1] = 1 + 1e-15 + damping
     _, step, fault = lapack.dposv(scaled, gradient * scale)
     return step * scale if fault == 0 else np.full(scale.size, np.nan)
-
-
-def _stacked(arrays: Sequence[npt.NDArray | None], sizes: Sequence[int]) -> npt.NDArray:
-    """(K,) of (1, k) or (1, 1) arrays; 0 where there is none."""
-    return np.concatenate(
-        [
-            np.zeros(size)
-            if a is None
-            else (a[0] if a.shape[-1] == size else np.full(size, a[0, 0]))
-            for a, size in zip(arrays, sizes, strict=True)
-        ]
-    )

@@ -193,12 +193,16 @@ def whiteness(residual: ComplexArray) -> FloatArray:
     """
     first, second = residual[..., :-1], residual[..., 1:]
     there = residual != 0
-    pairs = np.sum(there[..., :-1] & there[..., 1:], axis=-1)
-    used = np.maximum(np.sum(there, axis=-1), 1)
-    power = np.sum(residual.real**2 + residual.imag**2, axis=-1) / used
+    if there.all():
+        used = np.asarray(max(residual.shape[-1], 1))
+        pairs = np.asarray(residual.shape[-1] - 1)
+    else:
+        used = np.maximum(there.sum(axis=-1), 1)
+        pairs = (there[..., :-1] & there[..., 1:]).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        together = np.sum(first.real * second.real + first.imag * second.imag, axis=-1)
-        return np.asarray(together / (power * np.sqrt(pairs / 2)))
+        power = (residual.real**2 + residual.imag**2).sum(axis=-1) / used
+        together = (first.real * second.real + first.imag * second.imag).sum(axis=-1)
+        return np.asarray(together / (power * np.sqrt(np.maximum(pairs, 0) / 2)))
 
 
 def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:

@@ -120,12 +120,15 @@ class Problem:
         inverse_a = np.conj(a)
         inverse_a *= inverse_2
         g = None
-        y = np.zeros_like(inverse_a)
-        if group.numerator is not None:
-            g = group.evaluate(1, beta) * inverse_a
-            y = g if data.u is None else g * data.u
         if group.transient is not None:
-            y = y + group.evaluate(2, gamma) * inverse_a
+            y = group.evaluate(2, gamma)
+            y *= inverse_a
+        else:
+            y = np.zeros_like(inverse_a)
+        if group.numerator is not None:
+            g = group.evaluate(1, beta)
+            g *= inverse_a
+            y += g if data.u is None else g * data.u
         return inverse_a, inverse_2, y, g
 
     def linearise(
@@ -169,18 +172,19 @@ class Problem:
         """(batch, n) start values and one Gauss-Newton step: residuals are then all but noise."""
         if data[0].y.shape[0] == 1:
             point = OnePoint(self.stacked, data)
-            theta = point.start(START_ITERATIONS)
-            _, gradient, normal = point.linearise(theta)
-        else:
-            theta = self.start(data)
-            _, gradient, normal = self.linearise(data, theta)
+            begin = point.start(START_ITERATIONS)
+            _, gradient, normal = point.linearise(begin)
+            step = _solve_one(normal.sum(axis=0), gradient)[0]
+            return (begin - step if np.isfinite(step).all() else begin)[None]
+        theta = self.start(data)
+        _, gradient, normal = self.linearise(data, theta)
         moved = theta - solve_scaled(normal.sum(axis=1), gradient)[0]
         return np.where(np.isfinite(moved).all(axis=-1, keepdims=True), moved, theta)
 
     def first(self, data: Sequence[BinData]) -> FloatArray:
         """(batch, n) start values."""
         if data[0].y.shape[0] == 1:
-            return OnePoint(self.stacked, data).start(START_ITERATIONS)
+            return OnePoint(self.stacked, data).start(START_ITERATIONS)[None]
         return self.start(data)
 
     def start(self, data: Sequence[BinData], iterations: int = START_ITERATIONS) -> FloatArray:
@@ -238,10 +242,6 @@ def solve_scaled(
 ) -> tuple[FloatArray, FloatArray]:
     """``(N + damping diag N)^-1 gradient`` (batch, n), and the gradient times it (batch,)."""
     n = normal.shape[-1]
-    if normal.shape[0] == 1:
-        one = solve_one(normal[0], gradient[0], float(np.ravel(damping)[0]))
-        if np.isfinite(one).all():
-            return one[None], np.array([gradient[0] @ one])
     diagonal = np.einsum("...ii->...i", normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.where(diagonal > 0, 1 / np.sqrt(diagonal), 1.0)
@@ -259,6 +259,18 @@ def solve_scaled(
         step = (np.linalg.pinv(scaled) @ right[..., None])[..., 0]
     step[bad] = np.nan
     return np.asarray(step * scale, float), np.asarray(np.einsum("...i,...i->...", step, right))
+
+
+def _solve_one(
+    normal: FloatArray, gradient: FloatArray, damping: float = 0.0
+) -> tuple[FloatArray, float]:
+    """As `solve_scaled`, for one point (n, n), (n,)."""
+    step = solve_one(normal, gradient, damping)
+    decrement = float(gradient @ step)
+    if np.isfinite(decrement):
+        return step, decrement
+    steps, decrements = solve_scaled(normal[None], gradient[None], np.array([damping]))
+    return steps[0], float(decrements[0])
 
 
 def minimise(
@@ -287,11 +299,54 @@ def minimise(
             rows = slice(first, first + chunk)
             part = [values.rows(rows) for values in data] if batch > chunk else list(data)
             begin = problem.first(part) if start is None else start[rows]
-            parts.append(_minimise_chunk(problem, part, begin, max_iterations))
+            solver = _minimise_one if batch == 1 else _minimise_chunk
+            parts.append(solver(problem, part, begin, max_iterations))
     if len(parts) == 1:
         return parts[0]
     fields = ("theta", "normal", "cost", "group_cost", "converged", "iterations")
     return Solution(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
+
+
+def _minimise_one(
+    problem: Problem, data: list[BinData], start: FloatArray, max_iterations: int
+) -> Solution:
+    """As `_minimise_chunk`, for a batch of one: no masks."""
+    point = OnePoint(problem.stacked, data)
+    theta = start[0]
+    free = max(2 * sum(group.size for group in problem.groups) - theta.size, 1)
+    floor = ROUNDING**2 * point.weighted_power
+    group_cost, gradient, normal = point.linearise(theta)
+    cost = float(group_cost.sum())
+    damping = 0.0
+    converged = False
+    iterations = 0
+    for _ in range(max_iterations):
+        step, decrement = _solve_one(normal.sum(axis=0), gradient, damping)
+        if damping == 0 and decrement <= max(STEP_TOLERANCE**2 * cost / free, floor):
+            theta = theta - step
+            cost -= decrement
+            converged = True
+            break
+        if not np.isfinite(decrement) or damping > 1e10:
+            break
+        trial = theta - step
+        trial_cost, trial_gradient, trial_normal = point.linearise(trial)
+        total = float(trial_cost.sum())
+        iterations += 1
+        if total <= cost * (1 + 1e-12) + floor:
+            theta, cost, group_cost = trial, total, trial_cost
+            gradient, normal = trial_gradient, trial_normal
+            damping = 0.0 if damping < 1e-4 else damping / 10
+        else:
+            damping = max(10 * damping, 1e-3)
+    return Solution(
+        theta[None],
+        normal[None],
+        np.array([cost]),
+        group_cost[None],
+        np.array([converged]),
+        np.array([iterations]),
+    )
 
 
 def _minimise_chunk(
@@ -303,14 +358,7 @@ def _minimise_chunk(
     floor = ROUNDING**2 * sum(
         np.sum((v.y.real**2 + v.y.imag**2) / v.variance_y, axis=-1) for v in data
     )
-    point = OnePoint(problem.stacked, data) if batch == 1 else None
-
-    def linearise(
-        points: list[BinData], at: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return problem.linearise(points, at) if point is None else point.linearise(at)
-
-    group_cost, gradient, normal = linearise(data, theta)
+    group_cost, gradient, normal = problem.linearise(data, theta)
     theta = theta.copy()
     cost = group_cost.sum(axis=-1)
     damping = np.zeros(batch)
@@ -336,7 +384,7 @@ def _minimise_chunk(
             active, step = active[keep], step[keep]
             work = [values.rows(active) for values in data]
         trial = theta[active] - step
-        trial_cost, trial_gradient, trial_normal = linearise(work, trial)
+        trial_cost, trial_gradient, trial_normal = problem.linearise(work, trial)
         total = trial_cost.sum(axis=-1)
         iterations[active] += 1
         # rounding of the cost itself must not count as an increase

@@ -49,9 +49,9 @@ def test_equal_the_batch(errors_in_variables, transient):
     for k in range(5):
         row = [values.rows(slice(k, k + 1)) for values in data]
         point = OnePoint(problem.stacked, row)
-        assert point.start(2)[0] == pytest.approx(start[k], rel=1e-9)
+        assert point.start(2) == pytest.approx(start[k], rel=1e-9)
         cost, gradient, square = (values[k] for values in whole)
-        mine = [values[0] for values in point.linearise(start[k : k + 1])]
+        mine = point.linearise(start[k])
         assert mine[0] == pytest.approx(cost, rel=1e-10)
         # near the minimum the gradient is a small difference of products this large
         size = np.sqrt(cost.sum() * np.diag(square.sum(axis=0)).max())
@@ -68,12 +68,12 @@ def test_gradient_is_that_of_the_cost():
     problem, data = problem_and_data(1, True, True)
     point = OnePoint(problem.stacked, data)
     theta = point.start(2)
-    gradient = point.linearise(theta)[1][0]
+    gradient = point.linearise(theta)[1]
     for k in range(theta.size):
         step = np.zeros_like(theta)
-        step[0, k] = 1e-6 * max(abs(theta[0, k]), 0.1)
+        step[k] = 1e-6 * max(abs(theta[k]), 0.1)
         up, down = (point.linearise(theta + sign * step)[0].sum() for sign in (1, -1))
-        slope = (up - down) / (2 * step[0, k])
+        slope = (up - down) / (2 * step[k])
         assert 2 * gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
 
 

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint estimator through compiled code: the same answers, for one mode, in less time.
+
+`numba` is an optional dependency (``pip install tactile_resonance[compiled]``); the first fit of a
+process loads the compiled code, the first one after an installation compiles it, which takes some
+ten seconds. numba keeps it beside the source or, where that cannot be written, in its own cache
+(NUMBA_CACHE_DIR).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from tactile_resonance.identification.covariance import BAND_MARGIN
+from tactile_resonance.identification.joint import METHOD, JointPlan
+from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
+from tactile_resonance.identification.judgement import (
+    LARGEST_CONDITION_NUMBER,
+    MODEL_ERROR_PROBABILITY,
+)
+from tactile_resonance.identification.model import RationalModel
+from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
+from tactile_resonance.identification.result import (
+    SMOOTH_RESIDUAL,
+    STATUS_CODE,
+    PolesBatch,
+    PolesStatus,
+)
+from tactile_resonance.identification.solver import (
+    MAX_ITERATIONS,
+    ROUNDING,
+    START_ITERATIONS,
+    STEP_TOLERANCE,
+)
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledJointPlan(JointPlan):
+    """`JointPlan` whose ordinary points are fitted by compiled code.
+
+    Ordinary is a point with finite bins, noise that is flat and independent on both channels, a fit
+    that converges without damping and that nothing contradicts, and its pole in the band. All
+    others are fitted by `JointPlan`.
+
+    Raises
+    ------
+    ImportError
+        Without numba.
+    ValueError
+        As `JointPlan`, and for structures other than one mode in the s-domain, and where there are
+        no bins between harmonics.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.structure.order != 2 or self.structure.domain != "s":
+            raise ValueError(
+                f"structure: order {self.structure.order} in {self.structure.domain}, compiled is "
+                "order 2 in s"
+            )
+        if self.other_bins.size == 0:
+            raise ValueError(
+                f"periods: {self.periods} without bins between harmonics, compiled needs at least 2 "
+                "periods of a periodic input"
+            )
+        _kernel()
+
+    def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
+        """Poles from the bins of the band of the DFT of whole records; see `JointPlan.from_bins`."""
+        if u.shape[-1:] != self.bins.shape or y.shape[-1:] != self.bins.shape:
+            return super().from_bins(u, y)  # which says what is wrong
+        if u.shape != y.shape:
+            u, y = np.broadcast_arrays(u, y)
+        kernel = _kernel()
+        shape = y.shape[:-1]
+        flat_u, flat_y = (
+            np.ascontiguousarray(v, complex).reshape(-1, self.bins.size) for v in (u, y)
+        )
+        batch = flat_y.shape[0]
+        n = sum(self.problem.sizes)
+        ordinary = np.zeros(batch, bool)
+        theta = np.empty((batch, n))
+        covariance = np.empty((batch, n, n))
+        residual = np.empty((batch, self.excited_bins.size), complex)
+        figures = np.empty((batch, kernel.FIGURES))
+        out = (ordinary, theta, covariance, residual, figures)
+        kernel.fit_points(flat_u, flat_y, *self._constants, out)
+        result = self._ordinary(kernel, theta, covariance, residual, figures)
+        if not ordinary.all():
+            rows = np.flatnonzero(~ordinary)
+            result = _replaced(result, rows, super().from_bins(flat_u[rows], flat_y[rows]))
+        return result if shape == (batch,) else _reshaped(result, shape)
+
+    def _ordinary(
+        self,
+        kernel: Any,
+        theta: FloatArray,
+        covariance: FloatArray,
+        residual: ComplexArray,
+        figures: FloatArray,
+    ) -> PolesBatch:
+        batch = theta.shape[0]
+        a, b, _ = self.problem.sizes
+        denominator = np.ones((batch, a + 1))
+        denominator[:, :a] = theta[:, :a]
+        pole, of_pole, of_f0 = kernel.POLE, kernel.POLE_COVARIANCE, kernel.COVARIANCE
+        places = figures[:, pole : pole + 4].copy().view(complex)
+        return PolesBatch(
+            poles_rad_s=places[:, :1],
+            f0_hz=figures[:, kernel.F0_HZ, None],
+            damping_ratio=figures[:, kernel.DAMPING, None],
+            residues=places[:, 1:],
+            covariance=figures[:, of_f0 : of_f0 + 4].reshape(batch, 1, 2, 2),
+            total_covariance=np.full((batch, 1, 2, 2), np.nan),
+            pole_covariance=figures[:, of_pole : of_pole + 4].reshape(batch, 1, 2, 2),
+            coefficient_covariance=covariance,
+            cost=figures[:, kernel.COST],
+            expected_cost=figures[:, kernel.EXPECTED],
+            condition_number=figures[:, kernel.CONDITION],
+            residual=residual,
+            lines=np.full(batch, self.excited_bins.size),
+            status_code=np.full(batch, STATUS_CODE[PolesStatus.OK], np.uint8),
+            noise_variance=figures[:, kernel.NOISE_Y : kernel.NOISE_Y + 2],
+            fit=RationalModel(
+                denominator,
+                theta[:, a : a + b],
+                self.variable,
+                self.denominator_basis,
+                self.numerator_basis,
+                theta[:, a + b :],
+            ),
+            structure=self.structure,
+            band_hz=self.band_hz,
+            variance_model=np.full(batch, "flat", "U8"),
+            method=METHOD,
+        )
+
+    @cached_property
+    def _constants(self) -> tuple:
+        """Arguments of `joint_kernel.fit_points` between the bins and the results."""
+        a, b, c = self.problem.sizes
+        groups, places = [], []
+        for group in self.problem.groups:
+            size = group.size
+            parts = []
+            for basis in (group.denominator, group.numerator, group.transient):
+                rows = np.empty((0, size), complex) if basis is None else basis.T
+                parts += [np.ascontiguousarray(rows.real), np.ascontiguousarray(rows.imag)]
+            groups.append(tuple(parts))
+            inputs = np.arange(a, a + b) if group.numerator is not None else np.empty(0, int)
+            places.append(np.concatenate([np.arange(a), inputs, np.arange(a + b, a + b + c)]))
+        bands = self.noise_bands
+        others = self.other_bins.size
+        margin = BAND_MARGIN * (self.band_hz[1] - self.band_hz[0])
+        tested = bands.starts.size >= FEWEST_PIECES
+        limits = np.array(
+            [
+                1 - FALSE_ALARM ** (1 / max(others - 1, 1)),
+                flat_limit(bands.starts.size, BINS_PER_BAND) if tested else 0.0,
+                others / max(others - c / 2, 1.0),
+                ROUNDING**2,
+                STEP_TOLERANCE**2 / max(2 * self.bins.size - (a + b + c), 1),
+                MAX_ITERATIONS,
+                special.ndtri(1 - MODEL_ERROR_PROBABILITY),
+                SMOOTH_RESIDUAL,
+                LARGEST_CONDITION_NUMBER,
+                self.variable.scale_rad_s,
+                self.band_hz[0] - margin,
+                self.band_hz[1] + margin,
+            ]
+        )
+        return (
+            (self.other_bins - self.bins[0], self.excited_bins - self.bins[0]),
+            tuple(groups),
+            tuple(places),
+            (a, b, START_ITERATIONS),
+            (bands.starts, bands.counts),
+            (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),
+            limits,
+        )
+
+
+def _kernel() -> Any:
+    try:
+        from tactile_resonance.identification import joint_kernel
+    except ImportError as error:
+        raise ImportError(
+            f"{error}: the compiled estimator needs numba (pip install tactile_resonance[compiled])"
+        ) from error
+    return joint_kernel
+
+
+def _arrays(result: PolesBatch) -> dict[str, Any]:
+    values = {f.name: getattr(result, f.name) for f in fields(result)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def _replaced(result: PolesBatch, rows: npt.NDArray, other: PolesBatch) -> PolesBatch:
+    """With other results in some rows."""
+
+    def merged(values: npt.NDArray, new: npt.NDArray) -> npt.NDArray:
+        values = values.astype(np.result_type(values, new))
+        values[rows] = new
+        return values
+
+    theirs = _arrays(other)
+    model = replace(
+        result.fit,
+        denominator=merged(result.fit.denominator, other.fit.denominator),
+        numerator=merged(result.fit.numerator, other.fit.numerator),
+        transient=merged(result.fit.transient, other.fit.transient),
+    )
+    changed: dict[str, Any] = {
+        name: merged(values, theirs[name]) for name, values in _arrays(result).items()
+    }
+    return replace(result, fit=model, **changed)
+
+
+def _reshaped(result: PolesBatch, shape: tuple[int, ...]) -> PolesBatch:
+    """With leading axes `shape` instead of one of all points."""
+
+    def batch(values: npt.NDArray) -> npt.NDArray:
+        return values.reshape((*shape, *values.shape[1:]))
+
+    model = result.fit
+    model = replace(
+        model,
+        denominator=batch(model.denominator),
+        numerator=batch(model.numerator),
+        transient=batch(model.transient),
+    )
+    changed: dict[str, Any] = {name: batch(values) for name, values in _arrays(result).items()}
+    return replace(result, fit=model, **changed)
