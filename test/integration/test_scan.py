@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan through robot, load cell and all nodes: killed in the middle, resumed, every message in its file."""
+
+import os
+import signal
+from collections import Counter
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+pytest.importorskip("rtde_control", reason="ur-rtde is not here")
+
+from rosbags.rosbag2 import Reader
+from tactile_resonance.action import Scan
+
+from tactile_resonance.commands.scan import NODES
+from tactile_resonance.commands.simulate_ur import TABLE_IN_BASE
+from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.processes import NodeProcesses, may_take_priority
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.truth import truth_of
+
+SCENE = """
+name: three points
+force_n: 0.01
+regions:
+  - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.0, 0.0], radius_m: 0.025}}
+positions:
+  list: [[0.0, 0.0], [0.004, 0.0], [0.004, 0.004]]
+precision: {f0_std_hz: 0.02}
+blocks: {least: 3, most: 4}
+"""
+HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.9"
+
+
+@pytest.mark.skipif(
+    not may_take_priority(20), reason="a simulated robot beside nodes on these cores needs rtprio"
+)
+def test_a_scan_is_killed_and_resumed(domain, tmp_path):
+    scene, run_path = tmp_path / "three.yaml", tmp_path / "run"
+    scene.write_text(SCENE)
+    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
+    parameters = {
+        "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": table},
+        "excitation_node": {"record_folder": tmp_path / "records"},
+        "contact_node": {"robot_host": HOST, "force_host": HOST},
+        "scan_node": {"table_in_base": table},
+    }
+    with NodeProcesses(tmp_path / "log") as nodes, ScanClient(lambda: None) as client:
+        nodes.bring_up(NODES, parameters)
+        client.wait_until_up(90.0)
+        heard = []
+        client.start(Scan.Goal(scene=str(scene), run_directory=str(run_path)), heard.append)
+        client.wait(
+            lambda: heard and heard[-1].finished >= 1 and heard[-1].phase == "measure",
+            90.0,
+            "a point",
+        )
+        process = nodes._processes.pop("scan_node")
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        before = read_run(run_path)
+        assert before.problems == ()
+        assert [r.index for r in before.results] == [0]
+        # started anew, brought up by the manager, and on it goes
+        nodes.start("scan_node", parameters["scan_node"])
+        goal = Scan.Goal(run_directory=str(run_path), resume=True)
+        result = client.scan(goal, heard.append, 180.0)
+    assert result.outcome == Scan.Result.COMPLETE, result.message
+    assert (result.done, result.failed, result.skipped) == (3, 0, 0)
+    run = read_run(run_path)
+    assert run.problems == ()
+    assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0), (2, 0)]
+
+    for point in run.results:
+        # a centinewton, as the load cell of 1 mN noise tells it, over the blocks of the point
+        assert point.force_n == pytest.approx(0.01, abs=3e-4)
+        # poles of this gelatine at that force; 0.22 Hz per millinewton, and creep of up to 0.2 Hz
+        bench = SimulatedBench.from_configuration()
+        modes = truth_of(bench.coupled(read_tissues().gelatine(10.0), force_n=point.force_n)).modes
+        f0_hz = min((mode.f0_hz for mode in modes), key=lambda f: abs(f - 250))
+        assert abs(point.f0_hz - f0_hz) < 0.2 + 5 * point.f0_std_hz
+        assert point.simulated
+
+    # an independent reader finds every block's record, FRF and poles
+    with Reader(run_path / "recording") as reader:
+        counts = Counter(connection.topic for connection, _, _ in reader.messages())
+    air = 2 * 3
+    blocks = sum(point.blocks for point in run.results) + air
+    assert counts["/record"] == counts["/frf"] == counts["/poles"] == blocks
+    assert counts["/point_result"] == 3
+    assert counts["/wrench"] > 100
+    assert np.isfinite([point.force_std_n for point in run.results]).any()
