@@ -14,8 +14,10 @@ from tactile_resonance.frf.spectra import period_spectra
 Samples = npt.NDArray[np.floating]
 Lines = npt.NDArray[np.integer]
 
-FLAT_TOP = 3.0
-"""So many times as many samples at the largest value as at the next are a clipped peak."""
+SHARE_AT_TOP = 1 / np.sqrt(2)
+"""Largest share of a quantised peak's two topmost values that is at the top: a parabola's, cut at both."""
+GRID_SAMPLES, FEW_ALIKE = 2000, 0.98
+"""Samples of a converter that counts repeat each other; these many tell."""
 LARGE_OFFSET = 0.1
 """Mean against the rms of the rest."""
 LARGE_DRIFT = 0.05
@@ -56,7 +58,7 @@ def saturation(x: Samples, channel: str, range_v: tuple[float, float] | None) ->
         count = int(np.count_nonzero((record <= low + margin) | (record >= high - margin)))
         where = f"at the ends of its range ({low:g} to {high:g} V)"
     else:
-        count = sum(_clipped(sign * record) for sign in (1, -1))
+        count = sum(_clipped(sign * record, x.shape[0]) for sign in (1, -1))
         where = "on flat tops"
     if count == 0:
         return []
@@ -180,11 +182,11 @@ def unsettled(x: Samples, channel: str, harmonics: Lines, *, spoils: bool) -> li
     return [Fault(FaultKind.UNSETTLED, channel, float(10 ** (level / 20)), spoils, text)]
 
 
-def _clipped(record: Samples) -> int:
+def _clipped(record: Samples, periods: int) -> int:
     """How many samples stand at the largest value, if suspiciously many, else 0.
 
     Without clipping the values thin out towards the largest; of a quantised sine at most 2.4 times
-    as many stand at the largest value as at the next.
+    as many stand at the largest value as at the next. A few more may by chance (binomial test).
     """
     largest = record.max()
     rest = record[record < largest]
@@ -192,7 +194,14 @@ def _clipped(record: Samples) -> int:
         return 0
     top = record.size - rest.size
     following = np.count_nonzero(rest == rest.max())
-    return top if top >= 4 and top > FLAT_TOP * following else 0
+    some = record[:GRID_SAMPLES]
+    some = some[(some < largest) & (some > record.min())]
+    if np.unique(some).size > FEW_ALIKE * some.size:
+        return top if top >= 4 else 0  # not quantised: equal values are no chance
+    # probability of so many or more out of both; periods repeat each other, one counts
+    one, next_one = top // periods, -(-following // periods)
+    chance = special.bdtrc(one - 1, one + next_one, SHARE_AT_TOP) if one else 1.0
+    return top if chance < _FALSE_ALARM else 0
 
 
 def _runs(record: Samples) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy import io, signal
 
+from tactile_resonance.frf import record_checks
 from tactile_resonance.frf.fast import fast_frf
 from tactile_resonance.frf.fault_types import FaultKind, FaultReport
 from tactile_resonance.frf.faults import find_faults
@@ -160,3 +161,17 @@ def test_status_of_the_response(record):
 def test_shapes_must_fit():
     with pytest.raises(ValueError, match=r"u, y: shapes \(2, 10\), \(3, 10\)"):
         check(np.zeros((2, 10)), np.zeros((3, 10)))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_coarse_converter_is_no_saturation(seed):
+    # 57 lines around 250 Hz at 0.12 V rms, counts of 0.3 mV: a peak stands on one count for samples
+    rng = np.random.default_rng(seed)
+    t = np.arange(20000) / 50e3
+    phases = rng.uniform(0, 2 * np.pi, 57)
+    x = sum(np.cos(2 * np.pi * (180 + 2.5 * k) * t + p) for k, p in enumerate(phases))
+    x = np.round(0.12 * x / x.std() / 3.05e-4) * 3.05e-4
+    assert record_checks.saturation(np.tile(x, (8, 1)), "actuator", None) == []
+    clipped = np.clip(x, -0.3, 0.3)
+    (fault,) = record_checks.saturation(np.tile(clipped, (8, 1)), "actuator", None)
+    assert "flat tops" in fault.message
