@@ -16,6 +16,9 @@ from rclpy.executors import SingleThreadedExecutor
 from tactile_resonance.action import Scan
 from tactile_resonance.nodes.scan_session import NoAnswer
 
+TAKEN_WITHIN_S = 60.0
+ANSWER_WITHIN_S = 3.0
+
 
 class ScanClient:
     """Context that joins the nodes' domain; not for use beside another executor.
@@ -61,15 +64,17 @@ class ScanClient:
         self.wait(up, timeout_s, "the nodes to come up")
 
     def start(self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None]) -> ClientGoalHandle:
-        """Ask for a scan until the node takes it."""
-        deadline = time.monotonic() + 30.0
+        """Ask for a scan until the node takes it; one that was killed stays in the graph for seconds."""
+        deadline = time.monotonic() + TAKEN_WITHIN_S
         while time.monotonic() < deadline:
             if self._client.server_is_ready():
                 future = self._client.send_goal_async(
                     goal, feedback_callback=lambda message: feedback(message.feedback)
                 )
-                self.wait(future.done, 10.0, "the goal to be taken")
-                if future.result().accepted:
+                asked_s = time.monotonic()
+                while not future.done() and time.monotonic() < asked_s + ANSWER_WITHIN_S:
+                    self.spin(0.05)
+                if future.done() and future.result().accepted:
                     return future.result()
             self.spin(0.1)
         raise NoAnswer("scan: no node takes the goal")

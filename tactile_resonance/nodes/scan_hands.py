@@ -30,6 +30,7 @@ from tactile_resonance.scan.runner import (
     Check,
     Interrupted,
     Measured,
+    PointDisturbed,
     PointFailed,
     Recording,
     ScanEnded,
@@ -86,7 +87,8 @@ class NodeHands:
         self._measure = ActionClient(node, Measure, "measure")
         node.resources.callback(self._measure.destroy)
         self._contact: ActionClient | None = None
-        self._touching = False
+        # a scan that was killed may have left the tip on the tissue
+        self._touching = with_robot
         self._state: msg.ContactState | None = None
         if with_robot:
             # the newest only: the recorder's may have to wait behind what else is recorded
@@ -219,7 +221,8 @@ class NodeHands:
     def _check_contact(self) -> None:
         state = self._state
         if self._touching and state is not None and state.state != state.STATE_HOLD:
-            raise PointFailed(f"contact: {state.cause}: {state.message}")
+            kind = PointDisturbed if state.cause in DEVICE_CAUSES else PointFailed
+            raise kind(f"contact: {state.cause}: {state.message}")
 
     def _on_state(self, message: msg.ContactState) -> None:
         self._state = message
@@ -240,7 +243,7 @@ class NodeHands:
             if all(count >= result.blocks for count in counts):
                 return
             if time.monotonic() > deadline:
-                raise PointFailed(
+                raise PointDisturbed(
                     f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
                     "came"
                 )
@@ -272,7 +275,7 @@ class NodeHands:
         try:
             while not future.done():
                 if not client.server_is_ready():
-                    raise PointFailed(f"{node} went away")
+                    raise PointDisturbed(f"{node} went away")
                 check()
                 each_poll()
                 time.sleep(POLL_S)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -27,12 +28,17 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold, OnFailure, ScanScene
 
 PAUSE_POLL_S = 0.05
+ATTEMPTS = 3  # at a point that is disturbed
 SKIPPED = "skipped on request"
 Recording = PointRecording | ReferenceRecording
 
 
 class PointFailed(Exception):
     """A point gave no result; the message says why. The scan may go on with the next."""
+
+
+class PointDisturbed(PointFailed):
+    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away."""
 
 
 class ScanEnded(Exception):
@@ -214,12 +220,14 @@ class ScanRunner:
         self._hands, self._controls, self._tell = hands, controls, tell
         self._seed = seed
         self._durations_s: list[float] = []
+        self._disturbed: Counter[int] = Counter()
 
     def run(self) -> Summary:
         """Finish every point that is not; the references of free air are taken before and after."""
         begun_s = time.monotonic()
         message = ""
         try:
+            self._hands.retract()
             self._reference("air-before")
             while (point := self._next()) is not None:
                 spent_s = time.monotonic() - begun_s
@@ -292,6 +300,12 @@ class ScanRunner:
                     recording,
                     check,
                 )
+            except PointDisturbed as error:
+                self._disturbed[point.index] += 1
+                if self._disturbed[point.index] < ATTEMPTS:
+                    self._hands.retract()  # nothing is kept of it, and the point comes again
+                    return
+                reason = str(error)
             except PointFailed as error:
                 reason = str(error)
             except Interrupted:

@@ -74,6 +74,7 @@ class ControlPort:
             "tcp_force": controller.outputs("actual_TCP_force"),
             "rtde_connections": self._robot.rtde.connections,
             "stalls": pace.stalls,
+            "stood_still_s": controller.stood_still_s,
             "longest_delay_s": pace.longest_s,
         }
 
