@@ -16,7 +16,7 @@ def shared_data() -> Path:
 
 
 # Tests in which processes meet on the wall clock: a machine that stands still for some hundredths of a
-# second fails them, as it would fail a real robot. Such a run says nothing and is repeated, twice at most.
+# second fails them, as it would fail a real robot. Such a run says nothing and is repeated, four times at most.
 WALL_CLOCK = (
     *("drivers/ur/", "drivers/test_can_wrench.py", "drivers/test_force_sources.py"),
     *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/"),
@@ -29,4 +29,4 @@ def pytest_collection_modifyitems(items):
         if item.path.is_relative_to(here):
             where = item.path.relative_to(here).as_posix()
             if where.startswith(WALL_CLOCK):
-                item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=1))
+                item.add_marker(pytest.mark.flaky(reruns=4, reruns_delay=1))
