@@ -19,7 +19,7 @@ def shared_data() -> Path:
 # second fails them, as it would fail a real robot. Such a run says nothing and is repeated, four times at most.
 WALL_CLOCK = (
     *("drivers/ur/", "drivers/test_can_wrench.py", "drivers/test_force_sources.py"),
-    *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/"),
+    *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/test_scan.py"),
 )
 
 

@@ -11,8 +11,8 @@ import time
 from importlib.util import find_spec
 from pathlib import Path
 
-from tactile_resonance.commands.simulate_ur import TABLE_IN_BASE
 from tactile_resonance.processes import NodeProcesses, free_domain_id
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 NODES = (
     *("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),

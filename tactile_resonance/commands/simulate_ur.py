@@ -11,13 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.processes import take_priority
+from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
 
 if TYPE_CHECKING:
     from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
-
-READY = "simulated UR5e ready at"
-# Under the tip as the simulated robot starts, x of the scene along its beam.
-TABLE_IN_BASE = [-0.49, -0.13, 0.2, 0.0, 0.0, -1.5707963267948966]
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:

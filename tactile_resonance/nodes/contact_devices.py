@@ -9,11 +9,9 @@ from pathlib import Path
 from rclpy.node import Node
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.interfaces import Cell
 from tactile_resonance.contact.tip_force import TipForce
-from tactile_resonance.drivers.can_wrench import CanWrench
-from tactile_resonance.drivers.force_config import ForceConfig, read_force_config
-from tactile_resonance.drivers.rtde_wrench import RtdeWrench
+from tactile_resonance.drivers.force_config import read_force_config
+from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.nodes.parameters import Parameter, values
@@ -94,8 +92,11 @@ def make_force_source(node: Node, arm: UrArm) -> TipForce:
         if config.can is None:
             raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")
         config = replace(config, can=replace(config.can, bus={**config.can.bus, "host": host}))
-    return TipForce(
-        _make_cell(node, config, arm), config.mounting, arm.state, config.inertia_window_s
+    return force_source(
+        config,
+        arm.state,
+        arm_clock_std_s=lambda: arm.clock_uncertainty_s,
+        topic=lambda asked: TopicWrench(node, asked),
     )
 
 
@@ -103,14 +104,6 @@ def tip_radius_m(node: Node) -> float:
     """Radius of the sensor's ball [m]."""
     (name,) = values(node, "sensor_config")
     return read_sensor(_path(name)).tip.radius_m
-
-
-def _make_cell(node: Node, config: ForceConfig, arm: UrArm) -> Cell:
-    if config.kind == "can":
-        return CanWrench(config)
-    if config.kind == "rtde":
-        return RtdeWrench(config, arm.state, lambda: arm.clock_uncertainty_s)
-    return TopicWrench(node, config)
 
 
 def _path(name: str) -> Path:

@@ -14,7 +14,6 @@ from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.commands.simulate_ur import TABLE_IN_BASE
 from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.multisine import Excitation
@@ -38,6 +37,7 @@ from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bimorph import CoupledBimorph
 from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.tissue import Tissue

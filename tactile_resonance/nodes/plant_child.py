@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.commands.simulate_ur import READY
 from tactile_resonance.processes import end_with_parent, may_take_priority
+from tactile_resonance.simulation.plant_defaults import READY
 from tactile_resonance.simulation.robot.control_port import order
 
 START_WITHIN_S = 30.0

@@ -7,20 +7,18 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance.action import Scan
-from tactile_resonance.nodes.scan_session import NoAnswer
+from tactile_resonance.nodes.client import NoAnswer, NodeClient
 
 TAKEN_WITHIN_S = 60.0
 ANSWER_WITHIN_S = 3.0
 
 
-class ScanClient:
+class ScanClient(NodeClient):
     """Context that joins the nodes' domain; not for use beside another executor.
 
     Parameters
@@ -30,24 +28,18 @@ class ScanClient:
     """
 
     def __init__(self, check: Callable[[], None]) -> None:
-        self._check = check
-        self._context = rclpy.Context()
+        super().__init__("scan_client", check)
         self.states: dict[str, str] = {}
 
-    def __enter__(self) -> ScanClient:
-        rclpy.init(context=self._context)
-        self._node = rclpy.create_node("scan_client", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def join(self) -> None:
+        """Client of the action, reader of the diagnostics."""
         self._client = ActionClient(self._node, Scan, "scan")
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._client.destroy()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
+    def why(self) -> str:
+        """What the diagnostics say of each node."""
+        told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
+        return told or "no diagnostics"
 
     def wait_until_up(self, timeout_s: float) -> None:
         """Until the manager tells that all nodes are active.
@@ -90,20 +82,6 @@ class ScanClient:
     ) -> Scan.Result:
         """Ask for a scan and wait for its result."""
         return self.result(self.start(goal, feedback), timeout_s)
-
-    def wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Spin until something holds."""
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            self._check()
-            if time.monotonic() > deadline:
-                told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
-                raise NoAnswer(f"waited {timeout_s:g} s for {what} ({told or 'no diagnostics'})")
-            self.spin(0.05)
-
-    def spin(self, seconds: float) -> None:
-        """Let messages in for at most so long."""
-        self._executor.spin_once(timeout_sec=seconds)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -7,17 +7,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.result import Poles
+from tactile_resonance.nodes.client import NoAnswer, NodeClient
 from tactile_resonance.nodes.conversions import (
     frf_from_message,
     poles_from_message,
@@ -28,10 +27,6 @@ from tactile_resonance.record import Contact, Origin
 from tactile_resonance.srv import Truth
 
 Progress = Callable[[int, int], None]
-
-
-class NoAnswer(RuntimeError):
-    """Something that should have come from a node did not come in time."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +51,7 @@ class PointResult:
     contact: Truth.Response
 
 
-class ScanSession:
+class ScanSession(NodeClient):
     """Context that joins the nodes' domain; not for use beside another executor.
 
     Parameters
@@ -66,19 +61,15 @@ class ScanSession:
     """
 
     def __init__(self, check: Callable[[], None]) -> None:
-        self._check = check
-        self._context = rclpy.Context()
+        super().__init__("scan_session", check)
         self._frfs: dict[int, msg.FRF] = {}
         self._poles: dict[int, msg.Poles] = {}
         self._truth: msg.Poles | None = None
         self._progress: Progress = lambda done, planned: None
         self._refusal = ""
 
-    def __enter__(self) -> ScanSession:
-        rclpy.init(context=self._context)
-        self._node = rclpy.create_node("scan_session", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def join(self) -> None:
+        """Publisher of the tip's pose, readers of the results."""
         self._pose = self._node.create_publisher(PoseStamped, "tcp_pose", STREAM)
         self._measure = ActionClient(self._node, Measure, "measure")
         self._ask_truth = self._node.create_client(Truth, "bench/get_truth")
@@ -87,12 +78,6 @@ class ScanSession:
         subscribe(msg.Poles, "poles", lambda m: self._keep_final(self._poles, m), RESULTS)
         subscribe(msg.Poles, "bench/truth", self._on_truth, LATCHED)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
     def wait_for_nodes(self, timeout_s: float) -> None:
         """Until the action and all topics of the stream have somebody at both ends.
@@ -114,7 +99,7 @@ class ScanSession:
                 for topic, readers in ends.items()
             )
 
-        self._wait(complete, timeout_s, "the nodes to find each other")
+        self.wait(complete, timeout_s, "the nodes to find each other")
 
     def warm_up(self, position_m: tuple[float, float, float], timeout_s: float) -> PointResult:
         """Measure briefly until poles come back: only then has every node heard every other.
@@ -161,7 +146,7 @@ class ScanSession:
         if answer.result.outcome != Measure.Result.DONE:
             raise NoAnswer(f"measurement of {goal.label}: {answer.result.message}")
         key = answer.result.measurement_id
-        self._wait(lambda: key in self._poles and key in self._frfs, answer_timeout_s, "poles")
+        self.wait(lambda: key in self._poles and key in self._frfs, answer_timeout_s, "poles")
         poles, origin = poles_from_message(self._poles.pop(key))
         frf, _ = frf_from_message(self._frfs.pop(key))
         return PointResult(origin, frf, poles, poles_from_message(truth)[0], contact)
@@ -189,7 +174,7 @@ class ScanSession:
             self._pose.publish(pose)
             return self._truth is not None and self._truth.tip_pose == pose
 
-        self._wait(there, 10.0, "the bench to take up the pose")
+        self.wait(there, 10.0, "the bench to take up the pose")
 
     def _on_truth(self, message: msg.Poles) -> None:
         self._truth = message
@@ -209,13 +194,5 @@ class ScanSession:
             kept[message.measurement_id] = message
 
     def _result(self, future: Future, timeout_s: float, what: str):
-        self._wait(future.done, timeout_s, what)
+        self.wait(future.done, timeout_s, what)
         return future.result()
-
-    def _wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            self._check()
-            if time.monotonic() > deadline:
-                raise NoAnswer(f"waited {timeout_s:g} s for {what}")
-            self._executor.spin_once(timeout_sec=0.05)

@@ -12,6 +12,7 @@ from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.nodes.client import NoAnswer
 from tactile_resonance.nodes.conversions import (
     excitation_from_message,
     frf_from_message,
@@ -19,7 +20,7 @@ from tactile_resonance.nodes.conversions import (
     record_from_message,
 )
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
-from tactile_resonance.nodes.scan_session import NoAnswer, ScanSession
+from tactile_resonance.nodes.scan_session import ScanSession
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues

@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the plant's process and those who start it agree on."""
+
+READY = "simulated UR5e ready at"
+"""Begins the line that says that all ports are open."""
+
+TABLE_IN_BASE = [-0.49, -0.13, 0.2, 0.0, 0.0, -1.5707963267948966]
+"""Frame of a scene in the robot's base, position [m] and rotation vector [rad]: under the tip as the
+simulated robot starts, x of the scene along its beam."""
