@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 
 FloatArray = NDArray[np.float64]
 

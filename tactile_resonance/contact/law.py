@@ -16,7 +16,7 @@ from enum import Enum
 from tactile_resonance.contact import hertz
 from tactile_resonance.contact.estimator import ContactFilter
 from tactile_resonance.contact.parameters import ContactParameters
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 
 SURE_SHARE = 0.02
 """Uncertainty of the force, as a share of it, for which no caution is needed."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     numbers,
     read_dataclass,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.fields import known_keys, read_yaml, require, section
+from tactile_resonance.fields import known_keys, read_yaml, require, section
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 

@@ -17,7 +17,7 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     number,
     numbers,

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 
 FloatArray = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 
 FloatArray = npt.NDArray[np.float64]
 LEAST_POINTS = 5

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.simulation.fields import known_keys, number, numbers, require, section
+from tactile_resonance.fields import known_keys, number, numbers, require, section
 
 FloatArray = npt.NDArray[np.float64]
 FORMS = ("grid", "spiral", "list", "region")

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from tactile_resonance.simulation.fields import known_keys, number, numbers, require
+from tactile_resonance.fields import known_keys, number, numbers, require
 
 
 @dataclass(frozen=True)

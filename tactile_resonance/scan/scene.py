@@ -16,10 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.patterns import read_positions
-from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     number,
     read_dataclass,
@@ -27,6 +24,9 @@ from tactile_resonance.simulation.fields import (
     require,
     section,
 )
+from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
+from tactile_resonance.scan.patterns import read_positions
+from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.simulation.scene import read_scan_points
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.references import parse_classes, read_classes

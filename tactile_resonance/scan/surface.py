@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
+from tactile_resonance.fields import known_keys, number, numbers, require, section
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
-from tactile_resonance.simulation.fields import known_keys, number, numbers, require, section
 
 FloatArray = npt.NDArray[np.float64]
 FORMS = ("plane", "height_field", "mesh", "touch")

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from tactile_resonance.fields import require
 from tactile_resonance.scan.surface import unit_normal
-from tactile_resonance.simulation.fields import require
 
 FloatArray = npt.NDArray[np.float64]
 FORMS = {"plane": 3, "quadric": 6}

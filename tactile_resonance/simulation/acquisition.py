@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.modal import FloatArray
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.acquisition import (
     BenchEffects,
     Block,
@@ -19,7 +20,6 @@ from tactile_resonance.simulation.acquisition import (
 )
 from tactile_resonance.simulation.bimorph import CoupledBimorph
 from tactile_resonance.simulation.contact_history import ContactHistory
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.lines import Lines, PeriodicExcitation
 from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
 from tactile_resonance.simulation.nonlinear import NonlinearStream

@@ -19,9 +19,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import BeamModes, sensor_modes
 from tactile_resonance.simulation.contact import Contact
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray, PoleResidueModel
 from tactile_resonance.simulation.parameters import SensorParameters
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.contact import (
     Contact,
@@ -15,7 +16,6 @@ from tactile_resonance.simulation.contact import (
     contact_of_radius,
     hertz_contact,
 )
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.indentation import indent
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
 from tactile_resonance.simulation.parameters import SensorParameters

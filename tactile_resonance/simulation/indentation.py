@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.tissue import FloatArray, Tissue
 

@@ -20,8 +20,8 @@ from math import ceil, cos, exp, expm1, pi, sin, sqrt
 
 import numpy as np
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import BeamModes
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.free_springs import FreeSprings, Node, Values
 from tactile_resonance.simulation.tissue import Tissue
 

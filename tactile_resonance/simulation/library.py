@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.contact import ContactParameters
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     number,
     numbers,
@@ -22,6 +21,7 @@ from tactile_resonance.simulation.fields import (
     require,
     section,
 )
+from tactile_resonance.simulation.contact import ContactParameters
 from tactile_resonance.simulation.tissue import Tissue
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values

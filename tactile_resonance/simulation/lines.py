@@ -10,7 +10,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
 
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_resonance.simulation.fields import known_keys, number, numbers, require, section
+from tactile_resonance.fields import known_keys, number, numbers, require, section
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.shapes import Point

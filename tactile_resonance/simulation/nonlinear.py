@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.lines import Lines, sample_period
 from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
 from tactile_resonance.simulation.parameters import NonlinearParameters

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     read_dataclass,
     read_yaml,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.tissue import Tissue
 

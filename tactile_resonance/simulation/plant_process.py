@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell

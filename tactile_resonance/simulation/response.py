@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.lines import Lines, sample_period
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray, PoleResidueModel
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.fields import (
+from tactile_resonance.fields import (
     known_keys,
     number,
     numbers,

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.simulation.fields import known_keys, number, numbers, require, section
+from tactile_resonance.fields import known_keys, number, numbers, require, section
 
 Point = tuple[float, ...]
 SHAPES = ("disc", "box", "half_space", "sphere")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

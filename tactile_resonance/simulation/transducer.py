@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.fields import known_keys, number, numbers, read_yaml, require
+from tactile_resonance.fields import known_keys, number, numbers, read_yaml, require
 
 FloatArray = NDArray[np.float64]
 

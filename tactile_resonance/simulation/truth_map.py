@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
 from tactile_resonance.simulation.scene import PhantomScene
 

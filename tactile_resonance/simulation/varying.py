@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tactile_resonance.fields import require
 from tactile_resonance.simulation.bimorph import CoupledBimorph
-from tactile_resonance.simulation.fields import require
 from tactile_resonance.simulation.lines import Lines
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.response import ResponseStream

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from tactile_resonance.simulation.fields import require
+from tactile_resonance.fields import require
 
 FloatArray = npt.NDArray[np.float64]
 UNKNOWN = "unknown"

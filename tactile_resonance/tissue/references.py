@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.simulation.fields import known_keys, number, read_yaml, require, section
+from tactile_resonance.fields import known_keys, number, read_yaml, require, section
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples
 
 _KEYS = {"f0_hz", "damping_ratio", "f0_std_hz", "damping_ratio_std", "correlation", "prior"}
