@@ -27,7 +27,6 @@ from tactile_resonance.identification.judgement import (
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
 from tactile_resonance.identification.result import (
-    SMOOTH_RESIDUAL,
     STATUS_CODE,
     PolesBatch,
     PolesStatus,
@@ -38,6 +37,7 @@ from tactile_resonance.identification.solver import (
     START_ITERATIONS,
     STEP_TOLERANCE,
 )
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -90,11 +90,12 @@ class CompiledJointPlan(JointPlan):
         ordinary = np.zeros(batch, bool)
         theta = np.empty((batch, n))
         covariance = np.empty((batch, n, n))
-        residual = np.empty((batch, self.excited_bins.size), complex)
+        residual = np.zeros((batch, self.excited_bins.size), complex)
         figures = np.empty((batch, kernel.FIGURES))
         out = (ordinary, theta, covariance, residual, figures)
         kernel.fit_points(flat_u, flat_y, *self._constants, out)
         result = self._ordinary(kernel, theta, covariance, residual, figures)
+        ordinary &= result.whiteness <= SMOOTH_RESIDUAL
         if not ordinary.all():
             rows = np.flatnonzero(~ordinary)
             result = _replaced(result, rows, super().from_bins(flat_u[rows], flat_y[rows]))
@@ -171,7 +172,6 @@ class CompiledJointPlan(JointPlan):
                 STEP_TOLERANCE**2 / max(2 * self.bins.size - (a + b + c), 1),
                 MAX_ITERATIONS,
                 special.ndtri(1 - MODEL_ERROR_PROBABILITY),
-                SMOOTH_RESIDUAL,
                 LARGEST_CONDITION_NUMBER,
                 self.variable.scale_rad_s,
                 self.band_hz[0] - margin,

@@ -20,8 +20,8 @@ from tactile_resonance.identification.judgement import (
     difference_of_models,
 )
 from tactile_resonance.identification.noise_level import f_quantile
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, whiteness
 from tactile_resonance.identification.solver import Solution, minimise
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -132,7 +132,8 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     residual = _residual(layout, data[-1], solution.theta) / np.sqrt(level.scale)[:, None]
     # what rounding leaves of exact data says nothing
     told = level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
-    suspect = level.suspect | (told & (whiteness(residual) > SMOOTH_RESIDUAL))
+    smooth = whiteness(residual, layout.structure.parameters) > SMOOTH_RESIDUAL
+    suspect = level.suspect | (told & smooth)
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     if suspect.any():
         systematic[suspect] = _systematic(layout, data, solution.theta, suspect)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from tactile_resonance.identification.covariance import pole_quantities, real_covariance
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
 from tactile_resonance.identification.result import (
-    SMOOTH_RESIDUAL,
     STATUS_CODE,
     ComplexArray,
     FloatArray,
@@ -22,6 +21,7 @@ from tactile_resonance.identification.result import (
     natural_frequency_and_damping,
 )
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 BoolArray = npt.NDArray[np.bool_]
 

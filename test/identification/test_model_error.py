@@ -15,8 +15,9 @@ from benchmarks.poles_plant import (
 )
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import identify_poles_from_records
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, PolesStatus
+from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 BARE = ModelStructure(2, 2)
 RUNS = 2000

@@ -13,8 +13,9 @@ from tactile_resonance.identification.identify import (
     identify_poles,
     identify_spectra,
 )
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, PolesStatus
+from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 BARE = ModelStructure(2, 2)
 
