@@ -179,7 +179,7 @@ class CompiledJointPlan(JointPlan):
             ]
         )
         return (
-            (self.other_bins - self.bins[0], self.excited_bins - self.bins[0]),
+            (self.others_at, self.excited_at),
             tuple(groups),
             tuple(places),
             (a, b, START_ITERATIONS),

@@ -132,6 +132,16 @@ class JointLayout:
             object.__setattr__(self, name, value)
 
     @cached_property
+    def excited_at(self) -> IntArray:
+        """(K_e,) place of the excited bins among all."""
+        return self.excited_bins - self.bins[0]
+
+    @cached_property
+    def others_at(self) -> IntArray:
+        """(K_o,) place of the other bins among all."""
+        return self.other_bins - self.bins[0]
+
+    @cached_property
     def richer(self) -> JointLayout | None:
         """With one mode more; None where the band holds too few lines for it."""
         try:

@@ -15,7 +15,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 from scipy import special
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,22 +23,26 @@ IntArray = npt.NDArray[np.int64]
 
 # Residuals of noise alone are smoother than this once in a thousand fits.
 SMOOTH_RESIDUAL = 3.09
+# No more coefficients than this count as smooth.
+MOST_COMPONENTS = 128
 
 
-@lru_cache(maxsize=256)
-def components(lines: int, parameters: int) -> IntArray:
-    """(levels,) how many cosine coefficients are compared with the rest.
+@lru_cache(maxsize=64)
+def components(lines: int, parameters: int) -> tuple[IntArray, ComplexArray]:
+    """(levels,) how many cosine coefficients are compared with the rest, and (F, J) the cosines.
 
     The fit has taken its own parameters out of the smooth ones, half a coefficient each, so the
     first level has as many as there are parameters; each further one twice those of the last, up to
     half of all.
     """
-    most = lines // 2
-    first = min(max(parameters, 1), most)
-    if first < 1:
-        return np.zeros(0, np.int64)
-    doublings = int(np.log2(most / first))
-    return np.union1d(first * 2 ** np.arange(doublings + 1), most)
+    most = min(lines // 2, max(MOST_COMPONENTS, parameters))
+    levels = np.array([most])
+    while levels[0] > 2 * parameters:
+        levels = np.append(levels[0] // 2, levels)
+    line, k = np.ogrid[:lines, :most]
+    cosines = np.cos(np.pi * k * (line + 0.5) / lines) * np.sqrt(np.where(k == 0, 1, 2) / lines)
+    # complex, so that products with residuals need no conversion
+    return levels, cosines.astype(complex)
 
 
 def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
@@ -67,16 +70,22 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     `noise_level.f_quantile`.
     """
     lines = residual.shape[-1]
-    counts = components(lines, parameters)
-    if lines < 3 or counts.size == 0:
+    if lines < 3:
         return np.full(residual.shape[:-1], np.nan)
-    transform = scipy.fft.dct(residual, norm="ortho", axis=-1)
-    power = np.cumsum(transform.real**2 + transform.imag**2, axis=-1)
-    used = np.count_nonzero(residual, axis=-1)[..., None]
-    smooth, others = power[..., counts - 1], np.maximum(used - counts, 1)
+    counts, cosines = components(lines, parameters)
+    power = _squared(residual @ cosines).cumsum(axis=-1)
+    smooth = power[..., counts - 1]
+    total = _squared(residual).sum(axis=-1, keepdims=True)
+    used = lines if residual.all() else np.count_nonzero(residual, axis=-1)[..., None]
+    others = np.maximum(used - counts, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.cbrt(smooth * others / ((power[..., -1:] - smooth) * counts))
+        root = np.cbrt(smooth / (total - smooth) * (others / counts))
         a, b = 1 / (9 * counts), 1 / (9 * others)
         score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
         among = -np.expm1(counts.size * np.log1p(-special.ndtr(-score)))
     return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
+
+
+def _squared(values: ComplexArray) -> FloatArray:
+    """Squared moduli."""
+    return np.asarray(values.real**2 + values.imag**2)
