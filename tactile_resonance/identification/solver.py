@@ -242,14 +242,16 @@ def solve_scaled(
 ) -> tuple[FloatArray, FloatArray]:
     """``(N + damping diag N)^-1 gradient`` (batch, n), and the gradient times it (batch,)."""
     n = normal.shape[-1]
-    diagonal = np.einsum("...ii->...i", normal)
+    diagonal = normal.diagonal(axis1=-2, axis2=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.where(diagonal > 0, 1 / np.sqrt(diagonal), 1.0)
-    scaled = normal * scale[..., :, None] * scale[..., None, :]
-    index = np.arange(n)
+    scaled = normal * scale[..., :, None]
+    scaled *= scale[..., None, :]
     # a trace of damping: an exactly singular matrix of one point must not stop the batch
-    scaled[..., index, index] = 1 + 1e-15 + np.asarray(damping)[..., None]
-    bad = ~np.isfinite(scaled).all(axis=(-2, -1))
+    flat = scaled.reshape(*scaled.shape[:-2], n * n)
+    flat[..., :: n + 1] = 1 + 1e-15 + np.asarray(damping)[..., None]
+    # finite as a whole only where every entry is
+    bad = ~np.isfinite(flat.sum(axis=-1))
     if bad.any():
         scaled[bad] = np.eye(n)
     right = gradient * scale
