@@ -35,9 +35,8 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     n = normal.shape[-1]
     diagonal = normal.diagonal(axis1=-2, axis2=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / np.sqrt(diagonal)
-        scaled = normal * scale[..., :, None]
-        scaled *= scale[..., None, :]
+        scale = np.asarray(1 / np.sqrt(diagonal), float)
+        scaled = normal * scale[..., :, None] * scale[..., None, :]
     # finite as a whole only where every entry is, and every diagonal one above 0
     bad = ~np.isfinite(scaled.sum(axis=(-2, -1)))
     if bad.any():
@@ -53,8 +52,7 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     bad |= ~(inverse.diagonal(axis1=-2, axis2=-1) > 0).all(axis=-1)
     condition = (_squares(scaled) * _squares(inverse)) ** 0.25
     with np.errstate(invalid="ignore"):
-        inverse *= scale[..., :, None]
-        inverse *= scale[..., None, :]
+        inverse *= scale[..., :, None] * scale[..., None, :]
     if bad.any():
         inverse[bad], condition[bad] = np.nan, np.inf
     return inverse, condition

@@ -20,23 +20,17 @@ from scipy import special
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
-from tactile_resonance.identification.judgement import (
-    LARGEST_CONDITION_NUMBER,
-    MODEL_ERROR_PROBABILITY,
-)
+from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
 from tactile_resonance.identification.model import RationalModel
+from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
+from tactile_resonance.identification.problem import START_ITERATIONS
 from tactile_resonance.identification.result import (
     STATUS_CODE,
     PolesBatch,
     PolesStatus,
 )
-from tactile_resonance.identification.solver import (
-    MAX_ITERATIONS,
-    ROUNDING,
-    START_ITERATIONS,
-    STEP_TOLERANCE,
-)
+from tactile_resonance.identification.solver import MAX_ITERATIONS, ROUNDING, STEP_TOLERANCE
 from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 ComplexArray = npt.NDArray[np.complex128]

@@ -14,7 +14,7 @@ from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, noise_between_harmonics
-from tactile_resonance.identification.judgement import (
+from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
     difference_of_halves,
     difference_of_models,

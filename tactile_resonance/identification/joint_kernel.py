@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The joint estimator of one mode for point after point, compiled by numba.
 
-The steps are those of `one_point`, `joint_fit`, `joint_noise`, `solver` and `covariance`, written
+The steps are those of `one_point`, `joint_fit`, `joint_noise`, `problem`, `solver` and `covariance`, written
 out; complex numbers are pairs of arrays, so that loops over bins become vector instructions. A point
 that needs more than undamped steps, flat and independent noise and one stable pole in the band is
 left unmarked: the plain path takes it. Only `joint_compiled` imports this, and only where it is

@@ -17,9 +17,9 @@ from tactile_resonance.identification.joint_transient import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.identification.judgement import richer
 from tactile_resonance.identification.model import Variable
-from tactile_resonance.identification.solver import Problem
+from tactile_resonance.identification.model_error import richer
+from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
