@@ -125,9 +125,12 @@ class PolynomialBasis:
         if m == 1:
             return (h[0, 0] - last).astype(complex)
         if m == 2:  # closed form: an eigenvalue solver costs more than the fit
-            first, second = h[0, 0] * np.ones_like(last[..., 0]), h[1, 1] - last[..., 1]
+            first, second = h[0, 0], h[1, 1] - last[..., 1]
             half = (first + second) / 2
             under = ((first - second) / 2) ** 2 + (h[0, 1] - last[..., 0]) * h[1, 0]
+            if (under < 0).all():
+                above = half + 1j * np.sqrt(-under)
+                return np.stack([above, above.conj()], axis=-1)
             root = np.sqrt(under.astype(complex))
             # the root of larger modulus first, the other from the product: no cancellation
             large = half + np.where(half < 0, -1.0, 1.0) * root

@@ -33,12 +33,12 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
         Root of the Frobenius condition number with unit diagonal: the true one within a factor n.
     """
     n = normal.shape[-1]
-    diagonal = np.einsum("...ii->...i", normal)
-    # finite as a whole only where every entry is
-    bad = ~(np.isfinite(normal.sum(axis=(-2, -1))) & (diagonal > 0).all(axis=-1))
+    diagonal = normal.diagonal(axis1=-2, axis2=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / np.sqrt(diagonal)
+        scale = np.asarray(1 / np.sqrt(diagonal), float)
         scaled = normal * scale[..., :, None] * scale[..., None, :]
+    # finite as a whole only where every entry is, and every diagonal one above 0
+    bad = ~np.isfinite(scaled.sum(axis=(-2, -1)))
     if bad.any():
         scaled[bad] = np.eye(n)
     try:
@@ -49,7 +49,7 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse = np.linalg.inv(scaled)
         bad |= singular
     # rounding can leave a negative variance where the matrix is singular to working precision
-    bad |= ~(np.einsum("...ii->...i", inverse) > 0).all(axis=-1)
+    bad |= ~(inverse.diagonal(axis1=-2, axis2=-1) > 0).all(axis=-1)
     condition = (_squares(scaled) * _squares(inverse)) ** 0.25
     with np.errstate(invalid="ignore"):
         inverse *= scale[..., :, None] * scale[..., None, :]

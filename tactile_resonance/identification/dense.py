@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.solver import ROUNDING, Problem, Solution
+from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.solver import ROUNDING, Solution
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]

@@ -11,16 +11,14 @@ import numpy.typing as npt
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import modes_in_band
-from tactile_resonance.identification.judgement import (
+from tactile_resonance.identification.judgement import Evidence, assemble
+from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
-    Evidence,
-    assemble,
     difference_of_halves,
     difference_of_models,
     richer,
-    single,
 )
-from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
 from tactile_resonance.identification.noise_level import KINDS, VarianceModel, model_variance
 from tactile_resonance.identification.result import (
     ComplexArray,
@@ -28,7 +26,9 @@ from tactile_resonance.identification.result import (
     Poles,
     PolesBatch,
 )
+from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
 
 # Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
 FEWEST_BINS = 16
@@ -59,7 +59,7 @@ def identify_poles(
     where a test allows it. Where both are known, ``covariance`` propagates the noise through these
     weights and ``total_covariance`` the total; where only realisations are at hand, noise cannot be
     told from distortion and both fields hold both. Where the cost exceeds what the variance
-    explains, ``total_covariance`` holds the model error too; see `judgement.model_error_factor`.
+    explains, ``total_covariance`` holds the model error too; see `model_error.model_error_factor`.
     """
     if frf.g.ndim != 1:
         raise ValueError(f"frf.g: shape {frf.g.shape}, expected (F,); identify_batch takes batches")
@@ -283,6 +283,7 @@ def _identify(
     expected = known.expected_cost(parameters)
     with np.errstate(invalid="ignore"):
         suspect = fit.cost > known.cost_quantile(parameters, 1 - MODEL_ERROR_PROBABILITY)
+        suspect |= whiteness(fit.residual, parameters) > SMOOTH_RESIDUAL
     total = weighted if total_known else np.full_like(weighted, np.nan)
     evidence = Evidence(
         fit, lines, enough, fit.cost, expected, suspect, covariance, total,

@@ -81,9 +81,9 @@ class JointPlan(JointLayout):
                     f"{name}: shape {values.shape}, expected (..., {self.bins.size}) bins"
                 )
         shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
-        flat_u, flat_y = (
-            np.broadcast_to(v, (*shape, self.bins.size)).reshape(-1, self.bins.size) for v in (u, y)
-        )
+        if u.shape != y.shape:
+            u, y = (np.broadcast_to(v, (*shape, self.bins.size)) for v in (u, y))
+        flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
         chunk = self.problem.chunk
         starts = range(0, max(flat_u.shape[0], 1), chunk)
         parts = [fit_bins(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts]

@@ -20,24 +20,18 @@ from scipy import special
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
-from tactile_resonance.identification.judgement import (
-    LARGEST_CONDITION_NUMBER,
-    MODEL_ERROR_PROBABILITY,
-)
+from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
 from tactile_resonance.identification.model import RationalModel
+from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
+from tactile_resonance.identification.problem import START_ITERATIONS
 from tactile_resonance.identification.result import (
-    SMOOTH_RESIDUAL,
     STATUS_CODE,
     PolesBatch,
     PolesStatus,
 )
-from tactile_resonance.identification.solver import (
-    MAX_ITERATIONS,
-    ROUNDING,
-    START_ITERATIONS,
-    STEP_TOLERANCE,
-)
+from tactile_resonance.identification.solver import MAX_ITERATIONS, ROUNDING, STEP_TOLERANCE
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -90,11 +84,12 @@ class CompiledJointPlan(JointPlan):
         ordinary = np.zeros(batch, bool)
         theta = np.empty((batch, n))
         covariance = np.empty((batch, n, n))
-        residual = np.empty((batch, self.excited_bins.size), complex)
+        residual = np.zeros((batch, self.excited_bins.size), complex)
         figures = np.empty((batch, kernel.FIGURES))
         out = (ordinary, theta, covariance, residual, figures)
         kernel.fit_points(flat_u, flat_y, *self._constants, out)
         result = self._ordinary(kernel, theta, covariance, residual, figures)
+        ordinary &= result.whiteness <= SMOOTH_RESIDUAL
         if not ordinary.all():
             rows = np.flatnonzero(~ordinary)
             result = _replaced(result, rows, super().from_bins(flat_u[rows], flat_y[rows]))
@@ -171,7 +166,6 @@ class CompiledJointPlan(JointPlan):
                 STEP_TOLERANCE**2 / max(2 * self.bins.size - (a + b + c), 1),
                 MAX_ITERATIONS,
                 special.ndtri(1 - MODEL_ERROR_PROBABILITY),
-                SMOOTH_RESIDUAL,
                 LARGEST_CONDITION_NUMBER,
                 self.variable.scale_rad_s,
                 self.band_hz[0] - margin,
@@ -179,7 +173,7 @@ class CompiledJointPlan(JointPlan):
             ]
         )
         return (
-            (self.other_bins - self.bins[0], self.excited_bins - self.bins[0]),
+            (self.others_at, self.excited_at),
             tuple(groups),
             tuple(places),
             (a, b, START_ITERATIONS),

@@ -14,14 +14,14 @@ from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, noise_between_harmonics
-from tactile_resonance.identification.judgement import (
+from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
     difference_of_halves,
     difference_of_models,
 )
 from tactile_resonance.identification.noise_level import f_quantile
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, whiteness
 from tactile_resonance.identification.solver import Solution, minimise
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -104,11 +104,11 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         At its bins.
     """
     batch = u.shape[0]
-    usable = np.asarray(np.isfinite(u).all(axis=-1) & np.isfinite(y).all(axis=-1))
+    # finite as a whole only where every bin is
+    usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
     if not usable.all():
         u, y = (np.where(usable[:, None], v, 0) for v in (u, y))
-    where = layout.excited_bins - layout.bins[0]
-    u_e, y_e = np.take(u, where, axis=1), np.take(y, where, axis=1)
+    u_e, y_e = u.take(layout.excited_at, axis=1), y.take(layout.excited_at, axis=1)
     one = np.ones((batch, 1))
     problem = layout.problem
     if layout.other_bins.size == 0:
@@ -117,8 +117,7 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         data = [BinData(y_e, u_e, one, ratio * one if ratio else None, None)]
         solution = minimise(problem, data)
     else:
-        others = layout.other_bins - layout.bins[0]
-        u_o, y_o = np.take(u, others, axis=1), np.take(y, others, axis=1)
+        u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
         data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
         rough = problem.rough(data)
         data, noise, kind = _with_noise(layout, data, u_o, rough)
@@ -130,9 +129,10 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     else:
         level = _level_from_others(layout, solution, inverse, noise, kind)
     residual = _residual(layout, data[-1], solution.theta) / np.sqrt(level.scale)[:, None]
-    # what rounding leaves of exact data says nothing
-    told = level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
-    suspect = level.suspect | (told & (whiteness(residual) > SMOOTH_RESIDUAL))
+    suspect = whiteness(residual, layout.structure.parameters) > SMOOTH_RESIDUAL
+    if suspect.any():  # what rounding leaves of exact data says nothing
+        suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
+    suspect |= level.suspect
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     if suspect.any():
         systematic[suspect] = _systematic(layout, data, solution.theta, suspect)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The joint estimator of one mode for point after point, compiled by numba.
 
-The steps are those of `one_point`, `joint_fit`, `joint_noise`, `solver` and `covariance`, written
+The steps are those of `one_point`, `joint_fit`, `joint_noise`, `problem`, `solver` and `covariance`, written
 out; complex numbers are pairs of arrays, so that loops over bins become vector instructions. A point
 that needs more than undamped steps, flat and independent noise and one stable pole in the band is
 left unmarked: the plain path takes it. Only `joint_compiled` imports this, and only where it is
@@ -308,8 +308,8 @@ def fit_points(u, y, where, groups, places, sizes, pieces, bases, limits, out):
         Starts and counts of the pieces of the noise.
     bases : two (m + 1, m) float
         Hessenberg matrices of denominator and numerator.
-    limits : (12,) float
-        See `joint_compiled.limits`.
+    limits : (11,) float
+        See `CompiledJointPlan`.
     out : tuple of arrays
         ordinary (batch,) bool, theta (batch, n), covariance (batch, n, n), residual (batch, K_e)
         complex, figures (batch, FIGURES).
@@ -507,7 +507,6 @@ def _level(
     _evaluate(d_re, d_im, theta[:a], a_re, a_im)
     _evaluate(n_re, n_im, theta[a : a + b], b_re, b_im)
     _evaluate(t_re, t_im, theta[a + b :], c_re, c_im)
-    power, together = 0.0, 0.0
     for k in range(bins_e):
         inverse = 1 / complex(a_re[k] + d_re[a, k], a_im[k] + d_im[a, k])
         g = complex(b_re[k], b_im[k]) * inverse
@@ -520,13 +519,7 @@ def _level(
         variance = variances[0] + variances[1] * (g.real**2 + g.imag**2)
         error /= np.sqrt(variance * pooled)
         residual[k] = error
-        power += error.real**2 + error.imag**2
-        if k > 0:
-            last = residual[k - 1]
-            together += last.real * error.real + last.imag * error.imag
-    # of lines that are not white, or left out, the plain path judges
-    white = together / (power / bins_e * np.sqrt((bins_e - 1) / 2))
-    return white <= limits[7] and condition < limits[8]
+    return condition < limits[7]
 
 
 @compiled
@@ -544,7 +537,7 @@ def _f_quantile(normal, dof_1, dof_2):
 def _pole(theta, covariance, bases, limits, figures):
     """The pole, its residue and covariances; whether it is one stable pair near the band."""
     h, h_b = bases
-    scale = limits[9]
+    scale = limits[8]
     last_0, last_1 = h[2, 1] * theta[0], h[2, 1] * theta[1]
     first, second = h[0, 0], h[1, 1] - last_1
     under = ((first - second) / 2) ** 2 + (h[0, 1] - last_0) * h[1, 0]
@@ -554,7 +547,7 @@ def _pole(theta, covariance, bases, limits, figures):
     pole = x * scale
     size = abs(pole)
     f0_hz = size / (2 * np.pi)
-    if not (pole.real < 0 and limits[10] <= f0_hz <= limits[11]):
+    if not (pole.real < 0 and limits[9] <= f0_hz <= limits[10]):
         return False
     # A and its slope
     p_1 = (x - h[0, 0]) / h[1, 0]

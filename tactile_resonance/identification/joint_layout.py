@@ -17,9 +17,9 @@ from tactile_resonance.identification.joint_transient import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.identification.judgement import richer
 from tactile_resonance.identification.model import Variable
-from tactile_resonance.identification.solver import Problem
+from tactile_resonance.identification.model_error import richer
+from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -130,6 +130,16 @@ class JointLayout:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    @cached_property
+    def excited_at(self) -> IntArray:
+        """(K_e,) place of the excited bins among all."""
+        return self.excited_bins - self.bins[0]
+
+    @cached_property
+    def others_at(self) -> IntArray:
+        """(K_o,) place of the other bins among all."""
+        return self.other_bins - self.bins[0]
 
     @cached_property
     def richer(self) -> JointLayout | None:

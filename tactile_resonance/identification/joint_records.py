@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.judgement import single
 from tactile_resonance.identification.result import Poles
+from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
 
 IntArray = npt.NDArray[np.int64]

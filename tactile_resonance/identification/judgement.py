@@ -1,34 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit is worth: status, covariances, and the sentence that says so."""
+"""What a batch of fits is worth: status and covariances."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.identification.covariance import pole_quantities, real_covariance
+from tactile_resonance.identification.covariance import pole_quantities
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.identification.model_error import model_error_factor
 from tactile_resonance.identification.result import (
-    SMOOTH_RESIDUAL,
     STATUS_CODE,
-    ComplexArray,
     FloatArray,
-    Poles,
     PolesBatch,
     PolesStatus,
-    natural_frequency_and_damping,
 )
 from tactile_resonance.identification.structure import ModelStructure
 
 BoolArray = npt.NDArray[np.bool_]
 
-# A cost that noise alone exceeds once in a thousand fits counts as model error.
-MODEL_ERROR_PROBABILITY = 1e-3
-# A mode that noise makes is taken for one this often.
-NOISE_PASSES_FOR_A_MODE = 1e-4
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
 
@@ -96,93 +88,6 @@ class Evidence:
         total = self.total_covariance.copy()
         total[rows] = weighted[rows] * factor[:, None, None]
         return replace(self, total_covariance=total)
-
-
-def model_error_factor(
-    residual: ComplexArray, cost: FloatArray, expected_cost: FloatArray
-) -> FloatArray:
-    """(batch,) factor from the covariance of noise to that of noise and model error.
-
-    The excess of the cost tells how large the errors are; their correlation from line to line, how
-    many of them act together: errors that keep their sign over L lines disturb a coefficient as L
-    times fewer lines of independent errors would.
-
-    Parameters
-    ----------
-    residual : (batch, F) complex
-        Weighted.
-    cost, expected_cost : (batch,) float
-    """
-    ratio = np.fmax(cost / expected_cost, 1.0)  # 1 where the level itself is from the residuals
-    return ratio * correlation_length(residual)
-
-
-def correlation_length(residual: ComplexArray) -> FloatArray:
-    """(batch,) ``1 + 2 sum rho`` over the correlations of residuals (batch, F).
-
-    Sokal's automatic window: the sum ends at the lag that exceeds five times itself.
-    """
-    lines = residual.shape[-1]
-    padded = np.fft.fft(residual, 2 * lines, axis=-1)
-    correlation = np.fft.ifft(np.abs(padded) ** 2, axis=-1).real[:, :lines]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rho = correlation / correlation[:, :1]
-    length = 2 * np.cumsum(np.nan_to_num(rho), axis=-1) - 1  # (batch, F)
-    enough = np.arange(lines) >= 5 * length
-    window = np.where(enough.any(axis=-1), np.argmax(enough, axis=-1), lines - 1)
-    return np.maximum(np.take_along_axis(length, window[:, None], axis=-1)[:, 0], 1.0)
-
-
-def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> FloatArray:
-    """Outer product of what even and odd lines differ by in (f0_hz, damping_ratio).
-
-    What one wild line does shows in no residual of its neighbours; it does between halves of the
-    lines.
-
-    Parameters
-    ----------
-    even_rad_s, odd_rad_s : (..., places) complex
-        Poles found from either half; NaN where a half does not have the mode.
-
-    Returns
-    -------
-    (..., places, 2, 2) float
-    """
-    even, odd = (
-        np.stack(natural_frequency_and_damping(p), axis=-1) for p in (even_rad_s, odd_rad_s)
-    )
-    difference = even - odd  # (..., places, 2)
-    return np.asarray(difference[..., :, None] * difference[..., None, :])
-
-
-def difference_of_models(poles_rad_s: ComplexArray, richer_rad_s: ComplexArray) -> FloatArray:
-    """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
-
-    Two modes nearer to each other than their widths are fitted by one between them so well that
-    residuals tell little of how far it is from either.
-
-    Parameters
-    ----------
-    poles_rad_s : (..., places) complex
-    richer_rad_s : (..., more places) complex
-        NaN where there is no mode; the nearest one counts.
-
-    Returns
-    -------
-    (..., places, 2, 2) float
-        0 where the richer model has no mode.
-    """
-    distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
-    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
-    other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
-    return np.nan_to_num(difference_of_halves(poles_rad_s, other))
-
-
-def richer(structure: ModelStructure) -> ModelStructure:
-    """One mode more, as many residual terms."""
-    return replace(
-        structure, order=structure.order + 2, numerator_order=structure.numerator_order + 2
-    )
 
 
 def assemble(
@@ -266,145 +171,6 @@ def assemble(
         variance_model=batch(evidence.variance_model),
         method=method,
     )
-
-
-def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] = ()) -> Poles:
-    """One point of a batch, with the zeros and the sentence a batch leaves out.
-
-    Parameters
-    ----------
-    batch : PolesBatch
-    index : tuple of int
-        Into its leading axes.
-    notes : sequence of str
-        Added to the message.
-    """
-    model = batch.fit.at(index)
-    status = batch.status(index)
-    there = np.isfinite(batch.poles_rad_s[index])
-    poles = batch.poles_rad_s[index][there]
-    coefficients = batch.coefficient_covariance[index]
-    n = batch.structure.order
-    zeros = np.empty(0, complex)
-    if status is not PolesStatus.TOO_FEW_LINES and np.isfinite(model.numerator).all():
-        zeros = model.zeros_rad_s()
-    known = bool(np.isfinite(coefficients).all()) and poles.size > 0
-    residue = zero = None
-    if known:
-        with np.errstate(all="ignore"):
-            residue = real_covariance(model.residue_sensitivity(poles), coefficients)
-            m = model.numerator.size
-            zero = real_covariance(
-                model.zero_sensitivity(zeros), coefficients[n : n + m, n : n + m]
-            )
-
-    found = poles
-    if known and residue is not None:
-        real = _significant(batch.residues[index][there], residue, int(batch.lines[index]))
-        there[there] = real
-        poles, residue = poles[real], residue[real]
-        if not real.any():
-            status, residue = PolesStatus.NO_RESONANCE, None
-            notes = [
-                f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
-                "noise makes"
-                for pole in found
-            ] + list(notes)
-
-    if status is PolesStatus.OK and poles.size and not known:
-        status = PolesStatus.NO_COVARIANCE
-        notes = [
-            "the variance of each line has too few degrees of freedom to tell the uncertainty: "
-            "record more periods or realisations",
-            *notes,
-        ]
-
-    def optional(array: FloatArray) -> FloatArray | None:
-        values = array[index][there]
-        return values if values.size and np.isfinite(values).all() else None
-
-    message = "; ".join(filter(None, [_sentence(batch, index, status), *notes]))
-    return Poles(
-        poles_rad_s=poles,
-        f0_hz=batch.f0_hz[index][there],
-        damping_ratio=batch.damping_ratio[index][there],
-        residues=batch.residues[index][there],
-        covariance=optional(batch.covariance),
-        total_covariance=optional(batch.total_covariance),
-        pole_covariance=optional(batch.pole_covariance),
-        residue_covariance=residue,
-        zeros_rad_s=zeros,
-        zero_covariance=zero,
-        structure=batch.structure,
-        band_hz=batch.band_hz,
-        lines=int(batch.lines[index]),
-        cost=float(batch.cost[index]),
-        expected_cost=float(batch.expected_cost[index]),
-        whiteness=float(batch.whiteness[index]),
-        condition_number=float(batch.condition_number[index]),
-        variance_model=str(batch.variance_model[index]),
-        fit=None if status is PolesStatus.TOO_FEW_LINES else model,
-        method=batch.method,
-        status=status,
-        message=message,
-    )
-
-
-def _significant(
-    residues: ComplexArray, covariance: FloatArray, lines: int
-) -> npt.NDArray[np.bool_]:
-    """(n,) modes whose residue noise alone would not make.
-
-    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
-    zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
-    (Bonferroni). Where it cannot be computed the mode is kept.
-    """
-    limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / max(lines, 1))
-    kept = np.ones(residues.size, bool)
-    for k, (residue, matrix) in enumerate(zip(residues, covariance, strict=True)):
-        vector = np.array([residue.real, residue.imag])
-        try:
-            distance = vector @ np.linalg.solve(matrix, vector)
-        except np.linalg.LinAlgError:
-            continue
-        kept[k] = not distance < limit
-    return kept
-
-
-def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:
-    low_hz, high_hz = batch.band_hz
-    structure = batch.structure
-    sentences = {
-        PolesStatus.TOO_FEW_LINES: f"{int(batch.lines[index])} lines in {low_hz:g}-{high_hz:g} Hz, "
-        f"{structure.parameters} parameters need at least {structure.fewest_lines}",
-        PolesStatus.NOT_CONVERGED: "the iterations found no minimum",
-        PolesStatus.ILL_CONDITIONED: f"condition number {batch.condition_number[index]:.2g}: the "
-        "lines do not determine the model",
-        PolesStatus.NO_RESONANCE: f"no complex pole pair in {low_hz:g}-{high_hz:g} Hz",
-        PolesStatus.UNSTABLE_POLE: "a pole in the right half plane: the sensor is passive, so the "
-        "model is wrong",
-        PolesStatus.NO_COVARIANCE: "the variance is not known independently of the fit: a model "
-        "error would not show",
-        PolesStatus.MODEL_ERROR: f"{_contradiction(batch, index)}: the model leaves something out, "
-        "rely on the total covariance",
-    }
-    return sentences.get(status, "")
-
-
-def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
-    """What noise alone would not make."""
-    found = []
-    if np.isfinite(batch.cost[index]):
-        found.append(
-            f"cost {batch.cost[index]:.4g} where the variance explains "
-            f"{batch.expected_cost[index]:.4g}"
-        )
-    if batch.whiteness[index] > SMOOTH_RESIDUAL:
-        found.append(
-            f"residuals of neighbouring lines alike (whiteness {batch.whiteness[index]:.1f} where "
-            f"noise makes {SMOOTH_RESIDUAL} at most)"
-        )
-    return ", ".join(found)
 
 
 def _rows(model, rows):

@@ -23,7 +23,8 @@ from tactile_resonance.identification.dense import (
     minimise_dense,
 )
 from tactile_resonance.identification.model import RationalModel, Variable
-from tactile_resonance.identification.solver import Problem, minimise
+from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.solver import minimise
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]

@@ -13,9 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import lapack
 
 from tactile_resonance.identification.bins import BinData, BinGroup
+from tactile_resonance.identification.normal_equations import solve_one
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -166,13 +166,3 @@ class OnePoint:
         if which == 0:
             value += self._basis.last
         return value
-
-
-def solve_one(normal: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:
-    """``(N + damping diag N)^-1 gradient`` (n,) by Cholesky; NaN where N is not positive definite."""
-    diagonal = normal.diagonal()
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = normal * scale * scale[:, None]
-    scaled.flat[:: scale.size + 1] = 1 + 1e-15 + damping
-    _, step, fault = lapack.dposv(scaled, gradient * scale)
-    return step * scale if fault == 0 else np.full(scale.size, np.nan)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import whiteness
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -65,8 +66,8 @@ class Poles:
         Weighted squared residuals, and their expectation if there were nothing but noise; NaN where
         the variance is unknown.
     whiteness : float
-        Correlation of the residuals of neighbouring lines times the root of their number: beyond
-        +-3 noise alone is improbable. NaN where it was not computed.
+        How much smoother the residuals are than those of noise, as a normal score: see
+        `whiteness.whiteness`. NaN where it was not computed.
     condition_number : float
         Of the column-scaled Jacobian, to within a factor of the number of parameters; NaN where
         there is none.
@@ -103,9 +104,6 @@ class Poles:
     status: PolesStatus = PolesStatus.FAILED
     message: str = ""
 
-
-# Neighbouring residuals of noise alone are more alike than this once in a thousand fits.
-SMOOTH_RESIDUAL = 3.09
 
 STATUSES = tuple(PolesStatus)
 STATUS_CODE = {status: code for code, status in enumerate(STATUSES)}
@@ -171,11 +169,8 @@ class PolesBatch:
 
     @property
     def whiteness(self) -> FloatArray:
-        """(...) correlation of neighbouring residuals over its standard deviation if white.
-
-        NaN where there are no two of them.
-        """
-        return whiteness(self.residual)
+        """(...) how much smoother the residuals are than white ones; see `whiteness.whiteness`."""
+        return whiteness(self.residual, self.structure.parameters)
 
     def has_status(self, status: PolesStatus) -> npt.NDArray[np.bool_]:
         """(...) which points have a status."""
@@ -184,25 +179,6 @@ class PolesBatch:
     def status(self, index: tuple[int, ...] | int = ()) -> PolesStatus:
         """Status of one point."""
         return STATUSES[int(self.status_code[index])]
-
-
-def whiteness(residual: ComplexArray) -> FloatArray:
-    """(...) correlation of neighbouring residuals (..., F) over its standard deviation if white.
-
-    Residuals of 0 are those of lines left out. NaN where there are no two others.
-    """
-    first, second = residual[..., :-1], residual[..., 1:]
-    there = residual != 0
-    if there.all():
-        used = np.asarray(max(residual.shape[-1], 1))
-        pairs = np.asarray(residual.shape[-1] - 1)
-    else:
-        used = np.maximum(there.sum(axis=-1), 1)
-        pairs = (there[..., :-1] & there[..., 1:]).sum(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        power = (residual.real**2 + residual.imag**2).sum(axis=-1) / used
-        together = (first.real * second.real + first.imag * second.imag).sum(axis=-1)
-        return np.asarray(together / (power * np.sqrt(np.maximum(pairs, 0) / 2)))
 
 
 def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:

@@ -13,10 +13,13 @@ from benchmarks.poles_plant import (
     SAMPLES_PER_PERIOD,
     Plant,
 )
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import identify_poles_from_records
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, PolesStatus
+from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 BARE = ModelStructure(2, 2)
 RUNS = 2000
@@ -67,6 +70,49 @@ def test_one_period_shows_a_model_error_by_its_smoothness(ratio):
     std = np.sqrt(np.diagonal(result.total_covariance[:, 0], axis1=-2, axis2=-1))
     told = result.has_status(PolesStatus.MODEL_ERROR)
     assert np.mean(np.abs(error / std)[told] < 3) > 0.95
+
+
+def realisations(rng, lines, count, runs, size, structure):
+    """Fits of FRFs that have `count` realisations: a mode at 69.5 Hz, and what one at 121 Hz adds.
+
+    `size` is what the latter adds at 110 Hz, in standard deviations of one line of the mean, beyond a
+    spread over realisations that is three times as large at the resonance.
+    """
+    frequency_hz = np.linspace(40, 110, lines)
+    s, w, far = 2j * np.pi * frequency_hz, 2 * np.pi * 69.5, 2 * np.pi * 121
+    g = 0.1 + 0.1 * w**2 / (s**2 + 0.1 * w * s + w**2)
+    neighbour = 1 / (s**2 + 0.02 * far * s + far**2)
+    std = 0.02 * (1 + 3 * np.abs(g))
+    error = rng.standard_normal((runs, count, lines, 2)).view(complex)[..., 0] * std / np.sqrt(2)
+    each = g + error + size * std[-1] / np.sqrt(count) * neighbour / np.abs(neighbour[-1])
+    frf = FRF(
+        frequency_hz,
+        each.mean(axis=1),
+        variance_total=each.var(axis=1, ddof=1) / count,
+        total_dof=count - 1,
+        realisations=count,
+    )
+    return identify_batch(frf, structure=structure)
+
+
+@pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
+@pytest.mark.parametrize(("lines", "count"), [(41, 4), (41, 10), (470, 10)])
+def test_spread_over_realisations_alone_raises_no_more_alarms(lines, count, structure):
+    """Two tests here too; smoothness alone keeps to its one in a thousand."""
+    result = realisations(np.random.default_rng(8), lines, count, RUNS, 0.0, structure)
+    alarms = result.has_status(PolesStatus.MODEL_ERROR).sum()
+    assert stats.binom.sf(alarms - 1, RUNS, 2e-3) > 0.0005
+    smooth = np.sum(result.whiteness > SMOOTH_RESIDUAL)
+    assert stats.binom.sf(smooth - 1, RUNS, 1e-3) > 0.0005
+
+
+def test_a_model_error_that_the_cost_does_not_show_is_told_by_its_smoothness():
+    """Two standard deviations of a line at the end of the band, less elsewhere, over 470 lines."""
+    result = realisations(np.random.default_rng(9), 470, 10, 200, 2.0, BARE)
+    assert np.mean(result.cost > 1.3 * result.expected_cost) == 0
+    assert np.mean(result.has_status(PolesStatus.MODEL_ERROR)) > 0.9
+    richer = realisations(np.random.default_rng(9), 470, 10, 200, 2.0, ModelStructure())
+    assert np.mean(richer.has_status(PolesStatus.MODEL_ERROR)) < 0.02
 
 
 @pytest.mark.parametrize("band", [(40, 110), (1, 200)])

@@ -6,8 +6,10 @@ import pytest
 
 from tactile_resonance.identification.basis import PolynomialBasis
 from tactile_resonance.identification.bins import BinData, BinGroup
-from tactile_resonance.identification.one_point import OnePoint, solve_one
-from tactile_resonance.identification.solver import Problem, minimise, solve_scaled
+from tactile_resonance.identification.normal_equations import solve_one, solve_scaled
+from tactile_resonance.identification.one_point import OnePoint
+from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.solver import minimise
 
 RNG = np.random.default_rng(4)
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Against published implementations and measured data."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.io
@@ -13,8 +15,9 @@ from tactile_resonance.identification.identify import (
     identify_poles,
     identify_spectra,
 )
-from tactile_resonance.identification.result import SMOOTH_RESIDUAL, PolesStatus
+from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
 
 BARE = ModelStructure(2, 2)
 
@@ -100,6 +103,35 @@ def test_silverbox_second_order_leaves_nothing_out_that_ten_realisations_show(si
     assert abs(bare.whiteness) < SMOOTH_RESIDUAL
     # half a chi-square of 14 degrees of freedom, weights of 9 degrees: mean 7.9
     assert bare.cost - rich.cost < stats.chi2.ppf(0.95, 14) / 2 * 9 / 8
+
+
+def test_silverbox_one_model_serves_both_parts_of_the_band(silverbox):
+    """Chow's test: models of 40-110 Hz and of the rest cost as little less as chance takes."""
+    f = silverbox.frequency_hz
+    band, middle = (f >= 1) & (f <= 200), (f >= 40) & (f <= 110)
+
+    def cost(lines):
+        variance = silverbox.variance_total[lines]
+        frf = FRF(f[lines], silverbox.g[lines], variance_total=variance, total_dof=9)
+        return identify_poles(frf, structure=BARE).cost
+
+    gain = cost(band) - cost(band & middle) - cost(band & ~middle)
+    assert 0 < gain < stats.chi2.ppf(0.95, BARE.parameters) / 2 * 9 / 8
+
+
+@pytest.mark.parametrize("band", [(40, 110), (1, 200)])
+def test_silverbox_with_a_neighbouring_mode_is_told(silverbox, band):
+    """A mode beyond the band that adds four standard deviations of a line at its end, and less inside."""
+    s, w = 2j * np.pi * silverbox.frequency_hz, 2 * np.pi * 1.1 * band[1]
+    mode = 1 / (s**2 + 0.02 * w * s + w**2)
+    end = int(np.argmin(np.abs(silverbox.frequency_hz - band[1])))
+    std = np.sqrt(silverbox.variance_total[end - 20 : end].mean())
+    changed = replace(silverbox, g=silverbox.g + 4 * std * mode / np.abs(mode[end]))
+    poles = identify_poles(changed, band, BARE)
+    assert poles.status is PolesStatus.MODEL_ERROR
+    total = np.sqrt(np.diagonal(poles.total_covariance[0]))
+    assert abs(poles.f0_hz[0] - 69.536) < 2 * total[0]
+    assert abs(poles.damping_ratio[0] - 0.04877) < 2 * total[1]
 
 
 def test_batch_equals_single_points(silverbox):

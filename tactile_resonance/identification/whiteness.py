@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether residuals of neighbouring lines act together: what a model leaves out is smooth, noise not.
+
+Noise and stochastic distortion are independent from line to line. What a model leaves out is a smooth
+function of frequency: the cosine transform over the lines gathers it in its first coefficients, where
+it stands out long before the total cost shows it. How smooth is not known beforehand, so several
+numbers of coefficients are tried (Neyman's smooth test with a number of components taken from the
+data: Fan, *Test of significance based on wavelet thresholding and Neyman's truncation*, J. Am. Stat.
+Assoc. 91 (1996) 674-688).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+# Residuals of noise alone are smoother than this once in a thousand fits.
+SMOOTH_RESIDUAL = 3.09
+# No more coefficients than this count as smooth.
+MOST_COMPONENTS = 128
+
+
+@lru_cache(maxsize=64)
+def components(lines: int, parameters: int) -> tuple[IntArray, ComplexArray]:
+    """(levels,) how many cosine coefficients are compared with the rest, and (F, J) the cosines.
+
+    The fit has taken its own parameters out of the smooth ones, half a coefficient each, so the
+    first level has as many as there are parameters; each further one twice those of the last, up to
+    half of all.
+    """
+    most = min(lines // 2, max(MOST_COMPONENTS, parameters))
+    levels = np.array([most])
+    while levels[0] > 2 * parameters:
+        levels = np.append(levels[0] // 2, levels)
+    line, k = np.ogrid[:lines, :most]
+    cosines = np.cos(np.pi * k * (line + 0.5) / lines) * np.sqrt(np.where(k == 0, 1, 2) / lines)
+    # complex, so that products with residuals need no conversion
+    return levels, cosines.astype(complex)
+
+
+def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
+    """(...) how much smoother residuals (..., F) are than white ones, as a normal score.
+
+    Parameters
+    ----------
+    residual : (..., F) complex
+        Weighted, in the order of their lines; 0 on lines left out.
+    parameters : int
+        Real parameters of the fit.
+
+    Returns
+    -------
+    float array
+        The score whose chance is that of the most significant level among all levels (Sidak);
+        independent circular residuals exceed x no more often than a normal variable does. NaN for
+        fewer than three lines.
+
+    Notes
+    -----
+    The mean power of the first J coefficients over that of the others is F-distributed, with 2 J and
+    2 (F - J) degrees of freedom, whatever the level of the noise. What the fit took out of the first
+    ones makes the test conservative. F to normal by Paulson's cube roots, see
+    `noise_level.f_quantile`.
+    """
+    lines = residual.shape[-1]
+    if lines < 3:
+        return np.full(residual.shape[:-1], np.nan)
+    counts, cosines = components(lines, parameters)
+    power = _squared(residual @ cosines).cumsum(axis=-1)
+    smooth = power[..., counts - 1]
+    total = _squared(residual).sum(axis=-1, keepdims=True)
+    used = lines if residual.all() else np.count_nonzero(residual, axis=-1)[..., None]
+    others = np.maximum(used - counts, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.cbrt(smooth / (total - smooth) * (others / counts))
+        a, b = 1 / (9 * counts), 1 / (9 * others)
+        score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
+        among = -np.expm1(counts.size * np.log1p(-special.ndtr(-score)))
+    return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
+
+
+def _squared(values: ComplexArray) -> FloatArray:
+    """Squared moduli."""
+    return np.asarray(values.real**2 + values.imag**2)
