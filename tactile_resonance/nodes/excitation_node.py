@@ -105,7 +105,7 @@ class ExcitationNode(ManagedNode):
     def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
         result = Measure.Result()
         if not self._busy.acquire(blocking=False):
-            result.outcome = Measure.Result.REFUSED
+            result.outcome = Measure.Result.BUSY
             result.message = "a measurement is running, cancel it or wait for its result"
             return result
         try:
