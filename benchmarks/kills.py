@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan whose nodes are killed at random moments: what is finished stays, and all of it comes to its end.
 
-`tools/run.sh python -m benchmarks.kills --kills 50` kills each node in turn, and all at once, with SIGKILL. What
-was killed is started anew and a scan that was killed is resumed. After every kill the run is read from its files
-alone, by rosbags with the definitions in them; at its end it is compared with a scan that nobody disturbed.
+`tools/run.sh python -m benchmarks.kills --kills 50` kills each node in turn, and all at once, with SIGKILL.
+What was killed is started anew and a scan that was killed is resumed. After every kill the run is read from its
+files alone, by rosbags with the definitions in them; at its end it is compared with a scan that nobody disturbed.
 """
 
 from __future__ import annotations
@@ -208,8 +208,9 @@ class KilledScan:
         assert sorted(point.index for point in found.values()) == list(range(self._points))
         for name, point in found.items():
             assert point.counts == (BLOCKS, BLOCKS, BLOCKS), f"{name}: {point.counts}"
-        references = sorted(path.stem[13:] for path in self._run.glob("recording/reference-*"))
-        assert references == ["air-after", "air-before"], references
+        if "contact_node" in self.nodes:  # without a robot nobody lifts the tip into free air
+            references = sorted(path.stem[13:] for path in self._run.glob("recording/reference-*"))
+            assert references == ["air-after", "air-before"], references
         return {point.index: point.poles for point in found.values()}
 
 
@@ -273,7 +274,8 @@ def _report(kills: Sequence[Kill], scans: Sequence[Mapping], compared: bool, too
     same = " with the very poles of an undisturbed scan, to the bit," if compared else ""
     lines += [
         "",
-        f"{len(kills)} kills in {took_s:.0f} s; {len(scans)} scans of {len(scans[0])} points came to their end.",
+        f"{len(kills)} kills in {took_s:.0f} s; {len(scans)} scans of {len(scans[0])} points came to",
+        "their end. "
         f"All {points} points were finished once,{same} every file readable to its end and unchanged",
         "from when it was first seen, with as many records, FRFs and poles as blocks were measured.",
     ]
