@@ -3,7 +3,7 @@
 
 `tools/run.sh python -m benchmarks.kills --kills 50` kills each node in turn, and all at once, with SIGKILL.
 What was killed is started anew and a scan that was killed is resumed. After every kill the run is read from its
-files alone, by rosbags with the definitions in them; at its end it is compared with a scan that nobody disturbed.
+files alone, by rosbags with the definitions in them; at its end it is compared with one that nobody disturbed.
 """
 
 from __future__ import annotations

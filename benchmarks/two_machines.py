@@ -14,8 +14,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from tactile_resonance.processes import NodeProcesses, end_with_parent
@@ -26,6 +24,7 @@ NEAR, FAR = 0, 1
 # RFC 5737: addresses for documentation, in no network
 ADDRESSES = ("192.0.2.1", "192.0.2.2")
 CABLE = "veth0"
+CLIENT = "benchmarks.two_machines_client"
 DOMAIN = "7"
 UP_WITHIN_S = 90.0
 SCENE = """
@@ -147,7 +146,7 @@ def on_two_machines(
     speed: float = 0.0,
     environment: dict[str, str] | None = None,
 ) -> dict:
-    """Start the nodes of both sides, run one of the orders of `_main_near` near, return what it tells."""
+    """Start the nodes of both sides, run an order of the client near, return what it tells."""
     scene = folder / "scene.yaml"
     scene.write_text(SCENE)
     near = [*NEAR_NODES, *(["contact_node"] if robot_host else []), "scan_node"]
@@ -197,7 +196,7 @@ def _near(machines: TwoMachines, folder: Path, order: list[str]) -> dict:
     """What a client on the near machine tells."""
     carried, lost = machines.carried_bytes(), machines.losses()
     answer = subprocess.run(
-        [*machines.prefix(NEAR), sys.executable, "-m", __name__, "--near", str(folder), *order],
+        [*machines.prefix(NEAR), sys.executable, "-m", CLIENT, str(folder), *order],
         stdout=subprocess.PIPE,
         text=True,
         check=False,
@@ -213,81 +212,12 @@ def _near(machines: TwoMachines, folder: Path, order: list[str]) -> dict:
     return told
 
 
-def _main_near(folder: Path, order: list[str]) -> None:
-    """In the near namespace: `scan`, or `measure BLOCKS`; the last line of the output is JSON."""
-    from tactile_resonance.action import Measure, Scan
-
-    from tactile_resonance import msg
-    from tactile_resonance.nodes.running import RESULTS
-    from tactile_resonance.nodes.scan_client import ScanClient
-
-    class Client(ScanClient):
-        def join(self) -> None:
-            from rclpy.action import ActionClient
-
-            super().join()
-            self.measure = ActionClient(self._node, Measure, "measure")
-            self.counts: dict[str, dict[int, int]] = {}
-            for topic, kind in (("record", msg.Record), ("frf", msg.FRF), ("poles", msg.Poles)):
-                self.counts[topic] = {}
-                self._node.create_subscription(kind, topic, self._counter(topic), RESULTS)
-
-        def _counter(self, topic: str) -> Callable:
-            def count(message) -> None:
-                counts = self.counts[topic]
-                counts[message.measurement_id] = counts.get(message.measurement_id, 0) + 1
-
-            return count
-
-        def take(self, **goal):
-            self.wait(self.measure.server_is_ready, 30.0, "the action measure")
-            sent = self.measure.send_goal_async(Measure.Goal(**goal))
-            self.wait(sent.done, 30.0, "the goal to be taken")
-            future = sent.result().get_result_async()
-            self.wait(future.done, 600.0, "the measurement")
-            result = future.result().result
-            end_s = time.monotonic() + 20.0
-            while time.monotonic() < end_s:
-                self.spin(0.05)
-                if self.of(result.measurement_id) == [result.blocks] * 3:
-                    break
-            return result
-
-        def of(self, key: int) -> list[int]:
-            return [counts.get(key, 0) for counts in self.counts.values()]
-
-    with Client(lambda: None) as client:
-        client.wait_until_up(UP_WITHIN_S)
-        for _ in range(10):  # until all have found each other
-            warm = client.take(periods=3)
-            if client.of(warm.measurement_id) == [3, 3, 3]:
-                break
-        begun_s = time.monotonic()
-        if order[0] == "measure":
-            result = client.take(periods=int(order[1]))
-            told = {
-                "published": result.blocks,
-                "message": result.message,
-                **dict(zip(client.counts, client.of(result.measurement_id), strict=True)),
-            }
-        else:
-            goal = Scan.Goal(scene=str(folder / "scene.yaml"), run_directory=str(folder / "run"))
-            result = client.scan(goal, lambda _: None, 300.0)
-            told = {
-                name: getattr(result, name)
-                for name in ("outcome", "message", "points", "done", "failed", "blocks")
-            }
-        told["took_s"] = time.monotonic() - begun_s
-    print(json.dumps(told))
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=" ".join(__doc__.split()))
     parser.add_argument(
         "order", nargs="*", default=["measure", "50"], help="scan, or measure BLOCKS"
     )
-    parser.add_argument("--near", type=Path, help=argparse.SUPPRESS)
     parser.add_argument(
         "--speed", type=float, default=0.0, help="of the bench; 0: as fast as it computes"
     )
@@ -297,9 +227,6 @@ def main() -> None:
     )
     parser.add_argument("--environment", default="", metavar="NAME=VALUE,...")
     options = parser.parse_args()
-    if options.near:
-        _main_near(options.near, options.order)
-        return
     given = dict(pair.split("=") for pair in options.environment.split(",") if pair)
     with tempfile.TemporaryDirectory() as folder, TwoMachines(options.cable) as machines:
         told = on_two_machines(
