@@ -56,6 +56,7 @@ class TwoMachines:
     def __init__(self, discipline: str = "") -> None:
         self.names = tuple(f"tactile-{os.getpid()}-{side}" for side in ("near", "far"))
         self._discipline = discipline
+        self._holders: list[subprocess.Popen] = []
 
     def __enter__(self) -> TwoMachines:
         if reason := not_permitted():
@@ -73,18 +74,22 @@ class TwoMachines:
                     self.run(
                         name, "tc", "qdisc", "add", "dev", CABLE, "root", *self._discipline.split()
                     )
+                self._holders.append(_hold(name))
         except BaseException:
             self.__exit__()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
+        for holder in self._holders:
+            holder.kill()
+            holder.wait()
         for name in self.names:
             subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
 
     def prefix(self, side: int) -> tuple[str, ...]:
         """What runs a command on one side."""
-        return ("ip", "netns", "exec", self.names[side])
+        return ("nsenter", "--target", str(self._holders[side].pid), "--mount", "--net")
 
     @staticmethod
     def run(name: str, *command: str) -> str:
@@ -114,6 +119,25 @@ class TwoMachines:
         return found
 
 
+def _hold(name: str) -> subprocess.Popen:
+    """A process that keeps one side's own shared memory: two machines have none in common."""
+    script = "mount -t tmpfs tmpfs /dev/shm && echo ready && exec sleep infinity"
+    holder = subprocess.Popen(
+        ["ip", "netns", "exec", name, "unshare", "--mount", "sh", "-c", script],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=end_with_parent,
+    )
+    assert holder.stdout is not None
+    if (line := holder.stdout.readline().strip()) != "ready":
+        holder.kill()
+        holder.wait()
+        raise ValueError(f"two machines: no shared memory of its own: {line}")
+    return holder
+
+
 def _ip(*arguments: str) -> None:
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -122,8 +146,9 @@ def _ip(*arguments: str) -> None:
 
 def not_permitted() -> str:
     """Why there can be no namespaces here; empty where there can."""
-    if shutil.which("ip") is None:
-        return "two machines: no command ip (iproute2)"
+    for command in ("ip", "nsenter", "unshare"):
+        if shutil.which(command) is None:
+            return f"two machines: no command {command} (iproute2, util-linux)"
     name = f"tactile-{os.getpid()}-try"
     made = subprocess.run(["ip", "netns", "add", name], capture_output=True, text=True, check=False)
     if made.returncode:

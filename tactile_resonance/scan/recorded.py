@@ -143,8 +143,8 @@ def _ids_of(path: Path) -> list[int]:
     """Measurements of a file, by its excitations."""
     store = message_types()
     messages = read_messages_of_type(path, EXCITATION)
-    ids = (int(store.deserialize_cdr(cdr, EXCITATION).measurement_id) for _, _, cdr in messages)
-    return list(dict.fromkeys(ids))
+    excitations: list[Any] = [store.deserialize_cdr(cdr, EXCITATION) for _, _, cdr in messages]
+    return list(dict.fromkeys(int(excitation.measurement_id) for excitation in excitations))
 
 
 def _file_name(result: PointResult) -> str:

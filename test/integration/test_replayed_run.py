@@ -2,6 +2,7 @@
 """A run holds exactly what was published, tells any reader what it means, and gives the same poles again."""
 
 import array
+import dataclasses
 import struct
 from collections import defaultdict
 
@@ -91,8 +92,8 @@ def bits(message, *without):
     """Everything in a message, to the bit, of whatever library; serialised forms have padding of any value."""
     if hasattr(message, "get_fields_and_field_types"):
         names = message.get_fields_and_field_types()
-    elif hasattr(message, "__dataclass_fields__"):
-        names = [name for name in message.__dataclass_fields__ if name != "__msgtype__"]
+    elif dataclasses.is_dataclass(message):
+        names = [field.name for field in dataclasses.fields(message)]
     elif isinstance(message, array.array | np.ndarray):
         return message.tobytes()
     else:
