@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -159,6 +160,7 @@ class KilledScan:
         hidden = self._run / ".unfinished"
         midst = hidden.is_dir() and any(hidden.iterdir())
         self.kills.append(Kill(victim, len(found), midst, self._phase))
+        print(f"kill {len(self.kills)}: {self.kills[-1]}", file=sys.stderr, flush=True)
         self._start(killed)
         if "scan_node" in killed:
             self._ask(resume=True)

@@ -48,7 +48,7 @@ GOAL_ENDS_WITHIN_S = 15.0
 RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
 STATE_STALE_S = 2.0
-BUSY_POLL_S = 0.2
+NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 # What says nothing of the point: the contact is tried again.
 DEVICE_CAUSES = frozenset(
@@ -182,9 +182,9 @@ class NodeHands:
                 result = self._follow(
                     self._measure, handle, "excitation_node", check, watch, each_poll
                 )
-                if result.outcome != Measure.Result.BUSY or time.monotonic() > deadline:
+                if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
                     break
-                time.sleep(BUSY_POLL_S)
+                time.sleep(NOT_READY_POLL_S)
             if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
                 raise PointDisturbed(f"measurement: {result.message}")
             self._wait_for_results(result, watch, check)

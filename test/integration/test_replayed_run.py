@@ -93,7 +93,8 @@ def bits(message, *without):
     if hasattr(message, "get_fields_and_field_types"):
         names = message.get_fields_and_field_types()
     elif dataclasses.is_dataclass(message):
-        names = [field.name for field in dataclasses.fields(message)]
+        # without the constants of the definition and the name of its type
+        names = [f.name for f in dataclasses.fields(message) if f.name[0].islower()]
     elif isinstance(message, array.array | np.ndarray):
         return message.tobytes()
     else:
