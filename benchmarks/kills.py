@@ -130,9 +130,9 @@ class KilledScan:
         return self._to_the_end()
 
     def disturbed(
-        self, victims: Sequence[str], random: np.random.Generator
+        self, victims: Sequence[str], random: np.random.Generator, longest_s: float = float("inf")
     ) -> list[dict[int, tuple[float, ...]]]:
-        """Kill these one after the other; poles by point of every scan that it took.
+        """Kill these one after the other, for so long at most; poles by point of every scan that it took.
 
         Raises
         ------
@@ -140,8 +140,11 @@ class KilledScan:
             If a finished point is lost, changed, repeated or not readable, or a scan does not come to its end.
         """
         scans = []
+        over_s = time.monotonic() + longest_s
         self._begin()
         for victim in victims:
+            if time.monotonic() > over_s:
+                break
             wait_s = float(random.uniform(0.0, LONGEST_WAIT_S))
             end_s = time.monotonic() + wait_s
             while time.monotonic() < end_s:
@@ -230,6 +233,9 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
+        "--longest", type=float, default=float("inf"), metavar="S", help="no more kills after this"
+    )
+    parser.add_argument(
         "--robot-host",
         default="",
         metavar="127.X.Y.Z",
@@ -248,7 +254,7 @@ def main() -> None:
     with KilledScan(folder, points, options.robot_host) as scan:
         expected = None if options.robot_host else scan.undisturbed()
         victims = victims_of(scan.nodes, options.kills, random)
-        scans = scan.disturbed(victims, random)
+        scans = scan.disturbed(victims, random, options.longest)
         kills = scan.kills
     for poles in scans:
         assert expected is None or poles == expected, (
