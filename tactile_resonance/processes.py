@@ -24,10 +24,13 @@ class NodeProcesses:
     ----------
     log_folder : Path
         Receives the output of each node.
+    prefix : sequence of str
+        Before each command: what runs it elsewhere, in a network namespace for example.
     """
 
-    def __init__(self, log_folder: Path) -> None:
+    def __init__(self, log_folder: Path, prefix: Sequence[str] = ()) -> None:
         self._log_folder = log_folder
+        self._prefix = tuple(prefix)
         self._processes: dict[str, subprocess.Popen] = {}
 
     def __enter__(self) -> NodeProcesses:
@@ -42,7 +45,8 @@ class NodeProcesses:
         The node is told to end should this process die, and does not hear the terminal's Ctrl-C: this
         process ends it in order.
         """
-        command = [sys.executable, "-m", f"tactile_resonance.nodes.{node}", "--ros-args"]
+        module = f"tactile_resonance.nodes.{node}"
+        command = [*self._prefix, sys.executable, "-m", module, "--ros-args"]
         for name, value in (parameters or {}).items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-p", f"{name}:={text}"]
@@ -67,6 +71,14 @@ class NodeProcesses:
         given["manager_node"] = {"nodes": f"[{','.join(nodes)}]"}
         for node in (*nodes, "manager_node"):
             self.start(node, given.get(node))
+
+    def kill(self, *nodes: str) -> None:
+        """End nodes as a crash would, with SIGKILL, all before the first is waited for."""
+        killed = [self._processes.pop(node) for node in nodes]
+        for process in killed:
+            _signal(process, signal.SIGKILL)
+        for process in killed:
+            process.wait()
 
     def check(self) -> None:
         """RuntimeError if a node has ended by itself, with the last line it printed."""

@@ -10,6 +10,8 @@ Greengard & Lee, SIAM Rev. 46 (2004) 443-454).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
@@ -42,8 +44,7 @@ class BandSpectrum:
         self._first = int(np.floor(OVERSAMPLING * low - half))
         grid = np.arange(self._first, int(np.ceil(OVERSAMPLING * high + half)) + 1)
         centre = samples_per_period // 2
-        time = (np.arange(samples_per_period) - centre) / (OVERSAMPLING * samples_per_period)
-        self._weight = 1 / _kernel_transform(time)  # (N,)
+        self._weight = _weight(samples_per_period)  # (N,)
         # the transform of real samples of length 2 N: grid points outside 0..N by symmetry
         length = OVERSAMPLING * samples_per_period
         folded = grid % length
@@ -104,6 +105,16 @@ class BandSpectrum:
         length = periods * samples
         result *= np.exp(-2j * np.pi * ((self._centre * bins) % length) / length)
         return np.ascontiguousarray(result.transpose(1, 0, 2))
+
+
+@lru_cache(maxsize=4)
+def _weight(samples_per_period: int) -> FloatArray:
+    """(N,) factors that take the kernel's transform out of a period again."""
+    centre = samples_per_period // 2
+    time = (np.arange(samples_per_period) - centre) / (OVERSAMPLING * samples_per_period)
+    weight = 1 / _kernel_transform(time)
+    weight.flags.writeable = False
+    return weight
 
 
 def _kernel(distance: FloatArray) -> FloatArray:

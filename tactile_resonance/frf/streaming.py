@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -86,7 +88,6 @@ class FrfStream:
         self.samples_per_period = samples_per_period
         self.max_periods = max_periods
         self._order, self._dof = order, dof
-        self._plans: dict[int, LocalPolynomialPlan] = {}
         self._record = np.empty((2, 1, samples_per_period))  # (2, room, N), rows [Y; U]
         self._finished: list[PeriodicSpectra] = []
         self._band: BandSpectrum | None = None
@@ -168,11 +169,9 @@ class FrfStream:
         return robust_frf(stacked_spectra(realisations), sample_rate_hz=self.sample_rate_hz)
 
     def _plan(self, periods: int) -> LocalPolynomialPlan:
-        if periods not in self._plans:
-            self._plans[periods] = LocalPolynomialPlan(
-                self.harmonics, self.samples_per_period, periods, self._order, self._dof
-            )
-        return self._plans[periods]
+        return _plan(
+            self.harmonics.tobytes(), self.samples_per_period, periods, self._order, self._dof
+        )
 
     def _with_next(self, period: npt.NDArray[np.float64]) -> PeriodicSpectra:
         self.periods += 1
@@ -195,3 +194,12 @@ class FrfStream:
             larger[:, :room] = self._record
             self._record = larger
         self._record[:, self.periods - 1] = period
+
+
+@lru_cache(maxsize=16)
+def _plan(
+    harmonics: bytes, samples_per_period: int, periods: int, order: int, dof: int
+) -> LocalPolynomialPlan:
+    """Plans of the latest kinds: one measurement is like the next."""
+    lines = np.frombuffer(harmonics, np.int64)
+    return LocalPolynomialPlan(lines, samples_per_period, periods, order, dof)

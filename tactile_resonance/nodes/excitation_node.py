@@ -42,6 +42,10 @@ PARAMETERS = (
 RESULT_TIMEOUT_S = 900
 
 
+class NotReady(DeviceError):
+    """The device does not answer; it may do so later."""
+
+
 class Cancelled(Exception):
     """The goal was cancelled."""
 
@@ -105,13 +109,13 @@ class ExcitationNode(ManagedNode):
     def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
         result = Measure.Result()
         if not self._busy.acquire(blocking=False):
-            result.outcome = Measure.Result.REFUSED
+            result.outcome = Measure.Result.NOT_READY
             result.message = "a measurement is running, cancel it or wait for its result"
             return result
         try:
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
-            info = self._device.configure(excitations[0].sample_rate_hz)
+            info = self._ready_device(excitations[0].sample_rate_hz)
             excitation_design.check_output(excitations, info)
             store = self._open_store()
             if store is not None:
@@ -119,6 +123,8 @@ class ExcitationNode(ManagedNode):
         except (ValueError, OSError, DeviceError) as error:
             self._busy.release()
             result.outcome = Measure.Result.REFUSED
+            if isinstance(error, NotReady):
+                result.outcome = Measure.Result.NOT_READY
             result.message = _reason(error)
             self.health.error(f"refused: {result.message}")
             return result
@@ -137,6 +143,12 @@ class ExcitationNode(ManagedNode):
         finally:
             self._busy.release()
         return result
+
+    def _ready_device(self, sample_rate_hz: float) -> DeviceInfo:
+        try:
+            return self._device.configure(sample_rate_hz)
+        except DeviceError as error:
+            raise NotReady(str(error)) from error
 
     def _plan(self, goal: Measure.Goal) -> list[Excitation]:
         """What the device will play, with ids where neither goal nor device gives any."""

@@ -22,6 +22,7 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.publisher_watch import PublisherWatch
 from tactile_resonance.nodes.running import NEWEST, STREAM
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.record import Contact
@@ -46,6 +47,9 @@ RESULTS_WITHIN_S = 10.0
 GOAL_ENDS_WITHIN_S = 15.0
 RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
+STATE_STALE_S = 2.0
+NOT_READY_POLL_S = 0.2
+STREAM_TOPICS = ("record", "frf", "poles")
 # What says nothing of the point: the contact is tried again.
 DEVICE_CAUSES = frozenset(
     cause.value
@@ -56,6 +60,10 @@ DEVICE_CAUSES = frozenset(
 )
 ATTEMPTS = 3
 PLACE_FOR_S = 0.2
+
+
+class NodeRenewed(PointDisturbed):
+    """A node went away and was started anew: it knows nothing of what was asked of the one before."""
 
 
 class NodeHands:
@@ -81,6 +89,7 @@ class NodeHands:
         base_frame: str,
         with_robot: bool,
     ) -> None:
+        self._node = node
         self._recorder = recorder
         self._table = table_in_base
         self._base_frame = base_frame
@@ -90,6 +99,7 @@ class NodeHands:
         # a scan that was killed may have left the tip on the tissue
         self._touching = with_robot
         self._state: msg.ContactState | None = None
+        self._state_s = float("-inf")
         if with_robot:
             # the newest only: the recorder's may have to wait behind what else is recorded
             node.listen(msg.ContactState, "contact_state", self._on_state, NEWEST)
@@ -110,8 +120,9 @@ class NodeHands:
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         self._touching = True
         for attempt in range(1, ATTEMPTS + 1):
+            watch = PublisherWatch(self._node, ("contact_state",))
             handle = self._send(self._contact, goal, "make_contact", check)
-            result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
+            result = self._follow(self._contact, handle, "contact_node", check, watch)
             if result.reached:
                 break
             if result.cause not in DEVICE_CAUSES or attempt == ATTEMPTS:
@@ -135,7 +146,9 @@ class NodeHands:
         check: Check,
     ) -> Measured:
         """Measure until it is enough or the design's end; all messages go into the recording."""
+        # its own id: another measurement may be under way, begun by a scan that was killed
         goal = Measure.Goal(
+            measurement_id=time.time_ns() // 1000,
             label=label,
             grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
             level_v=design.level_v,
@@ -145,9 +158,10 @@ class NodeHands:
             realisations=design.realisations,
             seed=seed,
         )
-        self._recorder.record_into(recording)
+        topics = (*STREAM_TOPICS, *(["contact_state"] if self._touching else []))
+        watch = PublisherWatch(self._node, topics)
+        self._recorder.record_into(recording, goal.measurement_id)
         try:
-            handle = self._send(self._measure, goal, "measure", check)
             seen: list[msg.Poles] = []
             stopping = [False]
 
@@ -162,17 +176,24 @@ class NodeHands:
                 take_poles()
                 self._check_contact()
 
-            result = self._follow(self._measure, handle, "excitation_node", check, each_poll)
+            deadline = time.monotonic() + NODE_BACK_WITHIN_S
+            while True:
+                handle = self._send(self._measure, goal, "measure", check)
+                result = self._follow(
+                    self._measure, handle, "excitation_node", check, watch, each_poll
+                )
+                if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
+                    break
+                time.sleep(NOT_READY_POLL_S)
             if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
-                raise PointFailed(f"measurement: {result.message}")
-            self._wait_for_results(result, check)
+                raise PointDisturbed(f"measurement: {result.message}")
+            self._wait_for_results(result, watch, check)
             take_poles()
         finally:
-            self._recorder.record_into(None)
-        mine = [m for m in seen if m.measurement_id == result.measurement_id]
-        if not mine:
+            self._recorder.stop()
+        if not seen:
             raise PointFailed("measurement: it ended before its first block")
-        poles, origin = poles_from_message(mine[-1])
+        poles, origin = poles_from_message(seen[-1])
         if origin.contact.position_m is None:
             raise PointFailed("measurement: nobody told where the tip is (tcp_pose)")
         return Measured(poles, origin)
@@ -220,12 +241,17 @@ class NodeHands:
 
     def _check_contact(self) -> None:
         state = self._state
-        if self._touching and state is not None and state.state != state.STATE_HOLD:
+        if not self._touching or state is None:
+            return
+        silent_s = time.monotonic() - self._state_s
+        if silent_s > STATE_STALE_S:
+            raise PointDisturbed(f"contact_node: nothing heard of it for {silent_s:.1f} s")
+        if state.state != state.STATE_HOLD:
             kind = PointDisturbed if state.cause in DEVICE_CAUSES else PointFailed
             raise kind(f"contact: {state.cause}: {state.message}")
 
     def _on_state(self, message: msg.ContactState) -> None:
-        self._state = message
+        self._state, self._state_s = message, time.monotonic()
 
     def _new_poles(self) -> list[msg.Poles]:
         messages = []
@@ -235,14 +261,16 @@ class NodeHands:
             except queue.Empty:
                 return messages
 
-    def _wait_for_results(self, result: Measure.Result, check: Check) -> None:
+    def _wait_for_results(
+        self, result: Measure.Result, watch: PublisherWatch, check: Check
+    ) -> None:
         """Until every block's record, FRF and poles are in the recording."""
         deadline = time.monotonic() + RESULTS_WITHIN_S
         while True:
-            counts = self._recorder.counts(result.measurement_id)
+            counts = self._recorder.counts()
             if all(count >= result.blocks for count in counts):
                 return
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline or watch.renewed():
                 raise PointDisturbed(
                     f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
                     "came"
@@ -268,7 +296,8 @@ class NodeHands:
         handle: ClientGoalHandle,
         node: str,
         check: Check,
-        each_poll: Callable[[], None],
+        watch: PublisherWatch,
+        each_poll: Callable[[], None] = lambda: None,
     ) -> Any:
         """Result of a goal; one that is left for whatever reason is cancelled and waited for."""
         future = handle.get_result_async()
@@ -276,11 +305,13 @@ class NodeHands:
             while not future.done():
                 if not client.server_is_ready():
                     raise PointDisturbed(f"{node} went away")
+                if topic := watch.renewed():
+                    raise NodeRenewed(f"{topic}: who publishes it was started anew")
                 check()
                 each_poll()
                 time.sleep(POLL_S)
-        except (PointFailed, Interrupted):
-            if client.server_is_ready():
+        except (PointFailed, Interrupted) as error:
+            if client.server_is_ready() and not isinstance(error, NodeRenewed):
                 handle.cancel_goal_async()
                 self._done(future, GOAL_ENDS_WITHIN_S)
             raise

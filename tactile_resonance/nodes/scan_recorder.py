@@ -22,19 +22,24 @@ from tactile_resonance.scan.runner import Recording
 
 @dataclass(frozen=True)
 class Recorded:
-    """A topic that is recorded; `counted` where the scan needs to know what came."""
+    """A topic that is recorded.
+
+    `measured` where its messages belong to a measurement: only those of the scan's own are kept. `counted`
+    where the scan needs to know how many came.
+    """
 
     kind: type
     qos: QoSProfile
     latched: bool = False
+    measured: bool = False
     counted: bool = False
 
 
 TOPICS = {
-    "excitation": Recorded(msg.Excitation, EXCITATIONS, latched=True),
-    "record": Recorded(msg.Record, RESULTS, counted=True),
-    "frf": Recorded(msg.FRF, RESULTS, counted=True),
-    "poles": Recorded(msg.Poles, RESULTS, counted=True),
+    "excitation": Recorded(msg.Excitation, EXCITATIONS, latched=True, measured=True),
+    "record": Recorded(msg.Record, RESULTS, measured=True, counted=True),
+    "frf": Recorded(msg.FRF, RESULTS, measured=True, counted=True),
+    "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
     "contact_state": Recorded(msg.ContactState, SERIES),
@@ -55,25 +60,28 @@ class ScanRecorder:
         self.poles: queue.SimpleQueue[msg.Poles] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._recording: Recording | None = None
-        self._counts: Counter[tuple[str, int]] = Counter()
-        self._latched: dict[str, list[tuple[int, bytes]]] = {}
+        self._measurement_id = 0
+        self._counts: Counter[str] = Counter()
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
-    def record_into(self, recording: Recording | None) -> None:
-        """Write what comes from now on there; None: nowhere."""
+    def record_into(self, recording: Recording, measurement_id: int) -> None:
+        """Write what comes from now on there; of measurements only this one."""
         with self._lock:
-            self._recording = recording
+            self._recording, self._measurement_id = recording, measurement_id
             self._counts.clear()
-        while not self.poles.empty():
-            self.poles.get()
+            while not self.poles.empty():
+                self.poles.get()
 
-    def counts(self, measurement_id: int) -> tuple[int, ...]:
-        """Records, FRFs and poles of a measurement that came."""
+    def stop(self) -> None:
+        """Write no more."""
         with self._lock:
-            return tuple(
-                self._counts[(topic, measurement_id)] for topic, r in TOPICS.items() if r.counted
-            )
+            self._recording = None
+
+    def counts(self) -> tuple[int, ...]:
+        """Records, FRFs and poles of the measurement that came."""
+        with self._lock:
+            return tuple(self._counts[topic] for topic, r in TOPICS.items() if r.counted)
 
     def _listen(self, node: ManagedNode, topic: str, recorded: Recorded) -> None:
         full = node.resolve_topic_name(topic)
@@ -81,13 +89,15 @@ class ScanRecorder:
 
         def heard(cdr: bytes) -> None:
             with self._lock:
-                if self._recording is not None:
-                    self._recording.write(full, name, time.time_ns(), cdr, recorded.latched)
-                if not recorded.counted:
+                if self._recording is None:
                     return
-                message = deserialize_message(cdr, recorded.kind)
-                self._counts[(topic, message.measurement_id)] += 1
-            if topic == "poles":
-                self.poles.put(message)
+                if recorded.measured:
+                    message = deserialize_message(cdr, recorded.kind)
+                    if message.measurement_id != self._measurement_id:
+                        return
+                self._recording.write(full, name, time.time_ns(), cdr, recorded.latched)
+                self._counts[topic] += 1
+                if topic == "poles":
+                    self.poles.put(message)
 
         node.listen(recorded.kind, topic, heard, recorded.qos, raw=True)

@@ -30,7 +30,7 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     run : Path
         Folder of a run.
     measurement_id : int, optional
-        Column of ``results.csv``; not needed where there is only one.
+        Column of ``results.csv``; not needed where only one point has one.
 
     Raises
     ------
@@ -42,8 +42,9 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     ids = ", ".join(str(key) for key in list(by_id)[:_MOST_LISTED])
     if len(by_id) > _MOST_LISTED:
         ids += f" and {len(by_id) - _MOST_LISTED} more"
-    if measurement_id is None and len(by_id) == 1:
-        measurement_id = next(iter(by_id))
+    points = [entry.measurement_id for entry in source.entries if not entry.reference]
+    if measurement_id is None and len(points) == 1:
+        (measurement_id,) = points
     if measurement_id is None:
         raise ValueError(f"measurement_id: not told which, {run} holds {ids or 'none'}")
     if measurement_id not in by_id:
@@ -53,14 +54,15 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
 
 @dataclass(frozen=True)
 class RecordedEntry:
-    """One measurement of a run: its id and file."""
+    """One measurement of a run: its id and file, and whether it is a reference, in free air."""
 
     measurement_id: int
     path: Path
+    reference: bool = False
 
 
 class RunSource:
-    """The measurements of a run, by point and attempt, for a device that plays them again.
+    """The measurements of a run, in the order in which they were taken, for a device that plays them again.
 
     Parameters
     ----------
@@ -74,11 +76,15 @@ class RunSource:
 
     def __init__(self, run: Path) -> None:
         content = read_run(run)
-        self.entries = [
-            RecordedEntry(result.measurement_id, _file_of(run, result))
-            for result in content.results
-            if result.measurement_id
-        ]
+        folder = Path(run) / RECORDING
+        points = {_file_name(result): result.measurement_id for result in content.results}
+        self.entries: list[RecordedEntry] = []
+        for file in sorted(content.files, key=lambda file: (file.start_ns, file.name)):
+            path = folder / file.name
+            if file.name not in points:
+                self.entries += [RecordedEntry(key, path, True) for key in _ids_of(path)]
+            elif points[file.name]:
+                self.entries.append(RecordedEntry(points[file.name], path))
 
     def read(self, entry: RecordedEntry) -> StoredMeasurement:
         """One of `entries`.
@@ -133,5 +139,13 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
         )
 
 
-def _file_of(run: Path, result: PointResult) -> Path:
-    return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"
+def _ids_of(path: Path) -> list[int]:
+    """Measurements of a file, by its excitations."""
+    store = message_types()
+    messages = read_messages_of_type(path, EXCITATION)
+    excitations: list[Any] = [store.deserialize_cdr(cdr, EXCITATION) for _, _, cdr in messages]
+    return list(dict.fromkeys(int(excitation.measurement_id) for excitation in excitations))
+
+
+def _file_name(result: PointResult) -> str:
+    return f"point-{result.index:05d}-{result.attempt:02d}.mcap"

@@ -364,19 +364,23 @@ class ScanRunner:
         def all_blocks(poles: Poles, blocks: int) -> bool:
             return False
 
-        with self._run.begin_reference(name) as recording:
-            try:
-                self._hands.measure(
-                    replace(self._plan.measurement, periods=self._scene.blocks.least),
-                    "air",
-                    self._seed,
-                    all_blocks,
-                    recording,
-                    self._controls.check,
-                )
-            except PointFailed:
+        for _ in range(ATTEMPTS):
+            with self._run.begin_reference(name) as recording:
+                try:
+                    self._hands.measure(
+                        replace(self._plan.measurement, periods=self._scene.blocks.least),
+                        "air",
+                        self._seed,
+                        all_blocks,
+                        recording,
+                        self._controls.check,
+                    )
+                except PointDisturbed:
+                    continue
+                except PointFailed:
+                    return
+                recording.finish()
                 return
-            recording.finish()
 
     def _say(
         self, point: ScanPoint | None, phase: str, blocks: int = 0, poles: Poles | None = None

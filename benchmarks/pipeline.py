@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the last sample of a block to the poles of all blocks so far, stage by stage.
+
+The nodes run as processes of their own on the simulated bench in real time. Stages are told apart by what every
+message of ROS carries: when it was handed to the middleware, and when the middleware of a listener received it.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.processes import NodeProcesses, free_domain_id
+
+FloatArray = NDArray[np.float64]
+
+NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
+PERIODS = 8
+PLACE_M = (0.0, 0.0, 0.0)  # on gelatine
+START_WITHIN_S = 60.0
+GOAL_MS = 10.0
+CASES = {
+    "all lines, 10 Hz to 10 kHz": {},
+    "lines of a scan, 180 to 320 Hz": {"f_min_hz": 180.0, "f_max_hz": 320.0, "level_v": 0.12},
+}
+STAGES = (
+    "bench: last sample to block published",
+    "block received, on disk, handed out",
+    "transport of the record",
+    "FRF",
+    "transport of the FRF",
+    "poles",
+    "transport of the poles",
+)
+COMPUTING = (3, 5)
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """One case.
+
+    Attributes
+    ----------
+    stages_s : (blocks, stages) array
+    periods : (blocks,) array
+        Of the record that the FRF rests on.
+    record_bytes : int
+        Of a serialised record.
+    """
+
+    stages_s: FloatArray
+    periods: NDArray[np.int64]
+    record_bytes: int
+
+    @property
+    def computing_s(self) -> FloatArray:
+        """FRF and poles, waiting for the processor included."""
+        return self.stages_s[:, COMPUTING].sum(axis=1)
+
+    @property
+    def total_s(self) -> FloatArray:
+        """From the last sample of a block."""
+        return self.stages_s.sum(axis=1)
+
+
+def run(output: Path, quick: bool) -> str:
+    """Measure, write ``pipeline.md`` and ``pipeline.png`` into `output`, and return the table.
+
+    Raises
+    ------
+    ValueError
+        Where ROS 2 or the messages are not there.
+    """
+    for package in ("rclpy", "tactile_resonance.msg"):
+        if find_spec(package) is None:
+            raise ValueError(f"benchmark pipeline: {package} not found; tools/run.sh sets it up")
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    measurements = 4 if quick else 30
+    results = {name: measure(goal, measurements) for name, goal in CASES.items()}
+    text = _report(results)
+    (output / "pipeline.md").write_text(text, encoding="utf-8")
+    _draw(results, output / "pipeline.png")
+    return text
+
+
+def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
+    """Latencies of every block of so many measurements of `PERIODS` blocks."""
+    from benchmarks.pipeline_listener import PipelineListener
+
+    with tempfile.TemporaryDirectory() as folder, NodeProcesses(Path(folder) / "log") as nodes:
+        nodes.bring_up(NODES, {"excitation_node": {"record_folder": Path(folder) / "records"}})
+        with PipelineListener(nodes.check) as listener:
+            listener.wait_for_nodes(START_WITHIN_S)
+            listener.warm_up(PLACE_M, START_WITHIN_S)
+            keys = [
+                listener.measure_block_by_block(PLACE_M, goal, PERIODS, seed=1 + k)
+                for k in range(measurements)
+            ]
+            times_ns, size = listener.times_ns(keys)
+    # (blocks, 8): last sample; block, record sent; record received; FRF sent, received; poles sent, received
+    stages_s = np.diff(times_ns, axis=1) * 1e-9
+    return Latencies(stages_s, np.tile(np.arange(1, PERIODS + 1), measurements), size)
+
+
+def _report(results: Mapping[str, Latencies]) -> str:
+    def cells(values: FloatArray) -> str:
+        median, high = np.quantile(values, [0.5, 0.99]) * 1e3
+        return f"{median:.2f} | {high:.2f}"
+
+    each = list(results.values())
+    first = each[0]
+    lines = [
+        "# From the last sample to the poles",
+        "",
+        "`tools/run.sh tactile_resonance benchmark pipeline`. " + " ".join(__doc__.split()),
+        "50 kHz, two channels, blocks of one period of 20000 samples; after every block FRF, bins of 200 to",
+        f"300 Hz and poles of all blocks so far, up to {PERIODS}. {os.cpu_count()} cores for all nodes, the",
+        f"bench's synthesis and the listener together. A record is {first.record_bytes / 1e3:.0f} kB;",
+        f"{len(first.total_s)} blocks a column.",
+        "",
+        "| stage [ms] | " + " | ".join(f"{name}: median | 99 %" for name in results) + " |",
+        "|---|" + "---|---|" * len(results),
+    ]
+    for index, stage in enumerate(STAGES):
+        row = " | ".join(cells(result.stages_s[:, index]) for result in each)
+        lines.append(f"| {stage} | {row} |")
+    for name, values in (
+        ("**FRF and poles**", [result.computing_s for result in each]),
+        ("**last sample to poles**", [result.total_s for result in each]),
+    ):
+        lines.append(f"| {name} | " + " | ".join(cells(value) for value in values) + " |")
+    for periods in (1, PERIODS):
+        values = [result.computing_s[result.periods == periods] for result in each]
+        row = " | ".join(cells(value) for value in values)
+        lines.append(f"| FRF and poles, {periods} period{'s' if periods > 1 else ''} | {row} |")
+    lines += ["", "Goal for the median of FRF and poles together: below 10 ms."]
+    for name, result in results.items():
+        median_ms = 1e3 * float(np.median(result.computing_s))
+        verdict = "met" if median_ms < GOAL_MS else "missed"
+        lines.append(f"{name[0].upper()}{name[1:]}: {median_ms:.1f} ms, {verdict}.")
+    lines += [
+        "",
+        "A stage ends where the next begins: what waits for a processor is in the stage that waits. The bench",
+        "hands a block out when its last sample would have been taken and computes the next one meanwhile; a",
+        "device adds its own latency in place of the first row. The second row holds the record's way from the",
+        "bench to `excitation_node` and its file, synchronised to disk, before anybody hears of it.",
+        "",
+        "![Stages](pipeline.png)",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _draw(results: Mapping[str, Latencies], path: Path) -> None:
+    figure, panels = plt.subplots(
+        1, len(results), figsize=(12, 4.2), layout="constrained", sharex=True, sharey=True
+    )
+    names = [*STAGES, "FRF and poles", "last sample to poles"]
+    for axes, (name, result) in zip(panels, results.items(), strict=True):
+        columns = [*result.stages_s.T, result.computing_s, result.total_s]
+        axes.boxplot(
+            [column[column > 0] * 1e3 for column in columns],
+            vert=False,
+            whis=(1, 99),
+            showfliers=False,
+            widths=0.6,
+        )
+        axes.set_yticks(range(1, len(names) + 1), names)
+        axes.axvline(GOAL_MS, color="0.6", linestyle="--", linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set_xlabel("ms: median, quartiles, 1 % and 99 %")
+        axes.set_title(name)
+    panels[0].invert_yaxis()
+    figure.suptitle("From the last sample of a block to its poles (simulated bench in real time)")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Client of the nodes that keeps when each message was sent and received, as the middleware tells."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
+from tactile_resonance.action import Measure
+
+from tactile_resonance import msg
+from tactile_resonance.nodes.conversions import record_from_message
+from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.nodes.scan_session import ScanSession
+
+TOPICS = {"bench/block": msg.Record, "record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}
+ALL_WITHIN_S = 10.0
+
+
+class PipelineListener(ScanSession):
+    """Keeps every message as it came, and looks into them only when all is over."""
+
+    def join(self) -> None:
+        """Readers beside those of a session."""
+        super().join()
+        self._kept: dict[str, list[tuple[bytes, Mapping[str, int]]]] = {name: [] for name in TOPICS}
+        for topic, kind in TOPICS.items():
+            self._node.create_subscription(
+                kind, topic, self._keeper(self._kept[topic]), RESULTS, raw=True
+            )
+
+    @staticmethod
+    def _keeper(kept: list[tuple[bytes, Mapping[str, int]]]) -> Any:
+        # rclpy looks at the signature: two parameters ask for the times
+        def keep(cdr: bytes, info: Any) -> None:
+            kept.append((cdr, info))
+
+        return keep
+
+    def measure_block_by_block(
+        self,
+        position_m: tuple[float, float, float],
+        goal: Mapping[str, float],
+        periods: int,
+        seed: int,
+    ) -> int:
+        """One measurement; its id."""
+        request = Measure.Goal(periods=periods, seed=seed, **goal)
+        result = self.measure(position_m, request, lambda done, planned: None)
+        return result.origin.measurement_id
+
+    def times_ns(self, keys: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+        """Times of every block of these measurements, and the size of a record.
+
+        Returns
+        -------
+        (blocks, 8) int
+            Last sample; block and record sent, record received; FRF sent, received; poles sent, received
+            (UNIX time) [ns].
+        int
+            Bytes.
+
+        Raises
+        ------
+        ValueError
+            If a message is missing.
+        """
+        deadline = time.monotonic() + ALL_WITHIN_S
+        while time.monotonic() < deadline:
+            self.spin(0.05)
+            heard = {topic: self._by_block(topic, keys) for topic in TOPICS}
+            if len({tuple(sorted(blocks)) for blocks in heard.values()}) == 1:
+                break
+        else:
+            counts = {topic: len(blocks) for topic, blocks in heard.items()}
+            raise ValueError(
+                f"benchmark pipeline: messages heard: {counts}, expected as many of each"
+            )
+        rows = []
+        for place in sorted(heard["record"]):
+            message, record = heard["record"][place]
+            samples = record_from_message(message)
+            last_ns = samples.origin.time_ns + round(1e9 * samples.duration_s)
+            rows.append(
+                (
+                    last_ns,
+                    heard["bench/block"][place][1]["source_timestamp"],
+                    record["source_timestamp"],
+                    record["received_timestamp"],
+                    *(
+                        heard[topic][place][1][name]
+                        for topic in ("frf", "poles")
+                        for name in ("source_timestamp", "received_timestamp")
+                    ),
+                )
+            )
+        return np.array(rows, np.int64), len(self._kept["record"][-1][0])
+
+    def _by_block(
+        self, topic: str, keys: Sequence[int]
+    ) -> dict[tuple[int, int], tuple[Any, Mapping[str, int]]]:
+        """(measurement, block) -> message, times; results come in the order of the blocks."""
+        found: dict[tuple[int, int], tuple[Any, Mapping[str, int]]] = {}
+        order = {key: number for number, key in enumerate(keys)}
+        counts = [0] * len(keys)
+        for cdr, info in self._kept[topic]:
+            message = deserialize_message(cdr, TOPICS[topic])
+            number = order.get(message.measurement_id)
+            if number is not None:
+                found[number, counts[number]] = message, info
+                counts[number] += 1
+        return found
