@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ArmError, ForceError, ForceSource
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
@@ -89,6 +89,7 @@ class ContactLoop:
         self._next_ns = clock.now_ns()
         self._refused: ArmError | None = None  # what a command raised, told in the next cycle
         self._stopped_ns: int | None = None
+        self._unheard: Command | None = None  # a stop that the arm has not taken
 
     def start(self, goal: ContactGoal) -> None:
         """Begin a contact; raises ``ValueError`` where the controller refuses it."""
@@ -145,7 +146,8 @@ class ContactLoop:
             wrenches = self._force.read()
         except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
-        command = self.controller.step(now, arm, wrenches, fault)
+        # the arm keeps a velocity, so a stop is told until it is heard, whatever state that ends in
+        command = self.controller.step(now, arm, wrenches, fault) or self._unheard
         try:
             if command is None:
                 self._stopped_ns = None
@@ -155,9 +157,12 @@ class ContactLoop:
             elif self._stopped_ns is None or now - self._stopped_ns > STOP_AGAIN_NS:
                 self._stopped_ns = now
                 self._arm.stop(command.acceleration_m_s2)
+            self._unheard = None
         except ArmError as error:
             self._refused = error
             self._stopped_ns = None
+            if command is not None and command.twist is None:
+                self._unheard = command
         if self._listener is not None:
             state = self.controller.state
             bias_n = self.controller.bias_n

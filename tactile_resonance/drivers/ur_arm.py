@@ -159,8 +159,16 @@ class UrArm:
         return client.moving or client.done < self._move
 
     def stop(self, deceleration_m_s2: float) -> None:
-        """Stop; works at any time and raises only where the link is dead, or for a wrong figure."""
+        """Stop; works at any time and raises only where the link is dead, or for a wrong figure.
+
+        Where states are stale the client still takes it, and tells the robot as soon as it may.
+        """
         self._check_acceleration(deceleration_m_s2)
+        try:
+            self._fresh()
+        except ArmError as error:
+            if error.fault is not ArmFault.STALE:
+                raise
         self._send("stop", [float(deceleration_m_s2)])
 
     def close(self) -> None:
@@ -176,7 +184,6 @@ class UrArm:
         return self._send(name, values)
 
     def _send(self, name: str, values: list) -> int:
-        self._fresh()
         assert self._commands is not None
         self._number += 1
         message = json.dumps({"name": name, "number": self._number, "values": values})

@@ -17,6 +17,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from typing import Any, NoReturn
 
 import dashboard_client
@@ -25,8 +26,13 @@ import rtde_receive
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, EXIT_ORDERLY, Exchange
-from tactile_resonance.drivers.ur_motion import Motion
+from tactile_resonance.drivers.ur_exchange import (
+    EXIT_BROKEN,
+    EXIT_LINK_LOST,
+    EXIT_ORDERLY,
+    Exchange,
+)
+from tactile_resonance.drivers.ur_motion import Motion, OvertakenError
 from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
 from tactile_resonance.drivers.ur_states import VARIABLES, StateReader
 from tactile_resonance.processes import take_priority
@@ -38,6 +44,8 @@ GIVE_UP_S = 1.2
 HANG_S = 20
 LONGEST_MESSAGE = 8192
 REFUSAL_S = 0.008
+# From clearing the command register to sending a program that reads it, by another connection.
+CLEARING_S = 0.05
 
 
 class Client:
@@ -51,27 +59,38 @@ class Client:
         self._control: Any = None
         self._motion: Motion | None = None
         self._kicked_s = 0.0
+        self._requests: list[dict] = []
+        # number and deceleration of a stop that the robot has not taken yet
+        self._owed: tuple[int, float] | None = None
 
     def run(self) -> NoReturn:
         """Serve until the owner is gone."""
         while True:
-            pause_s = 1.0 if self._motion is None else 1.0 / (3 * self._require().watchdog_hz)
-            ready, _, _ = select.select([self._commands], [], [], pause_s)
-            requests = self._received() if ready else []
-            for request in _newest(requests):
-                self._execute(request)
+            if not self._requests:
+                pause_s = 1.0 if self._motion is None else 1.0 / (3 * self._require().watchdog_hz)
+                select.select([self._commands], [], [], pause_s)
+            self._receive()
+            if self._requests:
+                self._execute(self._requests.pop(0))
             self._keep_alive()
 
-    def _received(self) -> list[dict]:
-        requests = []
+    def _receive(self) -> None:
+        """Take what the owner has sent meanwhile."""
         while True:
             try:
                 data = self._commands.recv(LONGEST_MESSAGE, socket.MSG_DONTWAIT)
             except BlockingIOError:
-                return requests
+                break
+            except OSError:
+                data = b""
             if not data:
                 self._leave()
-            requests.append(json.loads(data))
+            self._requests.append(json.loads(data))
+        self._requests = _newest(self._requests)
+
+    def _stop_waits(self) -> bool:
+        self._receive()
+        return any(request["name"] == "stop" for request in self._requests)
 
     def _execute(self, request: dict) -> None:
         name, number = request["name"], request.get("number", 0)
@@ -79,27 +98,59 @@ class Client:
             self._answer(lambda: self._connect(UrArmConfig.from_dict(request["config"])))
         elif name == "restart":
             self._answer(self._restart)
-        else:
+        elif name == "stop":
             assert self._motion is not None
+            (deceleration,) = request["values"]
+            # whatever becomes of the stop itself, no velocity is said again
+            self._motion.rest(deceleration)
+            self._owed = number, deceleration
+            self._pay()
+        else:
             assert self._states is not None
-            try:
-                done = self._states.healthy and self._do(name, request["values"])
-            except Exception as error:  # the library raises what it likes; the owner hears of it
-                print(f"{name}: {error}", file=sys.stderr)
-                done = False
-            if not done:
-                # a stop that is why shows in the states a cycle or two later than in the refusal
-                time.sleep(REFUSAL_S)
-            self._states.note_moving(self._motion.moving)
+            done = self._do(name, request["values"])
+            if done:
+                self._owed = None
             self._states.report(number, done)
 
     def _do(self, name: str, values: list) -> bool:
         assert self._motion is not None
         assert self._states is not None
-        state = self._states.state()
-        if motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None:
-            return self._motion.execute(name, values)
-        return name == "stop"  # nothing runs that could be stopped; the library would wait for it
+        try:
+            done = self._listening() and self._motion.execute(name, values)
+        except OvertakenError:
+            done = True  # the stop that came will be answered
+        except Exception as error:  # the library raises what it likes; the owner hears of it
+            print(f"{name}: {error}", file=sys.stderr)
+            done = False
+        if not done:
+            # a stop that is why shows in the states a cycle or two later than in the refusal
+            time.sleep(REFUSAL_S)
+        self._note_moving()
+        return done
+
+    def _listening(self) -> bool:
+        """Whether the program would take a command: the library waits for one that does not."""
+        assert self._states is not None
+        return self._states.healthy and not self._faulty()
+
+    def _pay(self) -> None:
+        """Tell the robot of the stop that it has not taken yet, once it listens."""
+        assert self._motion is not None
+        assert self._states is not None
+        if self._owed is None or not self._states.healthy:
+            return
+        number, deceleration = self._owed
+        if self._listening():
+            done = self._do("stop", [deceleration])
+            self._states.report(number, done)
+            if done:
+                self._owed = None
+            return
+        self._states.report(number, True)  # nothing runs that could be stopped
+        if self._states.revived:
+            # a program that went on, or began, without us finds the old velocity in its register
+            with contextlib.suppress(Exception):
+                self._motion.execute("stop", [deceleration])
 
     def _answer(self, action: Any) -> None:
         try:
@@ -135,15 +186,21 @@ class Client:
             except Exception as error:
                 raise _named(config.host, error) from error
         self._states.watch(self._control)
-        self._motion = Motion(self._control)
+        self._motion = Motion(self._control, self._stop_waits)
         self._prepare(config)
         threading.Thread(target=self._publish, daemon=True).start()
+        self._guard()
 
     def _restart(self) -> None:
         """Upload the program again, after a stop has been released."""
         config = self._require()
         assert self._states is not None
         self._check_modes(config)
+        self._states.unguard()
+        # the velocity of the moment when the program ended still stands in the command register, and a
+        # new program would follow it; what the library does not send to a stopped program clears it
+        self._control.kickWatchdog()
+        time.sleep(CLEARING_S)
         if not self._control.reuploadScript():
             raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program could not be sent")
         deadline = time.monotonic() + 2.0
@@ -153,8 +210,14 @@ class Client:
                     ArmFault.PROGRAM_NOT_STARTED, "the program was sent again and does not run"
                 )
             time.sleep(0.01)
-        self._motion = Motion(self._control)
+        self._motion, self._owed = Motion(self._control, self._stop_waits), None
         self._prepare(config)
+        self._guard()
+
+    def _guard(self) -> None:
+        assert self._states is not None
+        if not self._states.guard():
+            raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program ended as soon as it ran")
 
     def _prepare(self, config: UrArmConfig) -> None:
         """Set TCP, payload and watchdog, and see that they were taken."""
@@ -200,26 +263,35 @@ class Client:
                 f"{config.host} is not in remote control: switch it on the pendant",
             )
 
-    def _publish(self) -> None:
+    def _publish(self) -> NoReturn:
         """Hand out states; end the process where none comes or the owner is gone."""
         assert self._states is not None
         states = self._states
-        while True:
-            states.poll()
-            if states.silence_s > GIVE_UP_S or not states.connected:
-                states.lose()
-                os._exit(EXIT_LINK_LOST)
-            if states.polls % 100 == 0 and _closed(self._commands):
-                # the commands' thread stops the arm, but may itself hang
-                threading.Timer(0.5, os._exit, (EXIT_ORDERLY,)).start()
-            time.sleep(0.0005)
+        try:
+            while True:
+                states.poll()
+                if states.silence_s > GIVE_UP_S or not states.connected:
+                    states.lose()
+                    os._exit(EXIT_LINK_LOST)
+                if states.polls % 100 == 0 and _closed(self._commands):
+                    # the commands' thread stops the arm, but may itself hang
+                    threading.Timer(0.5, os._exit, (EXIT_ORDERLY,)).start()
+                time.sleep(0.0005)
+        except Exception:
+            traceback.print_exc()
+            os._exit(EXIT_BROKEN)  # without states nothing may go on
 
     def _keep_alive(self) -> None:
         """Keep the watchdog quiet while nothing moves or the owner lives."""
         if self._motion is None or self._states is None:
             return
-        self._states.note_moving(self._motion.moving)
         config = self._require()
+        self._note_moving()
+        if self._faulty() and self._owed is None and self._motion.commanded:
+            # what was under way is not to go on, should the program do so
+            self._motion.rest(config.max_acceleration_m_s2)
+            self._owed = 0, config.max_acceleration_m_s2
+        self._pay()
         fresh = self._exchange.silence_s() < config.owner_timeout_s
         if not fresh and self._motion.commanded:
             return
@@ -227,16 +299,21 @@ class Client:
             self._kick()
 
     def _kick(self) -> None:
-        assert self._states is not None
         assert self._motion is not None
-        state = self._states.state()
-        # never a command on a dead link or to a program that does not run: the library would wait for it
-        if (
-            self._states.healthy
-            and motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None
-        ):
+        if self._listening():  # never a command on a dead link
             self._motion.feed()
         self._kicked_s = time.monotonic()
+
+    def _faulty(self) -> bool:
+        assert self._states is not None
+        state = self._states.state()
+        return motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is not None
+
+    def _note_moving(self) -> None:
+        """A move whose program has ended is not under way any more."""
+        assert self._motion is not None
+        assert self._states is not None
+        self._states.note_moving(self._motion.moving and not self._faulty())
 
     def _leave(self) -> NoReturn:
         """The owner is gone: stop the arm where that is possible, and end."""
@@ -268,6 +345,8 @@ def _closed(commands: socket.socket) -> bool:
         return commands.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
     except BlockingIOError:
         return False
+    except OSError:
+        return True
 
 
 def _round_trip_s(host: str) -> float:

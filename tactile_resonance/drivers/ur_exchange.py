@@ -21,7 +21,7 @@ _CHECKSUM = struct.Struct("<I")
 _HEARTBEAT = struct.Struct("<q")
 
 # Exit statuses of the client process; any other is a death.
-EXIT_ORDERLY, EXIT_LINK_LOST = 0, 3
+EXIT_ORDERLY, EXIT_BROKEN, EXIT_LINK_LOST = 0, 1, 3
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 
 No call here waits longer than the robot's watchdog allows without feeding it: the library's own
 ``speedStop`` and synchronous ``stopL`` do, so a speed is taken back to zero before its thread is ended.
+While it waits for the arm to brake it looks for a stop, which may ask for more: none comes late.
 
 A velocity is not acknowledged: it stands in the command register until the robot's program looks, once a
 cycle. The library's ``kickWatchdog`` writes zero into that register, and where both arrive within one cycle
@@ -23,7 +24,12 @@ CYCLE_S = 0.002
 # Beyond the time that deceleration takes: dead time and lag of the arm.
 SETTLE_S = 0.06
 FEED_S = 0.01
-LONGEST_STOP_S = 3.0
+# An owner waits for a second until he calls a command refused, and must not see it obeyed afterwards.
+LONGEST_BRAKING_S = 0.8
+
+
+class OvertakenError(Exception):
+    """A stop came while a command waited for the arm to brake; nothing of the command was begun."""
 
 
 class Motion:
@@ -32,10 +38,13 @@ class Motion:
     Parameters
     ----------
     control : rtde_control.RTDEControlInterface
+    overtaken : callable
+        Whether a stop has come in the meantime.
     """
 
-    def __init__(self, control: Any) -> None:
+    def __init__(self, control: Any, overtaken: Callable[[], bool]) -> None:
         self._control = control
+        self._overtaken = overtaken
         self._twist = [0.0] * 6  # newest velocity, and the acceleration towards it
         self._acceleration_m_s2 = 0.0
         self._speeding = False  # whether a velocity, zero included, is what the program follows
@@ -64,8 +73,22 @@ class Motion:
         return False
 
     def execute(self, name: str, values: list) -> bool:
-        """Do a command; False where the robot refused it."""
+        """Do a command; False where the robot refused it.
+
+        Raises
+        ------
+        OvertakenError
+        RuntimeError
+            Where the arm would brake for too long before the command could be begun.
+        """
         return self._do[name](*values)
+
+    def rest(self, deceleration: float) -> None:
+        """Want no velocity any more: from now on the watchdog is fed with zero."""
+        if any(self._twist):
+            speed_m_s = float(np.linalg.norm(self._twist))
+            self._rest_s = time.monotonic() + speed_m_s / deceleration + SETTLE_S
+        self._twist, self._acceleration_m_s2 = [0.0] * 6, deceleration
 
     def feed(self) -> bool:
         """Keep the robot's watchdog quiet without changing what the arm does."""
@@ -103,13 +126,18 @@ class Motion:
         return done
 
     def _brake(self, deceleration: float) -> bool:
-        speed_m_s = float(np.linalg.norm(self._twist))
-        self._rest_s = time.monotonic() + speed_m_s / deceleration + SETTLE_S
-        return self._follow([0.0] * 6, deceleration)
+        self.rest(deceleration)
+        return self._follow(self._twist, deceleration)
 
     def _end_speed(self, deceleration: float) -> bool:
         if any(self._twist) and not self._brake(deceleration):
             return False
+        braking_s = self._rest_s - time.monotonic()
+        if braking_s > LONGEST_BRAKING_S:
+            raise RuntimeError(
+                f"the arm brakes for {braking_s:.2g} s first, accepted are {LONGEST_BRAKING_S:g} s: "
+                "stop it, or give a larger acceleration"
+            )
         if not self._feed_while(lambda: time.monotonic() < self._rest_s):
             return False
         self._speeding = not self._control.speedStop(deceleration)
@@ -120,10 +148,14 @@ class Motion:
         return self._feed_while(lambda: self.moving)
 
     def _feed_while(self, condition: Callable[[], bool]) -> bool:
-        """Feed the watchdog while a condition holds; False where that takes too long."""
-        end_s = time.monotonic() + LONGEST_STOP_S
+        """Feed the watchdog while a condition holds; False where the robot refuses that."""
+        end_s = time.monotonic() + LONGEST_BRAKING_S
         while condition():
-            if time.monotonic() > end_s or not self.feed():
+            if self._overtaken():
+                raise OvertakenError
+            if time.monotonic() > end_s:
+                raise RuntimeError(f"the arm still brakes after {LONGEST_BRAKING_S:g} s")
+            if not self.feed():
                 return False
             time.sleep(FEED_S)
         return True

@@ -9,7 +9,7 @@ from __future__ import annotations
 from tactile_resonance.contact.interfaces import ArmFault
 
 ROBOT_RUNNING = 7
-PROGRAM_PLAYING = 2
+PROGRAM_STOPPED, PROGRAM_PLAYING = 1, 2
 _ROBOT_MODES = {
     -1: "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off",
     4: "power on", 5: "idle, brakes closed", 6: "backdrive", 7: "running", 8: "updating firmware",

@@ -13,6 +13,7 @@ from typing import Any
 from tactile_resonance.contact.clocks import ClockTracker
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_exchange import ClientState, Exchange
+from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, PROGRAM_STOPPED
 
 VARIABLES = [
     "timestamp",
@@ -59,6 +60,8 @@ class StateReader:
         self._arrivals: deque[float] = deque()
         self._moving = False
         self._done = self._refused = 0
+        self._runtime = 0
+        self._guarded = self._ended = False
 
     @property
     def silence_s(self) -> float:
@@ -89,6 +92,29 @@ class StateReader:
             self.poll()
             time.sleep(0.001)
 
+    @property
+    def revived(self) -> bool:
+        """A program runs, but not the one that was guarded: that one has ended, or was paused.
+
+        Whoever started it (the library after a lost connection, someone at the pendant) has not set its
+        watchdog, and it may follow an old velocity. So it is told to the owner as stopped.
+        """
+        return self._ended and self._runtime == PROGRAM_PLAYING
+
+    def guard(self) -> bool:
+        """Watch the program that was started; False where none runs within a second."""
+        deadline = time.monotonic() + 1.0
+        while self._runtime != PROGRAM_PLAYING:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.001)
+        self._guarded = True
+        return True
+
+    def unguard(self) -> None:
+        """Forget the program that was watched."""
+        self._guarded = self._ended = False
+
     def state(self) -> ClientState:
         """Return the newest state."""
         assert self._newest is not None
@@ -105,10 +131,11 @@ class StateReader:
         pose, speed = receive.getActualTCPPose(), receive.getActualTCPSpeed()
         force = receive.getActualTCPForce()
         safety_bits = receive.getSafetyStatusBits()
-        runtime, mode = receive.getRuntimeState(), receive.getRobotMode()
+        self._runtime, mode = receive.getRuntimeState(), receive.getRobotMode()
         safety_mode = receive.getSafetyMode()
         if receive.getTimestamp() != robot_s:
             return  # the next state came meanwhile: these values are of two
+        self._ended |= self._guarded and self._runtime != PROGRAM_PLAYING
         self._newest_s = now_ns * 1e-9
         self._clock.add(robot_s, now_ns)
         relation = self._clock.relation()
@@ -124,7 +151,7 @@ class StateReader:
                 tip_speed=tuple(speed),
                 tip_force=tuple(force),
                 safety_bits=safety_bits,
-                runtime_state=runtime,
+                runtime_state=PROGRAM_STOPPED if self.revived else self._runtime,
                 robot_mode=mode,
                 safety_mode=safety_mode,
                 connected=self.connected,
@@ -143,7 +170,7 @@ class StateReader:
     def report(self, number: int, done: bool) -> None:
         """Say with the next state what became of a command."""
         with self._lock:
-            self._done = number
+            self._done = max(self._done, number)
             if not done:
                 self._refused = number
 

@@ -10,6 +10,7 @@ import pytest
 
 from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import WallClock
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -239,3 +240,23 @@ def test_wall_clock_returns_at_the_time_and_at_once_after_it():
     clock.wait_until(time_ns)
     assert clock.now_ns() >= time_ns
     clock.wait_until(time_ns - 10**12)
+
+
+def test_stop_that_the_arm_did_not_hear_is_told_again():
+    """Also where the retraction has ended and nothing more is to be told: an arm keeps its velocity."""
+    made = started()
+    assert made.run_until(State.HOLD)
+    made.controller.retract()
+    hears, unheard = made.bench.arm.stop, []
+
+    def stop(deceleration_m_s2):
+        if made.controller.state is State.IDLE and not unheard:
+            unheard.append(made.bench.clock.time_ns)
+            raise ArmError(ArmFault.STALE, "the newest state is too old")
+        hears(deceleration_m_s2)
+
+    made.bench.arm.stop = stop
+    assert made.run_until(State.IDLE)
+    made.run(0.3)
+    assert unheard
+    assert abs(made.speed_m_s[-1]) < 1e-6

@@ -10,13 +10,18 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 from tactile_resonance.simulation.robot.control_port import order
+
+sys.path.insert(0, str(Path(__file__).parent))
+from arms import LAG_S, connect_again, keep, keep_for
 
 # Of the three numbers after 127 two say which test run, the last which robot of it.
 RUN = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}"
@@ -155,6 +160,24 @@ def module_arm(module_robot):
     arm = UrArm(config(module_robot.host))
     yield arm
     arm.close()
+
+
+@pytest.fixture
+def arm(robot, module_arm):
+    """A connected arm; connecting one that is healthy does nothing."""
+    connect_again(module_arm)
+    return module_arm
+
+
+@pytest.fixture
+def high(arm):
+    """The arm well above the tissue, wherever an earlier test left it."""
+    tip = arm.state().tip
+    place = np.array([*tip.position_m[:2], 0.36])
+    arm.move(Pose(place, tip.rotation_rad), 0.2, 1.0)
+    keep(arm, arm.moving)
+    keep_for(arm, LAG_S)
+    return arm
 
 
 @pytest.fixture

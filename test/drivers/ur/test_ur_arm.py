@@ -11,79 +11,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arms import (
+    ACCELERATION_M_S2,
+    DOWN,
+    LAG_S,
+    connect_again,
+    keep,
+    keep_for,
+    standing,
+    wait_for_fault,
+)
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import Pose
-
-DOWN = np.array([0.0, 0.0, -0.005, 0.0, 0.0, 0.0])
-ACCELERATION_M_S2 = 0.5
-LAG_S = 0.1  # the arm follows its target with dead time and lag
-
-
-def keep(arm, condition, limit_s=10.0):
-    """States while a condition holds, as the owner of a moving arm asks for them."""
-    samples = []
-    end = time.monotonic() + limit_s
-    while condition():
-        assert time.monotonic() < end, "it goes on for too long"
-        samples.append(arm.state())
-        time.sleep(0.004)
-    return samples
-
-
-def keep_for(arm, seconds):
-    """States for a time of the robot's clock."""
-    start = arm.state().robot_time_s
-    return keep(arm, lambda: arm.state().robot_time_s < start + seconds)
-
-
-def wait_for_fault(arm, limit_s=2.0):
-    """Drive the arm until it raises."""
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end:
-        try:
-            arm.speed(DOWN, ACCELERATION_M_S2)
-        except ArmError as error:
-            return error
-        time.sleep(0.004)
-    raise AssertionError(f"no fault within {limit_s} s")
-
-
-def connect_again(arm, limit_s=12.0):
-    """Connect as soon as the fault has ended."""
-    end = time.monotonic() + limit_s
-    while True:
-        try:
-            arm.connect()
-            return
-        except ArmError:
-            assert time.monotonic() < end
-            time.sleep(0.1)
-
-
-def standing(robot):
-    """Whether the robot stands after it had the time that a stop takes; its own word."""
-    time.sleep(0.3)
-    return np.linalg.norm(robot.order("state")["tcp_speed"]) < 1e-3
-
-
-@pytest.fixture
-def arm(robot, module_arm):
-    """A connected arm; connecting one that is healthy does nothing."""
-    connect_again(module_arm)
-    return module_arm
-
-
-@pytest.fixture
-def high(arm):
-    """The arm well above the tissue, wherever an earlier test left it."""
-    tip = arm.state().tip
-    place = np.array([*tip.position_m[:2], 0.36])
-    arm.move(Pose(place, tip.rotation_rad), 0.2, 1.0)
-    keep(arm, arm.moving)
-    keep_for(arm, LAG_S)
-    return arm
 
 
 def test_moves_in_a_straight_line_to_the_pose(high):
@@ -250,6 +191,10 @@ def test_protective_stop(robot, high):
     assert error.value.fault is ArmFault.PROTECTIVE_STOP
     robot.unlock()
     connect_again(high)
+    place = high.state().tip.position_m
+    keep_for(high, 0.2)
+    # the velocity of before is gone, though it stood in the robot's register
+    np.testing.assert_allclose(high.state().tip.position_m, place, atol=5e-5)
     high.speed(-DOWN, ACCELERATION_M_S2)
     assert keep_for(high, 0.2)[-1].tip_velocity[2] > 0
 
