@@ -9,39 +9,32 @@ machine it runs on, to be read as ratios to the Fourier transform of the same re
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 from scipy import stats
 
 from benchmarks.poles_bias import tissue_bias
-from benchmarks.poles_peers import PEERS, Case
+from benchmarks.poles_methods import (
+    BARE,
+    Method,
+    compare_methods,
+    estimates_of,
+    joint_plan,
+    local_polynomial_spectra,
+)
 from benchmarks.poles_plant import (
     BAND_HZ,
-    HARMONICS,
-    SAMPLE_RATE_HZ,
-    SAMPLES_PER_PERIOD,
     Plant,
     judge,
 )
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
-from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import (
-    identify_batch,
-    identify_poles,
     identify_spectra,
 )
-from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.result import PolesBatch, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
-BARE = ModelStructure(2, 2)
 DAMPING = (0.005, 0.01, 0.02, 0.05, 0.1)
 SNR_DB = (10.0, 20.0, 40.0, 60.0, 80.0)
 PERIODS = (1, 2, 8)
@@ -77,16 +70,6 @@ def run(output: Path, quick: bool) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
-    """Time per point [s] and root mean square error over the bound's standard deviation."""
-
-    name: str
-    time_s: float
-    error: npt.NDArray[np.float64]
-    note: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
 class Cell:
     """A cell of the Monte Carlo grid: MSE over bound, coverage, failures; NaN where no ELiS is.
 
@@ -102,43 +85,6 @@ class Cell:
     elis_coverage: float
     bound: npt.NDArray[np.float64]
     settled_bound: npt.NDArray[np.float64]
-
-
-def joint_plan(
-    plant: Plant, structure: ModelStructure = BARE, kind: type[JointPlan] = JointPlan
-) -> JointPlan:
-    """Joint estimator for a plant."""
-    variance_y, variance_u = plant.noise
-    return kind(
-        SAMPLE_RATE_HZ,
-        SAMPLES_PER_PERIOD,
-        plant.periods,
-        HARMONICS,
-        BAND_HZ,
-        structure,
-        input_noise_ratio=variance_u / variance_y if plant.periods == 1 else None,
-    )
-
-
-def local_polynomial_spectra(
-    plant: Plant,
-    u: npt.NDArray,
-    y: npt.NDArray,
-    bins: npt.NDArray,
-    band_hz: tuple[float, float] = BAND_HZ,
-) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray, int]:
-    """Lines [Hz], transient-free spectra (runs, 2, F), their covariance, degrees of freedom."""
-    line_hz = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD
-    harmonics = np.arange(round(band_hz[0] / line_hz), round(band_hz[1] / line_hz) + 1)
-    plan = LocalPolynomialPlan(harmonics, SAMPLES_PER_PERIOD, plant.periods)
-    samples = SAMPLES_PER_PERIOD * plant.periods
-    pair = np.stack([y, u], axis=1) * samples  # (runs, 2, K); the plan divides again
-    groups = []
-    for group in plan.groups:
-        where = group.centre_bins + group.offsets[:, None] - bins[0]  # (W, L)
-        groups.append(np.ascontiguousarray(np.moveaxis(pair[:, :, where], 1, 2)))
-    result = plan.from_bins(groups)
-    return harmonics * line_hz, result.spectra, result.covariance, result.noise_dof
 
 
 def measure_cell(plant: Plant, runs: int) -> Cell:
@@ -171,8 +117,7 @@ def measure_cell(plant: Plant, runs: int) -> Cell:
 
 def _errors(result: PolesBatch, plant: Plant) -> tuple[npt.NDArray, npt.NDArray]:
     truth = np.array([250.0, plant.damping_ratio])
-    estimate = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
-    return estimate - truth, result.covariance[:, 0]
+    return estimates_of(result) - truth, result.covariance[:, 0]
 
 
 def _judged(parts: list, bound: npt.NDArray) -> tuple[npt.NDArray, float, int]:
@@ -180,105 +125,6 @@ def _judged(parts: list, bound: npt.NDArray) -> tuple[npt.NDArray, float, int]:
     good = np.isfinite(errors).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
     ratio, coverage = judge(errors[good], covariance[good], bound)
     return ratio, coverage, int(np.sum(~good))
-
-
-def compare_methods(quick: bool) -> list[Method]:
-    """Time per point against error on one cell: damping 2 %, 40 dB, 8 periods."""
-    plant = Plant(0.02, 40.0, 8)
-    runs = 200 if quick else 2000
-    wide = plant.bins(10.0, 1030.0)
-    inside = np.isin(wide, plant.bins())
-    rng = np.random.default_rng(7)
-    u, y = plant.noisy(rng, runs, wide)
-    joint_u, joint_y = np.ascontiguousarray(u[:, inside]), np.ascontiguousarray(y[:, inside])
-    frequency_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
-    frf = FRF(
-        frequency_hz,
-        spectra[:, 0] / spectra[:, 1],
-        variance_noise=ratio_variance(spectra, covariance),
-        noise_dof=dof,
-    )
-    bound = np.sqrt(np.diag(plant.bound()))
-    methods = [
-        Method("Fourier transform of the record, 2 channels", _transform_time(), np.full(2, np.nan))
-    ]
-
-    def add(name: str, time_s: float, estimates: npt.NDArray, note: str = "") -> None:
-        error = np.sqrt(np.nanmean((estimates - [250.0, 0.02]) ** 2, axis=0)) / bound
-        methods.append(Method(name, time_s, error, note))
-
-    few_frfs = [_row(frf, k) for k in range(50)]
-    for structure, model in ((BARE, "2nd order"), (ModelStructure(), "mode + 6 residual terms")):
-        for kind, name in ((JointPlan, "joint"), (CompiledJointPlan, "joint compiled")):
-            try:
-                plan = joint_plan(plant, structure, kind)
-            except ImportError as error:
-                nothing = np.full(2, np.nan)
-                methods.append(
-                    Method(f"{name}, {model}", np.nan, nothing, f"not measured: {error}")
-                )
-                continue
-            result, seconds = _timed(lambda p=plan: p.from_bins(joint_u, joint_y))
-            estimates = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
-            add(f"{name}, {model}, batched", seconds / runs, estimates)
-            _, seconds = _timed(
-                lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)]
-            )
-            add(f"{name}, {model}, single", seconds / 50, estimates)
-        batch = _repeated(frf, max(1, 5000 // runs))
-        result, seconds = _timed(lambda b=batch, s=structure: identify_batch(b, structure=s))
-        size = batch.g.shape[0]
-        estimates = np.stack([result.f0_hz[:runs, 0], result.damping_ratio[:runs, 0]], -1)
-        add(f"FRF, {model}, batched", seconds / size, estimates)
-        _, seconds = _timed(lambda s=structure: [identify_poles(f, structure=s) for f in few_frfs])
-        add(f"FRF, {model}, single", seconds / 50, estimates)
-    few = 40 if quick else 200
-    wide_hz, wide_spectra, _, _ = local_polynomial_spectra(
-        plant, u[:few], y[:few], wide, (20.0, 1000.0)
-    )
-    joint = (plant.bins(), joint_u, joint_y)
-    wide_frf = (wide_hz, wide_spectra[:, 0] / wide_spectra[:, 1])
-    for name, peer in PEERS:
-        case = Case(plant, frequency_hz, frf.g, frf.variance_noise, joint, *wide_frf)
-        try:
-            function = peer(case)
-        except ImportError as error:
-            methods.append(Method(name, np.nan, np.full(2, np.nan), f"not measured: {error}"))
-            continue
-        start = time.process_time()
-        estimates = np.array([function(k) for k in range(few)])
-        failed = int(np.sum(~np.isfinite(estimates).all(axis=-1)))
-        seconds = (time.process_time() - start) / few
-        add(name, seconds, estimates, f"{failed} of {few} without a pole" if failed else "")
-    return methods
-
-
-def _repeated(frf: FRF, times: int) -> FRF:
-    return dataclasses.replace(
-        frf, g=np.tile(frf.g, (times, 1)), variance_noise=np.tile(frf.variance_noise, (times, 1))
-    )
-
-
-def _row(frf: FRF, k: int) -> FRF:
-    return dataclasses.replace(frf, g=frf.g[k], variance_noise=frf.variance_noise[k])
-
-
-def _timed(call: Callable) -> tuple[PolesBatch, float]:
-    """Result, and the least processor time of fifteen calls after a first one."""
-    result = call()
-    times = []
-    for _ in range(15):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return result, min(times)
-
-
-def _transform_time() -> float:
-    """Of one record, both channels one after the other, as `JointPlan` does; every record a new one."""
-    records = np.random.default_rng(0).standard_normal((10, 2, 8 * SAMPLES_PER_PERIOD))
-    call = lambda: [scipy.fft.rfft(channel) for record in records for channel in record]  # noqa: E731
-    return _timed(call)[1] / len(records)
 
 
 def _heading(quick: bool) -> list[str]:
@@ -298,6 +144,9 @@ def _method_table(methods: list[Method]) -> list[str]:
     transform = methods[0].time_s
     rows = [
         "## Damping 2 %, 40 dB, 8 periods",
+        "",
+        "Least processor time of fifteen rounds in which all methods take turns: what else the "
+        "machine does slows all of them, the short single fits most.",
         "",
         "| Method | time per point | over the Fourier transform | points per second | error f0 "
         "| error damping | |",

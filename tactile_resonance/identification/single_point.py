@@ -155,7 +155,7 @@ def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
         )
     if batch.whiteness[index] > SMOOTH_RESIDUAL:
         found.append(
-            f"residuals of neighbouring lines alike (whiteness {batch.whiteness[index]:.1f} where "
+            f"residuals smooth over the lines (whiteness {batch.whiteness[index]:.1f} where "
             f"noise makes {SMOOTH_RESIDUAL} at most)"
         )
     return ", ".join(found)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.poles import MARGIN_HZ, local_polynomial_spectra
+from benchmarks.poles import MARGIN_HZ
+from benchmarks.poles_methods import local_polynomial_spectra
 from benchmarks.poles_plant import BAND_HZ, Plant
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
