@@ -32,7 +32,7 @@ PARAMETERS = (
 
 TICK_S = 0.1
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
-STATE_WITHIN_S = 5.0
+STATE_WITHIN_S = 3.0
 LONGEST_RETRY_S = 16.0
 
 _UP = {
