@@ -108,7 +108,7 @@ class KilledScan:
         self._known: dict[str, Finished] = {}
         self._run = folder / "run-0"
         self._runs = 0
-        self._phase = ""
+        self._phase, self._finished = "", 0
         self.kills: list[Kill] = []
 
     def __enter__(self) -> KilledScan:
@@ -145,6 +145,8 @@ class KilledScan:
         for victim in victims:
             if time.monotonic() > over_s:
                 break
+            # every other time the scan may first finish a point; else it is met again while it recovers
+            wanted = self._finished + int(random.integers(2))
             wait_s = float(random.uniform(0.0, LONGEST_WAIT_S))
             end_s = time.monotonic() + wait_s
             while time.monotonic() < end_s:
@@ -152,6 +154,9 @@ class KilledScan:
                 if self._result.done():
                     scans.append(self._to_the_end())
                     self._begin()
+                    wanted = 0
+                if self._finished < wanted:
+                    end_s = time.monotonic() + wait_s
             self._kill(victim)
         scans.append(self._to_the_end())
         return scans
@@ -169,15 +174,23 @@ class KilledScan:
             self._ask(resume=True)
 
     def _start(self, nodes: Sequence[str]) -> None:
+        for _ in range(10):  # what those that were killed had told
+            self._client.spin(0.02)
+        states = self._client.states
+        states.clear()
         for node in nodes:
             self._processes.start(node, self._parameters.get(node))
-        self._client.states.clear()  # what is told from now on
-        self._client.wait_until_up(UP_WITHIN_S)
+
+        def up() -> bool:
+            # each tells of itself: the manager may not have noticed yet that one was away
+            return all(states.get(node, "").startswith("active") for node in (*nodes, MANAGER))
+
+        self._client.wait(up, UP_WITHIN_S, "the nodes to come up")
 
     def _begin(self) -> None:
         self._run = self._folder / f"run-{self._runs}"
         self._runs += 1
-        self._known = {}
+        self._known, self._finished = {}, 0
         self._ask(resume=False)
 
     def _ask(self, *, resume: bool) -> None:
@@ -190,7 +203,7 @@ class KilledScan:
         self._result = self._client.start(goal, self._hear).get_result_async()
 
     def _hear(self, feedback) -> None:
-        self._phase = feedback.phase
+        self._phase, self._finished = feedback.phase, feedback.finished
 
     def _look(self) -> dict[str, Finished]:
         """Every finished file, readable to its end, none of them lost, changed or repeated."""

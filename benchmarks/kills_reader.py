@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rosbags.highlevel import AnyReader
@@ -31,7 +31,7 @@ class Finished:
     index: int
     digest: str
     counts: tuple[int, ...]
-    poles: tuple[float, ...]
+    poles: tuple[float, ...] = field(compare=False)  # NaN where none were found; the digest tells
 
 
 def finished_points(recording: Path) -> dict[str, Finished]:

@@ -27,6 +27,7 @@ PERIODS = 8
 PLACE_M = (0.0, 0.0, 0.0)  # on gelatine
 START_WITHIN_S = 60.0
 GOAL_MS = 10.0
+NICE = -15
 CASES = {
     "all lines, 10 Hz to 10 kHz": {},
     "lines of a scan, 180 to 320 Hz": {"f_min_hz": 180.0, "f_max_hz": 320.0, "level_v": 0.12},
@@ -84,12 +85,22 @@ def run(output: Path, quick: bool) -> str:
             raise ValueError(f"benchmark pipeline: {package} not found; tools/run.sh sets it up")
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    measurements = 4 if quick else 30
+    measurements = 4 if quick else 20
+    raised = _take_precedence()
     results = {name: measure(goal, measurements) for name, goal in CASES.items()}
-    text = _report(results)
+    text = _report(results, raised)
     (output / "pipeline.md").write_text(text, encoding="utf-8")
     _draw(results, output / "pipeline.png")
     return text
+
+
+def _take_precedence() -> bool:
+    """Before other work of this machine, for this process and the nodes; whether that is permitted."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    except OSError:
+        return False
+    return True
 
 
 def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
@@ -111,7 +122,7 @@ def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
     return Latencies(stages_s, np.tile(np.arange(1, PERIODS + 1), measurements), size)
 
 
-def _report(results: Mapping[str, Latencies]) -> str:
+def _report(results: Mapping[str, Latencies], raised: bool) -> str:
     def cells(values: FloatArray) -> str:
         median, high = np.quantile(values, [0.5, 0.99]) * 1e3
         return f"{median:.2f} | {high:.2f}"
@@ -153,6 +164,9 @@ def _report(results: Mapping[str, Latencies]) -> str:
         "hands a block out when its last sample would have been taken and computes the next one meanwhile; a",
         "device adds its own latency in place of the first row. The second row holds the record's way from the",
         "bench to `excitation_node` and its file, synchronised to disk, before anybody hears of it.",
+        f"All processes ran at nice {NICE}, before other work of the machine."
+        if raised
+        else "All processes ran at the machine's ordinary priority.",
         "",
         "![Stages](pipeline.png)",
     ]

@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -252,6 +253,8 @@ def main() -> None:
     )
     parser.add_argument("--environment", default="", metavar="NAME=VALUE,...")
     options = parser.parse_args()
+    # asked to end, it still removes what it made
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     given = dict(pair.split("=") for pair in options.environment.split(",") if pair)
     with tempfile.TemporaryDirectory() as folder, TwoMachines(options.cable) as machines:
         told = on_two_machines(

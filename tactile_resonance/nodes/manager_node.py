@@ -26,11 +26,13 @@ PARAMETERS = (
         "Names of the managed nodes, in the order in which they come up.",
         read_only=True,
     ),
-    Parameter("answer_timeout_s", 15.0, "Longest wait for an answer of a node [s].", 0.1, 3600.0),
+    Parameter("answer_timeout_s", 15.0, "Longest wait for a node to change [s].", 0.1, 3600.0),
     Parameter("retry_s", 1.0, "First wait after a refusal [s]; doubled each time.", 0.05, 60.0),
 )
 
 TICK_S = 0.1
+# A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
+STATE_WITHIN_S = 3.0
 LONGEST_RETRY_S = 16.0
 
 _UP = {
@@ -139,6 +141,8 @@ class ManagerNode(Node):
 
     def _ask(self, node: _Managed, client: Client, request: object, now_s: float) -> None:
         (timeout_s,) = values(self, "answer_timeout_s")
+        if client is node.get:
+            timeout_s = min(timeout_s, STATE_WITHIN_S)
         node.client, node.pending = client, client.call_async(request)
         node.deadline_s = now_s + timeout_s
 

@@ -158,6 +158,7 @@ class NodeHands:
             realisations=design.realisations,
             seed=seed,
         )
+        self._wait_for_stream(check)
         topics = (*STREAM_TOPICS, *(["contact_state"] if self._touching else []))
         watch = PublisherWatch(self._node, topics)
         self._recorder.record_into(recording, goal.measurement_id)
@@ -260,6 +261,17 @@ class NodeHands:
                 messages.append(self._recorder.poles.get_nowait())
             except queue.Empty:
                 return messages
+
+    def _wait_for_stream(self, check: Check) -> None:
+        """Until somebody publishes each topic: a node that is away would spoil point after point."""
+        deadline = time.monotonic() + NODE_BACK_WITHIN_S
+        for topic in STREAM_TOPICS:
+            name = self._node.resolve_topic_name(topic)
+            while not self._node.count_publishers(name):
+                if time.monotonic() > deadline:
+                    raise ScanEnded(f"{topic}: nobody publishes it for {NODE_BACK_WITHIN_S:g} s")
+                check()
+                time.sleep(POLL_S)
 
     def _wait_for_results(
         self, result: Measure.Result, watch: PublisherWatch, check: Check

@@ -93,7 +93,19 @@ def run(tmp_path_factory):
                 for k, record in enumerate(records):
                     cdr = serialize_message(record_to_message(record))
                     recording.write("/left/record", RECORD, START_NS + k, cdr)
-                recording.finish(PointResult(index, measurement_id=key))
+                result = PointResult(index, measurement_id=key, time_ns=START_NS + 10 * (index + 1))
+                recording.finish(result)
+        # free air, taken before the points
+        excitation, records = measurement(13)
+        with run.begin_reference("air-before") as recording:
+            times_ns = START_NS - 10**9 + np.arange(4)
+            cdr = serialize_message(excitation_to_message(excitation, START_NS, "tip"))
+            recording.write("/left/excitation", EXCITATION, int(times_ns[3]), cdr, latched=True)
+            for time_ns, record in zip(times_ns.tolist(), records, strict=False):
+                recording.write(
+                    "/left/record", RECORD, time_ns, serialize_message(record_to_message(record))
+                )
+            recording.finish()
     return folder
 
 
@@ -119,7 +131,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
         declare(node, PARAMETERS)
         device = make_device(node)
         node.destroy_node()
-    for key in (11, 12):
+    for key in (13, 11, 12):  # in the order in which they were taken
         excitation, records = measurement(key)
         (planned,) = device.plan([design_multisine(label="asked for")])
         assert planned.measurement_id == key
@@ -133,7 +145,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
             assert same(block.actuator, record.actuator)
             assert same(block.sensor, record.sensor)
             assert same(block.contact, record.origin.contact)
-    with pytest.raises(DeviceError, match="recording is over: all 2 measurements"):
+    with pytest.raises(DeviceError, match="recording is over: all 3 measurements"):
         device.plan([design_multisine()])
 
 
@@ -147,7 +159,7 @@ def test_analyze_reads_a_run(run, tmp_path, capsys):
     assert main(["analyze", str(run)]) == 1
     assert "not told which" in capsys.readouterr().err
     assert main(["analyze", str(run), "--measurement", "5"]) == 1
-    assert "holds 11, 12" in capsys.readouterr().err
+    assert "holds 13, 11, 12" in capsys.readouterr().err
 
 
 def test_numbers_of_the_core_are_the_constants_of_the_messages():

@@ -162,6 +162,25 @@ def test_a_point_that_is_disturbed_comes_again_and_fails_the_third_time(tmp_path
     assert "force_stale" in run.latest[1].reason
 
 
+def test_a_reference_that_is_disturbed_comes_again(tmp_path):
+    @dataclass
+    class Disturbed(Bench):
+        left: int = 2
+
+        def measure(self, design, label, *rest):
+            if label == "air" and self.left:
+                self.left -= 1
+                raise PointDisturbed("frf: who publishes it was started anew")
+            return super().measure(design, label, *rest)
+
+    for disturbed, kept in ((2, ["air-before", "air-after"]), (3, ["air-after"])):
+        path = tmp_path / f"{disturbed}"
+        summary, run, _ = scan(path, scene(), Disturbed(left=disturbed))
+        assert (summary.complete, summary.done) == (True, 4)
+        references = [file.name for file in run.files if file.name.startswith("reference-")]
+        assert [name[13:-5] for name in sorted(references)] == kept
+
+
 def test_a_scene_may_stop_at_a_failure(tmp_path):
     made = scene(on_failure=OnFailure.STOP)
     summary, run, _ = scan(tmp_path / "run", made, Bench(failing=(1,)))
