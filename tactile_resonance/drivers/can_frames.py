@@ -188,7 +188,10 @@ def _description(content: dict[str, Any]) -> CanDescription:
         | {"invalid_counts", "full_scale_counts", "commands"},
         "",
     )
-    ids = _integers(content.get("frame_ids"), "frame_ids", 0x1FFFFFFF)
+    extended = content.get("extended_ids", False)
+    require(type(extended) is bool, "extended_ids", extended, "true or false")
+    most_id = 0x1FFFFFFF if extended else 0x7FF
+    ids = _integers(content.get("frame_ids"), "frame_ids", most_id)
     require(bool(ids) and len(set(ids)) == len(ids), "frame_ids", ids, "different identifiers")
     layout_text = content.get("layout")
     try:
@@ -219,11 +222,11 @@ def _description(content: dict[str, Any]) -> CanDescription:
     commands = content.get("commands")
     parsed: dict[str, Any] = {}
     if commands is not None:
-        parsed = _commands(section(content, "commands", ""))
+        parsed = _commands(section(content, "commands", ""), most_id, layout.size)
     return CanDescription(
         name=str(content.get("name", "")),
         frame_ids=ids,
-        extended_ids=bool(content.get("extended_ids", False)),
+        extended_ids=extended,
         layout=layout,
         fields=tuple(names),
         constant=constant,
@@ -234,9 +237,9 @@ def _description(content: dict[str, Any]) -> CanDescription:
     )
 
 
-def _commands(part: Any) -> dict[str, Any]:
+def _commands(part: Any, most_id: int, size: int) -> dict[str, Any]:
     known_keys(part, {"id", "stop", "start", "setup", "rates", "request", "reply"}, "commands")
-    (command_id,) = _integers([part.get("id")], "commands.id", 0x1FFFFFFF)
+    (command_id,) = _integers([part.get("id")], "commands.id", most_id)
     result: dict[str, Any] = {"command_id": command_id}
     for name in ("stop", "start"):
         if part.get(name) is not None:
@@ -265,6 +268,8 @@ def _commands(part: Any) -> dict[str, Any]:
         result["reply"] = Reply(
             *_integers(numbers, "commands.reply", 255), errors=dict(reply.get("errors") or {})
         )
+        for name in ("result_byte", "error_byte"):
+            require(reply[name] < size, f"commands.reply.{name}", reply[name], f"below {size}")
     answered = [c.name for c in (*setup, *result["rates"].values()) if c.reply]
     missing = bool(answered) and "reply" not in result
     require(not missing, "commands.reply", None, f"where {answered[:1]} are answered")

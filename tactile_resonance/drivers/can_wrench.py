@@ -176,8 +176,13 @@ class CanWrench:
         if description.stop is not None:
             self._send(bus, description.stop.data)
             deadline_s = time.monotonic() + ANSWER_WITHIN_S
-            while bus.recv(QUIET_S) is not None:
-                if time.monotonic() > deadline_s:
+            quiet_s = time.monotonic() + QUIET_S
+            while time.monotonic() < quiet_s:
+                message = bus.recv(QUIET_S)
+                if message is None or not self._is_of_the_cell(message):
+                    continue  # the bus may be busy with others
+                quiet_s = time.monotonic() + QUIET_S
+                if quiet_s > deadline_s:
                     raise ForceError(ForceFault.REFUSED, f"{self._where}: does not stop")
         commands = list(description.setup)
         if description.rates:
@@ -204,7 +209,7 @@ class CanWrench:
         deadline_s = time.monotonic() + ANSWER_WITHIN_S
         while time.monotonic() < deadline_s:
             message = bus.recv(QUIET_S)
-            if message is None:
+            if message is None or not self._is_of_the_cell(message):
                 continue
             whole = assembler.add(message.arbitration_id, message.data, message.timestamp)
             if whole is None or whole[0] != command.data[0]:
@@ -224,6 +229,7 @@ class CanWrench:
         period_s = 1 / self._config.info.rate_hz
         longest_s = silent_s if request is None else period_s
         last_s = due_s = time.monotonic()
+        stamped, last_stamp_s = self._can.stamps == "adapter", math.inf
         flow = Flow(self._config.info.rate_hz, last_s)
         try:
             while not self._ended.is_set():
@@ -240,6 +246,10 @@ class CanWrench:
                     raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
                 elif self._take(message):
                     last_s = now_s
+                    last_stamp_s = message.timestamp
+                elif stamped and message.timestamp - last_stamp_s > silent_s:
+                    # the bus is never empty, but its frames are already those of later
+                    raise self._silence(bus, message.timestamp - last_stamp_s)
                 if request is None and flow.short(now_s, self.received + self.lost):
                     text = (
                         f"{self._where}: {flow.rate_hz:.0f} wrenches/s of {1 / period_s:.0f} arrive"
@@ -269,6 +279,8 @@ class CanWrench:
 
     def _take(self, message: can.Message) -> bool:
         """Whether this frame completed a wrench. Raises `ForceError`."""
+        if not self._is_of_the_cell(message):
+            return False
         lost = self._assembler.lost
         whole = self._assembler.add(message.arbitration_id, message.data, message.timestamp)
         if self._assembler.lost > lost:
@@ -285,6 +297,16 @@ class CanWrench:
         self._samples.append(CellSample(self._stamp_ns(message), wrench, overload))
         self.received += 1
         return True
+
+    def _is_of_the_cell(self, message: can.Message) -> bool:
+        """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
+        description = self._can.description
+        return (
+            message.arbitration_id in description.frame_ids
+            and message.is_extended_id == description.extended_ids
+            and not message.is_remote_frame
+            and not message.is_error_frame
+        )
 
     def _stamp_ns(self, message: can.Message) -> int:
         arrival_ns = time.time_ns()

@@ -65,6 +65,13 @@ def test_lost_wrenches_are_counted():
     assert assembler.lost == 2
 
 
+COMMANDS_WITH_A_REPLY_TOO_FAR = {
+    "id": 0x64,
+    "rates": {1000: [0x0F, 8]},
+    "reply": {"result_byte": 1, "good": 1, "error_byte": 16, "errors": {}},
+}
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -78,6 +85,9 @@ def test_lost_wrenches_are_counted():
         ({"full_scale_counts": -1}, "full_scale_counts"),
         ({"commands": {"id": 0x64, "stop": [256]}}, "commands.stop"),
         ({"commands": {"id": 0x64, "setup": [{"data": [1]}]}}, "commands.reply"),
+        ({"frame_ids": [0x001, 0x800]}, "frame_ids: .* from 0 to 0x7ff"),
+        ({"extended_ids": "no"}, "extended_ids: got 'no'; accepted is true or false"),
+        ({"commands": COMMANDS_WITH_A_REPLY_TOO_FAR}, "commands.reply.error_byte"),
         ({"endian": "little"}, "endian"),
     ],
 )

@@ -56,9 +56,12 @@ class ControlPort:
         """Do one request and return its answer."""
         try:
             fields = json.loads(line)
-            if not isinstance(fields, dict) or fields.get("command") not in self.commands:
+            name = fields.get("command") if isinstance(fields, dict) else None
+            if not isinstance(name, str) or name not in self.commands:
                 raise ValueError(f"command: expected one of {', '.join(self.commands)}")
-            return {"ok": True, **self.commands[fields["command"]](fields)}
+            return {"ok": True, **self.commands[name](fields)}
+        except RecursionError:
+            return {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
             return {"ok": False, "error": str(error)}
 

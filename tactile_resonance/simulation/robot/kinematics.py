@@ -124,11 +124,12 @@ def inverse(flange: FloatArray, wrist_angle_rad: float = 0.0) -> list[tuple[floa
         bend = _cosine(px * s1 - py * c1 - D4, D6)
         if bend is None:
             continue
+        # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
+        along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
         for sign5 in (1.0, -1.0):
-            q5 = sign5 * math.acos(bend)
+            # the arc cosine alone would lose half of the digits near 0 and half a turn
+            q5 = sign5 * math.atan2(math.hypot(along_x, along_y), bend)
             s5, c5 = math.sin(q5), math.cos(q5)
-            # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
-            along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
             parallel = abs(s5) < _EDGE
             q6 = wrist_angle_rad if parallel else math.atan2(-along_y / s5, along_x / s5)
             s6, c6 = math.sin(q6), math.cos(q6)

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from enum import IntEnum
 
 PROTOCOL_VERSION = 2
+LONGEST_PAYLOAD = 0xFFFF - 3
 
 # type -> struct code and count
 _LAYOUT = {
@@ -42,7 +43,9 @@ class Kind(IntEnum):
 
 
 def packet(kind: Kind, payload: bytes) -> bytes:
-    """Return a packet with its header."""
+    """Return a packet with its header; ValueError where it does not fit into one."""
+    if len(payload) > LONGEST_PAYLOAD:
+        raise ValueError(f"RTDE packet: {len(payload)} bytes, expected at most {LONGEST_PAYLOAD}")
     return struct.pack(">HB", 3 + len(payload), kind) + payload
 
 
@@ -85,6 +88,10 @@ class Layout:
         self._lengths = [_LAYOUT[name][1] for name in types]
         codes = "".join(f"{_LAYOUT[name][1]}{_LAYOUT[name][0]}" for name in types)
         self._struct = struct.Struct(">B" + codes)
+        if self._struct.size > LONGEST_PAYLOAD:
+            raise ValueError(
+                f"RTDE recipe: {self._struct.size} bytes, expected at most {LONGEST_PAYLOAD}"
+            )
 
     def pack(self, recipe: int, values: Sequence[object]) -> bytes:
         """Return a data packet; a vector is a sequence of its length."""

@@ -272,3 +272,22 @@ def test_wrong_options_are_one_line(options, message, capsys):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_requests_that_no_packet_can_answer_close_their_connection_only(robot, connect):
+    """Types of so many variables, or their values, are longer than a packet can be."""
+    for names in ("x," * 20000, "target_q," * 3000):
+        client = connect()
+        client.ask(Kind.PROTOCOL_VERSION, struct.pack(">H", 2))
+        client.send(Kind.OUTPUTS, struct.pack(">d", 500.0) + names.encode())
+        with pytest.raises(ConnectionError):
+            client.next(Kind.OUTPUTS)
+    assert robot.order("state")["robot_mode"] == "RUNNING"
+
+
+@pytest.mark.parametrize("line", [b'{"command": []}', b"[" * 20000, b'{"command": {"a": 1}}'])
+def test_control_port_answers_whatever_comes(robot, line):
+    with socket.create_connection((robot.host, PORT), 5) as channel:
+        channel.sendall(line + b"\n")
+        assert not json.loads(channel.makefile().readline())["ok"]
+    assert robot.order("state")["robot_mode"] == "RUNNING"

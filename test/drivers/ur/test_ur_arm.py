@@ -191,10 +191,6 @@ def test_protective_stop(robot, high):
     assert error.value.fault is ArmFault.PROTECTIVE_STOP
     robot.unlock()
     connect_again(high)
-    place = high.state().tip.position_m
-    keep_for(high, 0.2)
-    # the velocity of before is gone, though it stood in the robot's register
-    np.testing.assert_allclose(high.state().tip.position_m, place, atol=5e-5)
     high.speed(-DOWN, ACCELERATION_M_S2)
     assert keep_for(high, 0.2)[-1].tip_velocity[2] > 0
 

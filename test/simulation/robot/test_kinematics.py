@@ -96,6 +96,18 @@ def test_parallel_wrist_axes_take_the_wrist_angle_given():
     np.testing.assert_allclose(forward(found), forward(q), atol=1e-12)
 
 
+@pytest.mark.parametrize("fifth", [0.0, np.pi])
+@pytest.mark.parametrize("off", [0.0, 1e-8, 1e-7, 1e-6, 1e-4])
+def test_wrist_axes_that_are_almost_parallel_lose_no_digits(postures, fifth, off):
+    for q in postures[:100].copy():
+        q[4] = fifth - np.copysign(off, fifth - 1.0)
+        wanted = product_of_exponentials(q)
+        solutions = inverse(wanted, q[5])
+        assert solutions
+        for solution in solutions:
+            np.testing.assert_allclose(forward(np.array(solution)), wanted, atol=1e-9)
+
+
 @pytest.mark.parametrize("position", [(1.2, 0, 0.3), (0, 0, 1.3), (0.05, 0.0, 0.3)])
 def test_out_of_reach_has_no_solution(position):
     flange = np.eye(4)
