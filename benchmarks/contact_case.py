@@ -27,6 +27,7 @@ FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03
 TOOL = {
     "carried_kg": TOOL_KG,
     "acceleration_m_s2": 0.3,
+    "relief_acceleration_m_s2": 0.3,
     "approach_speed_m_s": 3e-3,
 }
 """A tool on the cell: its inertia is known, it shakes with the robot, and it is started gently."""

@@ -45,7 +45,10 @@ LOST_GRACE_S = 0.02
 """Forces from before the touch do not count for a lost contact, nor those of the first moments."""
 
 RETRACT_AFTER_S = 0.1
-"""A fault's stop lasts so long before the tip is drawn back [s]."""
+"""A fault's stop lasts so long before the tip is drawn back [s]; where too much force is why, none."""
+
+PRESSING_CAUSES = frozenset({Cause.FORCE_ABORT, Cause.FORCE_HARD, Cause.FORCE_RATE})
+"""After these the tip is drawn back at once: while it slows down it goes deeper."""
 
 ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_INVALID})
 """After these the tip is not drawn back by itself: the arm moves again only when told to."""
@@ -82,7 +85,7 @@ class ContactController:
         self._still_ns = self._within_ns = -1
         self._travel_force: FloatArray | None = None
         self._hold_height_m = 0.0
-        self._wish_retract = self._arm_was_bad = False
+        self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
 
     @property
     def result(self) -> ContactResult | None:
@@ -199,8 +202,11 @@ class ContactController:
         if twist is None:
             return self._stop()
         twist = self._envelope.bound(twist, arm.tip.position_m, place)
+        speed, arm_model = float(self._normal @ twist[:3]), self._observer.arm_model
         limit = self.parameters.acceleration_m_s2
-        self._observer.arm_model.step(float(self._normal @ twist[:3]), limit)
+        if self.state in (*TOUCHING, State.RETRACT) and speed > arm_model.set_speed_m_s:
+            limit = max(limit, self.parameters.relief_acceleration_m_s2)
+        arm_model.step(speed, limit)
         return Command(twist, limit)
 
     def _stop(self) -> Command:
@@ -400,7 +406,8 @@ class ContactController:
 
     def _after_fault(self, now_ns: int) -> None:
         """Stand still; then draw back, unless the arm itself was the fault."""
-        if not self._arm_was_bad and now_ns - self._state_ns > 1e9 * RETRACT_AFTER_S:
+        after_s = 0.0 if self._pressed_too_hard else RETRACT_AFTER_S
+        if not self._arm_was_bad and now_ns - self._state_ns >= 1e9 * after_s:
             self._enter(State.RETRACT, now_ns)
 
     # pieces
@@ -442,6 +449,7 @@ class ContactController:
     def _fail(self, breach: Breach, now_ns: int) -> None:
         """Note why, and stop."""
         self._arm_was_bad = breach.cause in ARM_CAUSES
+        self._pressed_too_hard = breach.cause in PRESSING_CAUSES
         self._end(breach, now_ns)
         self._enter(State.FAULT, now_ns)
 

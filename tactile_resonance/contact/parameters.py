@@ -23,6 +23,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "travel_speed_m_s": (1e-3, 0.25),
     "retract_speed_m_s": (1e-3, 0.1),
     "acceleration_m_s2": (0.05, 2.0),
+    "relief_acceleration_m_s2": (0.05, 2.0),
     "standoff_m": (5e-4, 0.05),
     "search_m": (0.0, 0.02),
     "early_m": (0.0, 0.02),
@@ -56,8 +57,9 @@ class ContactParameters:
         Towards the surface before and after the touch [m/s].
     travel_speed_m_s, retract_speed_m_s : float
         To the standoff, and away from the tissue [m/s].
-    acceleration_m_s2 : float
-        Limit of every motion but stops [m/s2].
+    acceleration_m_s2, relief_acceleration_m_s2 : float
+        Limit of every motion but stops [m/s2]; and, where it is larger, of one in contact that takes
+        force off the tissue.
     standoff_m : float
         Height above the expected surface where the approach begins [m].
     search_m, early_m : float
@@ -93,6 +95,7 @@ class ContactParameters:
     travel_speed_m_s: float = 0.05
     retract_speed_m_s: float = 0.02
     acceleration_m_s2: float = 0.5
+    relief_acceleration_m_s2: float = 1.0
     standoff_m: float = 3e-3
     search_m: float = 2e-3
     early_m: float = 2e-3
