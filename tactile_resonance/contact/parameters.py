@@ -157,6 +157,7 @@ LIMIT_RANGES: dict[str, tuple[float, float]] = {
     "angular_speed_rad_s": (0.0, 2.0),
     "tilt_rad": (1e-3, 1.6),
     "misalignment_rad": (1e-3, 0.5),
+    "clearance_m": (0.0, 0.05),
     "force_age_s": (1e-3, 0.5),
     "arm_age_s": (1e-3, 0.5),
     "stuck_samples": (3, 1000),
@@ -199,6 +200,8 @@ class Limits:
         Between +z of the tip and the vertical [rad].
     misalignment_rad : float
         Between the tip and its goal while near the surface [rad].
+    clearance_m : float
+        Of the sensor's housing above the surface, at least [m].
     force_age_s, arm_age_s : float
         Age of the newest data [s].
     stuck_samples : int
@@ -226,6 +229,7 @@ class Limits:
     angular_speed_rad_s: float = 0.3
     tilt_rad: float = 0.8
     misalignment_rad: float = 0.05
+    clearance_m: float = 1e-4
     force_age_s: float = 0.010
     arm_age_s: float = 0.020
     stuck_samples: int = 10

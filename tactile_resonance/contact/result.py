@@ -30,6 +30,7 @@ class Cause(str, Enum):
     WORKSPACE = "workspace"
     TILT = "tilt"
     MISALIGNED = "misaligned"
+    HOUSING = "housing"
     SPEED = "speed"
     ARM_STALE = "arm_stale"
     ARM_STOPPED = "arm_stopped"

@@ -85,7 +85,7 @@ class ContactNode(ManagedNode):
         self.resources.callback(self._arm.close)
         self._force = contact_devices.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
-        self._tip_radius_m = contact_devices.tip_radius_m(self)
+        self._tip = contact_devices.tip_geometry(self)
         self._arm.connect()
         self._force.start()
         self._goal: ServerGoalHandle | None = None
@@ -111,7 +111,7 @@ class ContactNode(ManagedNode):
         gc.collect()
         gc.freeze()
         self._thread = ContactThread(
-            self._arm, self._force, self._settings, self._limits, self._on_cycle
+            self._arm, self._force, self._settings, self._limits, self._tip, self._on_cycle
         )
 
     def deactivate(self) -> None:
@@ -186,6 +186,11 @@ class ContactNode(ManagedNode):
         if self._thread is None:
             response.message = f"contact_node is {self.state_name()}"
             return response
+        try:
+            self._thread.make_ready()
+        except ArmError as error:
+            response.message = str(error)
+            return response
         self._thread.retract()
         response.success = True
         response.message = "asked; contact_state tells when it is idle"
@@ -205,7 +210,7 @@ class ContactNode(ManagedNode):
         axes = Rotation.from_quat(quaternion).as_matrix()
         given = np.array([request.normal.x, request.normal.y, request.normal.z])
         normal = given if given.any() else axes[:, 2]
-        touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], self._tip_radius_m)
+        touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], self._tip.ball_radius_m)
         return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
 
     def _goal_limits(self, request: MakeContact.Goal) -> Limits:

@@ -11,7 +11,8 @@ import pytest
 from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.loop import WallClock
+from tactile_resonance.contact.loop import ContactLoop, WallClock
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -239,3 +240,21 @@ def test_wall_clock_returns_at_the_time_and_at_once_after_it():
     clock.wait_until(time_ns)
     assert clock.now_ns() >= time_ns
     clock.wait_until(time_ns - 10**12)
+
+
+def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
+    made = contact(height_m=0.0)
+    assert made.loop.make(made.goal).reached
+    # a new controller knows nothing of that; its goal lies 3 mm beside
+    touch = made.goal.touch
+    beside = ContactGoal(Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad), made.goal.aim)
+    controller = ContactController(QUICK, Limits())
+    loop = ContactLoop(made.bench.arm, made.bench.force, made.bench.clock, controller)
+    way, since = [], len(made.force_n)
+    made.bench.clock.on_step.append(lambda: way.append(made.bench.plant.tip_m[0]))
+    assert loop.make(beside).reached
+    force = np.array(made.force_n[since:])
+    lifted = int(np.argmax(force == 0))
+    assert lifted > 10
+    assert np.ptp(way[:lifted]) < 3e-5
+    assert way[-1] == pytest.approx(3e-3, abs=1e-4)
