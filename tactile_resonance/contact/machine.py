@@ -37,6 +37,9 @@ TOUCH_IN_TRAVEL_N = 0.01
 LOST_GRACE_S = 0.02
 """Forces from before the touch do not count for a lost contact, nor those of the first moments."""
 
+MOST_TAKEN_BACK = 3
+"""So often in one contact a touch may turn out to have been noise."""
+
 RETRACT_AFTER_S = 0.1
 """A fault's stop lasts so long before the tip is drawn back [s]; where too much force is why, none."""
 
@@ -88,6 +91,8 @@ class ContactController:
         self._still_ns = self._within_ns = -1
         self._travel_force: FloatArray | None = None
         self._hold_height_m = 0.0
+        self._looked_again = False
+        self._taken_back = 0
         self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
 
     @property
@@ -300,7 +305,7 @@ class ContactController:
         p = self.parameters
         model = self._observer.model
         if model is not None:
-            self._contact_ns = now_ns
+            self._contact_ns, self._looked_again = now_ns, False
             self._enter(State.CONTACT, now_ns)
             return self._press(now_ns, arm, self._place(arm))
         if place.height_m < -p.search_m:
@@ -317,7 +322,14 @@ class ContactController:
             return None
         estimate = model.estimate(place.height_m)
         sure = now_ns - self._contact_ns > 1e9 * (self.limits.lost_s + LOST_GRACE_S)
-        if self.state is not State.HOLD and sure and estimate.surface_m > p.early_m:
+        early = self.state is not State.HOLD and sure and estimate.surface_m > p.early_m
+        if early and self._was_noise(self.limits.lost_force_n, now_ns):
+            return None
+        if early and not self._looked_again:
+            self._looked_again = True
+            self._observer.look_again()
+            return self._path.along_normal(arm, 0.0)
+        if early:
             text = f"touched {1e3 * estimate.surface_m:.2f} mm above the expected surface"
             text += f", accepted are {1e3 * p.early_m:g} mm"
             self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
@@ -356,15 +368,25 @@ class ContactController:
         mean = observer.watch.mean_n(limits.lost_s)
         if mean is None or now_ns - self._contact_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
             return False
-        if self.state is State.CONTACT and mean < observer.noise_n / 4:
-            observer.seek_touch()
-            self._enter(State.APPROACH, now_ns)
+        if self.state is State.CONTACT and self._was_noise(observer.noise_n / 4, now_ns):
+            return True
+        if self.state is State.SETTLE and self._was_noise(limits.lost_force_n, now_ns):
             return True
         if self.state in (State.SETTLE, State.HOLD) and mean < limits.lost_force_n:
             text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
             self._fail(Breach(Cause.CONTACT_LOST, text), now_ns)
             return True
         return False
+
+    def _was_noise(self, least_n: float, now_ns: int) -> bool:
+        """Whether what told the touch was noise: no such force is there; then it is sought anew."""
+        mean = self._observer.watch.mean_n(self.limits.lost_s)
+        if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
+            return False
+        self._taken_back += 1
+        self._observer.seek_touch()
+        self._enter(State.APPROACH, now_ns)
+        return True
 
     def _draw_back(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         if now_ns - self._state_ns > 1e9 * self.limits.retract_s:

@@ -33,7 +33,7 @@ from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import STREAM, run_node
+from tactile_resonance.nodes.running import STREAM, RCLError, run_node
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
@@ -265,6 +265,14 @@ class ContactNode(ManagedNode):
             return
         self._unpublished = 0
         wrenches, self._wrenches = self._wrenches, []
+        try:
+            self._publish(wrenches, cycle)
+        except RCLError:
+            # once ROS has been shut down nobody listens, but the tip is still to be drawn back
+            if self.context.ok():
+                raise
+
+    def _publish(self, wrenches: list[WrenchSample], cycle: Cycle) -> None:
         if cycle.arm is not None and self._pose.get_subscription_count():
             self._pose.publish(self._pose_message(cycle))
         if wrenches and self._wrench.get_subscription_count():

@@ -21,6 +21,8 @@ from tactile_resonance.simulation.tracking import TrackingParameters
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, started, stiffer
 
+EARLY = replace(QUICK, early_m=1.55e-3)
+
 
 @pytest.mark.parametrize("tissue", [stiffer(SOFT, 0.4), SOFT, stiffer(SOFT, 4.0)])
 def test_force_is_reached_held_and_reported_with_an_honest_deviation(tissue):
@@ -258,3 +260,18 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
     assert lifted > 10
     assert np.ptp(way[:lifted]) < 3e-5
     assert way[-1] == pytest.approx(3e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_touch_told_by_noise_above_the_surface_is_no_early_surface(seed):
+    # 0.2 mm above the tissue the cell shows 3 mN for 10 ms; the surface lies within what is accepted
+    made = started(stiffer(SOFT, 2.0), height_m=1.5e-3, seed=seed, parameters=EARLY)
+    assert made.run_until(State.APPROACH)
+    tip = made.bench.clock.motion
+    made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1.7e-3)
+    made.bench.cell.faults.bias_step_n = -3e-3
+    made.run(0.01)
+    made.bench.cell.faults.bias_step_n = 0.0
+    made.loop.run_while(lambda: made.controller.result is None)
+    assert made.controller.result.reached, made.controller.result.message
+    assert made.controller.result.surface_m < EARLY.early_m

@@ -126,11 +126,12 @@ class Bench:
         return order(HOST, command, **fields)
 
     def until_touching(self, timeout_s=20.0):
-        """Return as soon as the tissue pushes; the plant's time then [s]."""
+        """Return as soon as the tissue is touched anew; the plant's time then [s]."""
         deadline = time.monotonic() + timeout_s
+        touches = self.order("truth")["touches"]
         while time.monotonic() < deadline:
             true = self.order("truth")
-            if true["in_contact"]:
+            if true["in_contact"] and true["touches"] > touches:
                 return true["time_s"]
             time.sleep(0.004)
         raise AssertionError("the tissue is never touched")
