@@ -185,6 +185,21 @@ def run_controller(
     return rig.outcome(ready, result.cause.value, stated)
 
 
+def stiff_peaks(count: int) -> np.ndarray:
+    """Largest true force of contacts on tissue ten times stiffer than the stiffest expected [N], (count,)."""
+    peaks = []
+    for seed in range(count):
+        # the place of the touch between two periods varies
+        rig = Rig(Case(2.5e-3, 400e3, 1.0, 1e-3 + 2e-6 * seed, 0.0, seed), Setup("stiff"))
+        bench = rig.bench
+        controller = ContactController(ContactParameters(), Limits())
+        loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+        loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
+        loop.run_while(lambda: True, 0.3)
+        peaks.append(max(rig.force_n))
+    return np.array(peaks)
+
+
 def contact_series(count: int) -> np.ndarray:
     """Mean true force over 0.3 s of so many contacts in a row at one place [N], (count,)."""
     rig = Rig(Case(2.5e-3, 10e3, 1.0, 1.5e-3, 0.0, 1), Setup("series"))
