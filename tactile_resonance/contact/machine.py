@@ -91,6 +91,7 @@ class ContactController:
         self._still_ns = self._within_ns = -1
         self._travel_force: FloatArray | None = None
         self._hold_height_m = 0.0
+        self._told_m: float | None = None
         self._looked_again = False
         self._taken_back = 0
         self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
@@ -152,6 +153,17 @@ class ContactController:
         """Draw the tip back along the normal, at the next cycle; also out of a fault."""
         if self.state is not State.IDLE:
             self._wish_retract = True
+
+    def tell_touch(self) -> bool:
+        """Another sensor tells the first contact: the rest of the approach is slow.
+
+        What counts as contact for the law and its limits is still the force. Returns whether it is new
+        and of use: only in an approach.
+        """
+        if self.state is not State.APPROACH or self._told_m is not None:
+            return False
+        self._told_m = self._height_m
+        return True
 
     # one cycle
 
@@ -312,7 +324,9 @@ class ContactController:
             text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
             self._fail(Breach(Cause.SURFACE_MISSING, text), now_ns)
             return None
-        return self._path.along_normal(arm, -p.approach_speed_m_s)
+        told = self._told_m is not None
+        speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
+        return self._path.along_normal(arm, -speed)
 
     def _press(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         p, goal, model = self.parameters, self.goal, self._observer.model
@@ -461,6 +475,7 @@ class ContactController:
             depth_m=estimate.depth_m if estimate is not None else None,
             stiffness_n_per_m=estimate.stiffness_n_per_m if estimate is not None else None,
             surface_m=estimate.surface_m if estimate is not None else None,
+            told_m=self._told_m,
             contact_s=(now_ns - self._contact_ns) * 1e-9 if estimate is not None else None,
             total_s=(now_ns - self._start_ns) * 1e-9,
             peak_force_n=self._observer.watch.peak_n,

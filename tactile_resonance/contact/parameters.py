@@ -20,6 +20,7 @@ from tactile_resonance.fields import (
 RANGES: dict[str, tuple[float, float]] = {
     "approach_speed_m_s": (1e-4, 5e-3),
     "press_speed_m_s": (1e-4, 5e-3),
+    "told_speed_m_s": (1e-4, 5e-3),
     "travel_speed_m_s": (1e-3, 0.25),
     "retract_speed_m_s": (1e-3, 0.1),
     "acceleration_m_s2": (0.05, 2.0),
@@ -55,6 +56,8 @@ class ContactParameters:
     ----------
     approach_speed_m_s, press_speed_m_s : float
         Towards the surface before and after the touch [m/s].
+    told_speed_m_s : float
+        Towards it, at most, once another sensor has told the touch and the force has not yet [m/s].
     travel_speed_m_s, retract_speed_m_s : float
         To the standoff, and away from the tissue [m/s].
     acceleration_m_s2, relief_acceleration_m_s2 : float
@@ -92,6 +95,7 @@ class ContactParameters:
 
     approach_speed_m_s: float = 4e-3
     press_speed_m_s: float = 5e-3
+    told_speed_m_s: float = 1e-3
     travel_speed_m_s: float = 0.05
     retract_speed_m_s: float = 0.02
     acceleration_m_s2: float = 0.5

@@ -66,6 +66,11 @@ class ContactThread:
         with self._lock:
             self.controller.retract()
 
+    def tell_touch(self) -> bool:
+        """Pass on that another sensor tells the first contact; whether that is new in an approach."""
+        with self._lock:
+            return self.controller.tell_touch()
+
     def make_ready(self) -> None:
         """Start the program of an arm again that was stopped; ``ArmError`` where it is not released."""
         with self._lock:

@@ -275,3 +275,21 @@ def test_touch_told_by_noise_above_the_surface_is_no_early_surface(seed):
     made.loop.run_while(lambda: made.controller.result is None)
     assert made.controller.result.reached, made.controller.result.message
     assert made.controller.result.surface_m < EARLY.early_m
+
+
+def test_touch_told_by_the_resonance_slows_the_rest_of_the_approach():
+    made = started(height_m=0.0)
+    assert not made.controller.tell_touch()  # not in an approach
+    assert made.run_until(State.APPROACH)
+    tip = made.bench.clock.motion
+    made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1e-3)
+    told_m = tip.reported.position_m[2] - RADIUS_M
+    assert made.controller.tell_touch()
+    assert not made.controller.tell_touch()
+    made.run(0.1)
+    began = len(made.speed_m_s)
+    made.run(0.3)
+    np.testing.assert_allclose(made.speed_m_s[began:], -QUICK.told_speed_m_s, rtol=0.05)
+    made.loop.run_while(lambda: made.controller.result is None)
+    assert made.controller.result.reached
+    assert made.controller.result.told_m == pytest.approx(told_m, abs=2e-5)

@@ -125,16 +125,16 @@ class Bench:
     def order(self, command, **fields):
         return order(HOST, command, **fields)
 
-    def until_touching(self, timeout_s=20.0):
-        """Return as soon as the tissue is touched anew; the plant's time then [s]."""
+    def until_touching(self, ended=lambda: False, timeout_s=20.0):
+        """The plant's time [s] as soon as the tissue is touched anew; None where it ended before."""
         deadline = time.monotonic() + timeout_s
         touches = self.order("truth")["touches"]
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and not ended():
             true = self.order("truth")
             if true["in_contact"] and true["touches"] > touches:
-                return true["time_s"]
+                return true["time_s"] - true["contact_s"]
             time.sleep(0.004)
-        raise AssertionError("the tissue is never touched")
+        return None
 
     def history(self, since_s):
         """Time (n,), place of the tip (n, 3) and true force (n,) of all steps after a time."""

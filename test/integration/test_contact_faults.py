@@ -94,13 +94,38 @@ ARM_FAULTS = {
 """The last one leaves nothing that could stop the robot but its own watchdog."""
 
 
-def pressed_then(bench, client, inject):
-    """Inject at the first touch; the action's result and what truly happened from then on."""
-    stalls = bench.order("state")["stalls"]
-    handle = client.start()
-    at_s = bench.until_touching()
-    inject(bench)
-    result = client.result(handle)
+LATE_S = 0.08
+"""An injection so long after the touch may find the force reached."""
+
+
+def pressed_then(bench, client, inject, end=lambda bench: None):
+    """Inject at the first touch; the action's result and what truly happened from then on.
+
+    An attempt in which the machine was too busy for the test itself to be in time is repeated.
+    """
+    for _ in range(3):
+        stalls = bench.order("state")["stalls"]
+        handle = client.start()
+        future = handle.get_result_async()
+
+        def ended(future=future):
+            client.spin(0.0)
+            return future.done()
+
+        touched_s = bench.until_touching(ended)
+        at_s = bench.order("truth")["time_s"]
+        in_time = touched_s is not None and at_s - touched_s < LATE_S
+        if in_time:
+            inject(bench)
+            in_time = bench.order("truth")["time_s"] - touched_s < LATE_S
+        result = client.result(handle)
+        if in_time:
+            break
+        end(bench)
+        client.retract()
+        time.sleep(1.5)
+        client.back()
+    assert in_time, f"three attempts were disturbed, the last ended with {result.message!r}"
     time.sleep(0.3)
     time_s, tip_m, force_n = bench.history(at_s)
     assert bench.order("state")["stalls"] == stalls, "the simulation itself stood still"
@@ -118,7 +143,7 @@ def height_m(bench):
 def test_fault_of_the_cell_stops_the_tip_and_draws_it_back(bench, client, name):
     inject, end, causes = FORCE_FAULTS[name]
     try:
-        result, _ = pressed_then(bench, client, inject)
+        result, _ = pressed_then(bench, client, inject, end)
     finally:
         end(bench)
     assert not result.reached
@@ -156,7 +181,7 @@ def test_protective_stop_is_named_and_the_tip_stays(bench, client):
 
 def test_a_cancelled_goal_draws_back(bench, client):
     handle = client.start()
-    bench.until_touching()
+    assert bench.until_touching() is not None
     future = handle.cancel_goal_async()
     client.wait(future.done, 5.0, "an answer to cancel")
     result = client.result(handle)
