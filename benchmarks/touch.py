@@ -31,7 +31,7 @@ DRIVE_V, NOISE_V = 1.0, 5e-4
 CELL_NOISE_N, TARE_S = 1e-3, 0.4
 FALSE_ALARM = 1e-7
 AIR_N = 1e-18  # a contact that is none, with the states of one
-AIR_S, AFTER_S = 2.0, 0.25
+AIR_S, DEEPEST_M = 2.0, 0.6e-3
 SPEEDS_M_S = (4e-3, 1e-3, 0.25e-3)
 TISSUES = ("cortex", "liver", "gel10", "gel16")
 REFERENCE_S = 0.4
@@ -47,7 +47,7 @@ class Approach:
 
 
 def approach(bench: SimulatedBench, name: str, speed_m_s: float, seed: int) -> Approach:
-    """Come down until both have told a touch, or AFTER_S is over."""
+    """Come down by DEEPEST_M past the first touch."""
     library, rng = read_tissues(), np.random.default_rng(seed)
     tissue = library[name]
     ball = Indenter(
@@ -58,7 +58,7 @@ def approach(bench: SimulatedBench, name: str, speed_m_s: float, seed: int) -> A
     tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
     # the touch falls anywhere within a window
     air = round(AIR_S / STEP_S) + int(rng.integers(round(WINDOW_S / STEP_S)))
-    after = round(AFTER_S * max(1.0, 1e-3 / speed_m_s) / STEP_S)
+    after = round(DEEPEST_M / speed_m_s / STEP_S)
     depth = speed_m_s * STEP_S * (np.arange(after) + rng.random())
     force = np.array([max(0.0, (tip.step(d, STEP_S), ball.force_n)[1]) for d in depth])
     lines = Lines(np.array([2]), np.array([DRIVE_V + 0j]), RATE_HZ, round(WINDOW_S * RATE_HZ))
@@ -116,7 +116,7 @@ def false_alarms(windows: int, probability: float, seed: int = 0) -> tuple[int, 
 
 def run(output: Path, quick: bool) -> str:
     """Measure, write ``touch.md`` and ``touch.png`` into `output`, and return the page."""
-    bench, repeats = SimulatedBench.from_configuration(), 3 if quick else 10
+    bench, repeats = SimulatedBench.from_configuration(), 2 if quick else 5
     found: dict[tuple[str, float], list[Approach]] = {}
     with tqdm(
         total=len(TISSUES) * len(SPEEDS_M_S) * repeats, desc="approaches", unit=""
