@@ -27,6 +27,7 @@ FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03
 TOOL = {
     "carried_kg": TOOL_KG,
     "acceleration_m_s2": 0.3,
+    "relief_acceleration_m_s2": 0.3,
     "approach_speed_m_s": 3e-3,
 }
 """A tool on the cell: its inertia is known, it shakes with the robot, and it is started gently."""
@@ -182,6 +183,21 @@ def run_controller(
     if ready is not None and result.force_n is not None and result.force_std_n is not None:
         stated = result.force_n, result.force_std_n
     return rig.outcome(ready, result.cause.value, stated)
+
+
+def stiff_peaks(count: int) -> np.ndarray:
+    """Largest true force of contacts on tissue ten times stiffer than the stiffest expected [N], (count,)."""
+    peaks = []
+    for seed in range(count):
+        # the place of the touch between two periods varies
+        rig = Rig(Case(2.5e-3, 400e3, 1.0, 1e-3 + 2e-6 * seed, 0.0, seed), Setup("stiff"))
+        bench = rig.bench
+        controller = ContactController(ContactParameters(), Limits())
+        loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+        loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
+        loop.run_while(lambda: True, 0.3)
+        peaks.append(max(rig.force_n))
+    return np.array(peaks)
 
 
 def contact_series(count: int) -> np.ndarray:

@@ -8,7 +8,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-NAMES = ("frf", "poles", "bench", "contact", "robot", "cell", "recording", "pipeline")
+NAMES = (
+    *("frf", "poles", "bench", "contact", "touch", "robot", "cell"),
+    *("recording", "pipeline"),
+)
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""
 

@@ -15,6 +15,8 @@ class ArmModel:
 
     Attributes
     ----------
+    set_speed_m_s : float
+        That the arm was told, after the acceleration limit.
     speed_m_s, acceleration_m_s2 : float
         Of the tip, as far as the model knows.
     """
@@ -23,15 +25,15 @@ class ArmModel:
         self._period_s, self._lag_s = period_s, lag_s
         self._line: deque[float] = deque([0.0] * max(1, round(dead_time_s / period_s)))
         self._keep = math.exp(-period_s / lag_s) if lag_s > 0 else 0.0
-        self._set_speed = 0.0
+        self.set_speed_m_s = 0.0
         self.speed_m_s = 0.0
         self.acceleration_m_s2 = 0.0
 
     def step(self, speed_m_s: float, acceleration_m_s2: float) -> None:
         """Advance one period, told to go at a speed under an acceleration limit."""
         most = acceleration_m_s2 * self._period_s
-        self._set_speed += min(most, max(-most, speed_m_s - self._set_speed))
-        self._line.append(self._set_speed)
+        self.set_speed_m_s += min(most, max(-most, speed_m_s - self.set_speed_m_s))
+        self._line.append(self.set_speed_m_s)
         delayed = self._line.popleft()
         before = self.speed_m_s
         self.speed_m_s = delayed + self._keep * (before - delayed)

@@ -44,12 +44,15 @@ class Place:
         Past the first touch [m]; None where not in contact.
     misalignment_rad : float
         Between the tip's orientation and its goal's.
+    housing_m : float or None
+        Height of the housing above the surface [m]; None where it is not watched.
     """
 
     normal: FloatArray
     height_m: float
     depth_m: float | None
     misalignment_rad: float
+    housing_m: float | None = None
 
 
 class Envelope:
@@ -105,6 +108,9 @@ class Envelope:
             if place.misalignment_rad > limits.misalignment_rad:
                 text = f"tip {place.misalignment_rad:.3f} rad off its orientation near the surface"
                 return Breach(Cause.MISALIGNED, f"{text}, limit {limits.misalignment_rad:g} rad")
+            if place.housing_m is not None and place.housing_m < limits.clearance_m:
+                text = f"housing {1e3 * place.housing_m:.2f} mm above the surface"
+                return Breach(Cause.HOUSING, f"{text}, limit {1e3 * limits.clearance_m:g} mm")
         return None
 
     def judge_force(self, now_ns: int, watch: ForceWatch) -> Breach | None:

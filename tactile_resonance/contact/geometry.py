@@ -67,6 +67,31 @@ class TipGeometry:
             - run * math.tan(surface_tilt_rad)
         )
 
+    def housing_height(self, turn: FloatArray, normal: FloatArray, height_m: float) -> float:
+        """Height of the housing's lower edge above a plane [m].
+
+        Parameters
+        ----------
+        turn : (3, 3) array
+            Orientation of the frame `tip`.
+        normal : (3,) array
+            Of the plane, out of the tissue, length 1.
+        height_m : float
+            Of the tip above its first touch of the plane [m]; below 0 when pressed in.
+        """
+        rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
+        run = self.beam_length_m * math.cos(self.beam_tilt_rad)
+        edge = (rise - self.housing_below_m) * turn[:, 2] - run * turn[
+            :, 0
+        ]  # from the ball's centre
+        return float(self.ball_radius_m + height_m + normal @ edge)
+
+    def worst_height(self, depth_m: float, off_rad: float) -> float:
+        """The same at a depth, the clamp turned down by an angle about the ball [m]."""
+        cosine, sine = math.cos(off_rad), math.sin(off_rad)
+        turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+        return self.housing_height(turn, np.array([0.0, 0.0, 1.0]), -depth_m)
+
 
 def touch_pose(
     point_m: ArrayLike, normal: ArrayLike, towards: ArrayLike, ball_radius_m: float

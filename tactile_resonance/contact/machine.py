@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.envelope import Envelope, Place
 from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
@@ -23,17 +24,9 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
 
 FloatArray = NDArray[np.float64]
-
-RIGHTING_S = 0.1
-"""Time constant in which place along the surface and orientation are put right [s]."""
-
-ARRIVED_M, ARRIVED_RAD = 5e-5, 2e-3
-"""Distance and angle from the standoff at which it is reached."""
-
-TURNING_M = 2e-3
-"""So far above where the surface is near the tip is turned [m]."""
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
@@ -44,8 +37,14 @@ TOUCH_IN_TRAVEL_N = 0.01
 LOST_GRACE_S = 0.02
 """Forces from before the touch do not count for a lost contact, nor those of the first moments."""
 
+MOST_TAKEN_BACK = 3
+"""So often in one contact a touch may turn out to have been noise."""
+
 RETRACT_AFTER_S = 0.1
-"""A fault's stop lasts so long before the tip is drawn back [s]."""
+"""A fault's stop lasts so long before the tip is drawn back [s]; where too much force is why, none."""
+
+PRESSING_CAUSES = frozenset({Cause.FORCE_ABORT, Cause.FORCE_HARD, Cause.FORCE_RATE})
+"""After these the tip is drawn back at once: while it slows down it goes deeper."""
 
 ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_INVALID})
 """After these the tip is not drawn back by itself: the arm moves again only when told to."""
@@ -58,6 +57,13 @@ TARED = (State.APPROACH, *TOUCHING)
 class ContactController:
     """State machine, law and envelope of one tip.
 
+    Parameters
+    ----------
+    parameters : ContactParameters
+    limits : Limits
+    tip : TipGeometry, optional
+        For its housing, which is not watched without it.
+
     Attributes
     ----------
     state : State
@@ -66,8 +72,11 @@ class ContactController:
     goal : ContactGoal or None
     """
 
-    def __init__(self, parameters: ContactParameters, limits: Limits) -> None:
+    def __init__(
+        self, parameters: ContactParameters, limits: Limits, tip: TipGeometry | None = None
+    ) -> None:
         limits.check(parameters)
+        self._tip = tip
         self.parameters, self.limits = parameters, limits
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
@@ -82,7 +91,10 @@ class ContactController:
         self._still_ns = self._within_ns = -1
         self._travel_force: FloatArray | None = None
         self._hold_height_m = 0.0
-        self._wish_retract = self._arm_was_bad = False
+        self._told_m: float | None = None
+        self._looked_again = False
+        self._taken_back = 0
+        self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
 
     @property
     def result(self) -> ContactResult | None:
@@ -130,28 +142,10 @@ class ContactController:
         """
         if self.state is not State.IDLE:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
-        if not np.isfinite(goal.touch.vector).all():
-            raise ValueError(f"touch: got {goal.touch.vector}; accepted are finite numbers")
-        most = self.limits.abort_force_n / 1.5
-        if goal.aim.force_n > most:
-            raise ValueError(
-                f"force_n: got {goal.aim.force_n}; accepted is up to {most:g}, two thirds of "
-                "abort_force_n"
-            )
-        box, normal = self.limits.workspace, goal.touch.rotation.as_matrix()[:, 2]
-        for name, height in (
-            ("standoff", self.parameters.standoff_m),
-            ("deepest place", -self.parameters.search_m - self.limits.depth_m),
-        ):
-            place = goal.touch.position_m + height * normal
-            if (place < box.low_m).any() or (place > box.high_m).any():
-                raise ValueError(f"touch: its {name} {place} lies outside the workspace {box}")
-        if normal[2] < math.cos(self.limits.tilt_rad):
-            raise ValueError(f"touch: tilted by more than tilt_rad = {self.limits.tilt_rad}")
+        check_goal(goal, self.parameters, self.limits, self._tip)
         self._clear()
         self.goal = goal
-        self._normal = normal
-        self._rotation = goal.touch.rotation
+        self._path = TipPath(goal, self._tip)
         self._start_ns = now_ns
         self._enter(State.TRAVEL, now_ns)
 
@@ -159,6 +153,17 @@ class ContactController:
         """Draw the tip back along the normal, at the next cycle; also out of a fault."""
         if self.state is not State.IDLE:
             self._wish_retract = True
+
+    def tell_touch(self) -> bool:
+        """Another sensor tells the first contact: the rest of the approach is slow.
+
+        What counts as contact for the law and its limits is still the force. Returns whether it is new
+        and of use: only in an approach.
+        """
+        if self.state is not State.APPROACH or self._told_m is not None:
+            return False
+        self._told_m = self._height_m
+        return True
 
     # one cycle
 
@@ -199,8 +204,11 @@ class ContactController:
         if twist is None:
             return self._stop()
         twist = self._envelope.bound(twist, arm.tip.position_m, place)
+        speed, arm_model = float(self._path.normal @ twist[:3]), self._observer.arm_model
         limit = self.parameters.acceleration_m_s2
-        self._observer.arm_model.step(float(self._normal @ twist[:3]), limit)
+        if self.state in (*TOUCHING, State.RETRACT) and speed > arm_model.set_speed_m_s:
+            limit = max(limit, self.parameters.relief_acceleration_m_s2)
+        arm_model.step(speed, limit)
         return Command(twist, limit)
 
     def _stop(self) -> Command:
@@ -269,6 +277,9 @@ class ContactController:
     def _travel(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         p = self.parameters
         near = place.height_m < self.limits.near_m
+        if self._path.must_lift(arm, p.standoff_m):
+            # it may still press, where something ended while it did: up before it goes along
+            return self._path.lift(arm, p)
         if near and math.isfinite(self._observer.watch.age_s(now_ns)):
             # not tared yet, so only a change counts
             if self._travel_force is None:
@@ -278,20 +289,10 @@ class ContactController:
                 text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
                 self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
                 return None
-        turn = self._turn(arm)
-        angle = float(np.linalg.norm(turn))
-        height = p.standoff_m
-        if angle > self.limits.misalignment_rad / 2:  # first turn, out of reach of the surface
-            height = max(height, self.limits.near_m + TURNING_M)
-        way = self._goal_position(height) - arm.tip.position_m
-        distance = float(np.linalg.norm(way))
-        if distance < ARRIVED_M and angle < ARRIVED_RAD:
+        if self._path.arrived(arm, p.standoff_m):
             self._enter(State.TARE, now_ns)
             return None
-        braking = math.sqrt(p.acceleration_m_s2 * distance)  # half the limit: the arm lags
-        speed = min(p.travel_speed_m_s, braking, distance / RIGHTING_S)
-        velocity = way * (speed / max(distance, 1e-9))
-        return np.concatenate([velocity, turn / RIGHTING_S])
+        return self._path.travel(arm, p, self.limits)
 
     def _taring(self, now_ns: int, arm: ArmSample) -> FloatArray | None:
         speed = float(np.linalg.norm(arm.tip_velocity[:3]))
@@ -316,14 +317,16 @@ class ContactController:
         p = self.parameters
         model = self._observer.model
         if model is not None:
-            self._contact_ns = now_ns
+            self._contact_ns, self._looked_again = now_ns, False
             self._enter(State.CONTACT, now_ns)
             return self._press(now_ns, arm, self._place(arm))
         if place.height_m < -p.search_m:
             text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
             self._fail(Breach(Cause.SURFACE_MISSING, text), now_ns)
             return None
-        return self._normal_motion(arm, -p.approach_speed_m_s)
+        told = self._told_m is not None
+        speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
+        return self._path.along_normal(arm, -speed)
 
     def _press(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         p, goal, model = self.parameters, self.goal, self._observer.model
@@ -333,7 +336,14 @@ class ContactController:
             return None
         estimate = model.estimate(place.height_m)
         sure = now_ns - self._contact_ns > 1e9 * (self.limits.lost_s + LOST_GRACE_S)
-        if self.state is not State.HOLD and sure and estimate.surface_m > p.early_m:
+        early = self.state is not State.HOLD and sure and estimate.surface_m > p.early_m
+        if early and self._was_noise(self.limits.lost_force_n, now_ns):
+            return None
+        if early and not self._looked_again:
+            self._looked_again = True
+            self._observer.look_again()
+            return self._path.along_normal(arm, 0.0)
+        if early:
             text = f"touched {1e3 * estimate.surface_m:.2f} mm above the expected surface"
             text += f", accepted are {1e3 * p.early_m:g} mm"
             self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
@@ -364,7 +374,7 @@ class ContactController:
                 holding=self.state is State.HOLD,
             )
         most = p.press_speed_m_s
-        return self._normal_motion(arm, min(most, max(-most, speed)))
+        return self._path.along_normal(arm, min(most, max(-most, speed)))
 
     def _lost(self, now_ns: int) -> bool:
         """Whether the tissue has gone; a touch that was noise is taken back."""
@@ -372,9 +382,9 @@ class ContactController:
         mean = observer.watch.mean_n(limits.lost_s)
         if mean is None or now_ns - self._contact_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
             return False
-        if self.state is State.CONTACT and mean < observer.noise_n / 4:
-            observer.seek_touch()
-            self._enter(State.APPROACH, now_ns)
+        if self.state is State.CONTACT and self._was_noise(observer.noise_n / 4, now_ns):
+            return True
+        if self.state is State.SETTLE and self._was_noise(limits.lost_force_n, now_ns):
             return True
         if self.state in (State.SETTLE, State.HOLD) and mean < limits.lost_force_n:
             text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
@@ -382,56 +392,48 @@ class ContactController:
             return True
         return False
 
+    def _was_noise(self, least_n: float, now_ns: int) -> bool:
+        """Whether what told the touch was noise: no such force is there; then it is sought anew."""
+        mean = self._observer.watch.mean_n(self.limits.lost_s)
+        if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
+            return False
+        self._taken_back += 1
+        self._observer.seek_touch()
+        self._enter(State.APPROACH, now_ns)
+        return True
+
     def _draw_back(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
         if now_ns - self._state_ns > 1e9 * self.limits.retract_s:
             self._fail(Breach(Cause.TIME, "retraction took too long"), now_ns)
             return None
-        left = self.parameters.standoff_m - place.height_m
-        if left < ARRIVED_M:
+        if self.parameters.standoff_m - place.height_m < ARRIVED_M:
             if self._result is not None:
                 self._result = replace(self._result, retracted=True)
             self._enter(State.IDLE, now_ns)
             return None
-        p = self.parameters
-        speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
-        twist = np.zeros(6)
-        twist[:3] = max(speed, 1e-4) * self._normal
-        return twist
+        return self._path.lift(arm, self.parameters)
 
     def _after_fault(self, now_ns: int) -> None:
         """Stand still; then draw back, unless the arm itself was the fault."""
-        if not self._arm_was_bad and now_ns - self._state_ns > 1e9 * RETRACT_AFTER_S:
+        after_s = 0.0 if self._pressed_too_hard else RETRACT_AFTER_S
+        if not self._arm_was_bad and now_ns - self._state_ns >= 1e9 * after_s:
             self._enter(State.RETRACT, now_ns)
 
     # pieces
 
     def _place(self, arm: ArmSample) -> Place:
-        assert self.goal is not None
-        height = float(self._normal @ (arm.tip.position_m - self.goal.touch.position_m))
-        depth = None
-        self._height_m = height
+        path, depth = self._path, None
+        self._height_m = above = path.height_m(arm)
         if self._observer.model is not None and self.state in TOUCHING:
-            depth = self._observer.model.estimate(height).depth_m
-        return Place(self._normal, height, depth, float(np.linalg.norm(self._turn(arm))))
-
-    def _turn(self, arm: ArmSample) -> FloatArray:
-        """Rotation vector (3,) in the base from the tip's orientation to the goal's."""
-        assert self.goal is not None
-        if np.array_equal(arm.tip.rotation_rad, self.goal.touch.rotation_rad):
-            return np.zeros(3)
-        return (self._rotation * Rotation.from_rotvec(arm.tip.rotation_rad).inv()).as_rotvec()
-
-    def _goal_position(self, height_m: float) -> FloatArray:
-        assert self.goal is not None
-        return self.goal.touch.position_m + height_m * self._normal
-
-    def _normal_motion(self, arm: ArmSample, speed_m_s: float) -> FloatArray:
-        """Twist along the normal that also keeps place along the surface and orientation."""
-        assert self.goal is not None
-        away = self.goal.touch.position_m - arm.tip.position_m
-        away = away - float(self._normal @ away) * self._normal
-        velocity = speed_m_s * self._normal + away / RIGHTING_S
-        return np.concatenate([velocity, self._turn(arm) / RIGHTING_S])
+            depth = self._observer.model.estimate(above).depth_m
+            above = -depth
+        return Place(
+            path.normal,
+            self._height_m,
+            depth,
+            float(np.linalg.norm(path.turn(arm))),
+            path.housing_m(arm, above),
+        )
 
     def _enter(self, state: State, now_ns: int) -> None:
         self.state, self._state_ns = state, now_ns
@@ -442,6 +444,7 @@ class ContactController:
     def _fail(self, breach: Breach, now_ns: int) -> None:
         """Note why, and stop."""
         self._arm_was_bad = breach.cause in ARM_CAUSES
+        self._pressed_too_hard = breach.cause in PRESSING_CAUSES
         self._end(breach, now_ns)
         self._enter(State.FAULT, now_ns)
 
@@ -472,6 +475,7 @@ class ContactController:
             depth_m=estimate.depth_m if estimate is not None else None,
             stiffness_n_per_m=estimate.stiffness_n_per_m if estimate is not None else None,
             surface_m=estimate.surface_m if estimate is not None else None,
+            told_m=self._told_m,
             contact_s=(now_ns - self._contact_ns) * 1e-9 if estimate is not None else None,
             total_s=(now_ns - self._start_ns) * 1e-9,
             peak_force_n=self._observer.watch.peak_n,

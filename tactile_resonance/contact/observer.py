@@ -125,12 +125,12 @@ class Observer:
                 continue
             height = _between(self._heights, sample.time_ns, self.arm_model.speed_m_s)
             force = float(self.watch.force_n[2])
+            if self._detector is not None:
+                self._window.append((height, force))
             if self.model is not None:
                 self._update(self.model, sample.time_ns, height, force)
-            elif self._detector is not None:
-                self._window.append((height, force))
-                if self._detector.add(force):
-                    self._touch(sample.time_ns)
+            elif self._detector is not None and self._detector.add(force):
+                self._touch(sample.time_ns)
         return None
 
     def _update(self, model: ContactFilter, time_ns: int, height: float, force: float) -> None:
@@ -139,6 +139,10 @@ class Observer:
         self._model_ns = time_ns
         self._sum_n += force
         self._count += 1
+
+    def look_again(self) -> None:
+        """Estimate the contact anew from all that was kept: noise may have told the touch too early."""
+        self._touch(self._model_ns)
 
     def _touch(self, time_ns: int) -> None:
         heights, forces = zip(*self._window, strict=True)

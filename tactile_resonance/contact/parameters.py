@@ -20,9 +20,11 @@ from tactile_resonance.fields import (
 RANGES: dict[str, tuple[float, float]] = {
     "approach_speed_m_s": (1e-4, 5e-3),
     "press_speed_m_s": (1e-4, 5e-3),
+    "told_speed_m_s": (1e-4, 5e-3),
     "travel_speed_m_s": (1e-3, 0.25),
     "retract_speed_m_s": (1e-3, 0.1),
     "acceleration_m_s2": (0.05, 2.0),
+    "relief_acceleration_m_s2": (0.05, 2.0),
     "standoff_m": (5e-4, 0.05),
     "search_m": (0.0, 0.02),
     "early_m": (0.0, 0.02),
@@ -54,10 +56,13 @@ class ContactParameters:
     ----------
     approach_speed_m_s, press_speed_m_s : float
         Towards the surface before and after the touch [m/s].
+    told_speed_m_s : float
+        Towards it, at most, once another sensor has told the touch and the force has not yet [m/s].
     travel_speed_m_s, retract_speed_m_s : float
         To the standoff, and away from the tissue [m/s].
-    acceleration_m_s2 : float
-        Limit of every motion but stops [m/s2].
+    acceleration_m_s2, relief_acceleration_m_s2 : float
+        Limit of every motion but stops [m/s2]; and, where it is larger, of one in contact that takes
+        force off the tissue.
     standoff_m : float
         Height above the expected surface where the approach begins [m].
     search_m, early_m : float
@@ -90,9 +95,11 @@ class ContactParameters:
 
     approach_speed_m_s: float = 4e-3
     press_speed_m_s: float = 5e-3
+    told_speed_m_s: float = 1e-3
     travel_speed_m_s: float = 0.05
     retract_speed_m_s: float = 0.02
     acceleration_m_s2: float = 0.5
+    relief_acceleration_m_s2: float = 1.0
     standoff_m: float = 3e-3
     search_m: float = 2e-3
     early_m: float = 2e-3
@@ -154,6 +161,7 @@ LIMIT_RANGES: dict[str, tuple[float, float]] = {
     "angular_speed_rad_s": (0.0, 2.0),
     "tilt_rad": (1e-3, 1.6),
     "misalignment_rad": (1e-3, 0.5),
+    "clearance_m": (0.0, 0.05),
     "force_age_s": (1e-3, 0.5),
     "arm_age_s": (1e-3, 0.5),
     "stuck_samples": (3, 1000),
@@ -196,6 +204,8 @@ class Limits:
         Between +z of the tip and the vertical [rad].
     misalignment_rad : float
         Between the tip and its goal while near the surface [rad].
+    clearance_m : float
+        Of the sensor's housing above the surface, at least [m].
     force_age_s, arm_age_s : float
         Age of the newest data [s].
     stuck_samples : int
@@ -223,6 +233,7 @@ class Limits:
     angular_speed_rad_s: float = 0.3
     tilt_rad: float = 0.8
     misalignment_rad: float = 0.05
+    clearance_m: float = 1e-4
     force_age_s: float = 0.010
     arm_age_s: float = 0.020
     stuck_samples: int = 10

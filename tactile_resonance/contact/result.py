@@ -30,6 +30,7 @@ class Cause(str, Enum):
     WORKSPACE = "workspace"
     TILT = "tilt"
     MISALIGNED = "misaligned"
+    HOUSING = "housing"
     SPEED = "speed"
     ARM_STALE = "arm_stale"
     ARM_STOPPED = "arm_stopped"
@@ -68,6 +69,8 @@ class ContactResult:
         When reached [N/m], the beam included.
     surface_m : float or None
         Height of the first touch above the expected one [m].
+    told_m : float or None
+        Height at which another sensor told the touch, on the same scale [m]; None where none did.
     contact_s : float or None
         From the detection of contact until the force was reached [s].
     total_s : float
@@ -90,3 +93,4 @@ class ContactResult:
     total_s: float
     peak_force_n: float
     retracted: bool
+    told_m: float | None = None

@@ -21,7 +21,7 @@ from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, ClientState, Exchange
-from tactile_resonance.drivers.ur_safety import motion_fault
+from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
@@ -85,6 +85,9 @@ class UrArm:
                 if motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None:
                     self._forget_commands()
                     return
+                stop = stop_fault(state.safety_bits, state.robot_mode)
+                if stop is not None:  # not released yet; the connection is good
+                    raise ArmError(*stop)
                 self._ask({"name": "restart"})
                 self._forget_commands()
                 return

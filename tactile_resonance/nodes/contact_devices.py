@@ -9,6 +9,7 @@ from pathlib import Path
 from rclpy.node import Node
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
@@ -56,7 +57,23 @@ PARAMETERS = (
     Parameter(
         "sensor_config",
         "config/sensors/bimorph.yaml",
-        "The sensor, for the radius of its tip.",
+        "The sensor, for the radius of its tip and the length of its beam.",
+        read_only=True,
+    ),
+    Parameter(
+        "beam_tilt_rad",
+        0.17,
+        "By which the clamp of the beam lies higher than the ball, seen from the surface [rad].",
+        0.0,
+        1.0,
+        read_only=True,
+    ),
+    Parameter(
+        "housing_below_m",
+        0.006,
+        "How far the housing reaches below the beam at the clamp [m].",
+        0.0,
+        0.9,
         read_only=True,
     ),
 )
@@ -100,10 +117,11 @@ def make_force_source(node: Node, arm: UrArm) -> TipForce:
     )
 
 
-def tip_radius_m(node: Node) -> float:
-    """Radius of the sensor's ball [m]."""
-    (name,) = values(node, "sensor_config")
-    return read_sensor(_path(name)).tip.radius_m
+def tip_geometry(node: Node) -> TipGeometry:
+    """Ball, beam and housing; ValueError where a figure is wrong."""
+    name, tilt, below = values(node, "sensor_config", "beam_tilt_rad", "housing_below_m")
+    sensor = read_sensor(_path(name))
+    return TipGeometry(sensor.tip.radius_m, sensor.beam.free_length_m, tilt, below)
 
 
 def _path(name: str) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,15 +26,19 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.requirements import require_fit
+from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
-from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.conversions import (
+    poles_from_message,
+    time_message,
+)
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import STREAM, run_node
+from tactile_resonance.nodes.running import POLES, STREAM, RCLError, run_node
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
@@ -45,6 +50,22 @@ PARAMETERS = (
         1,
         500,
     ),
+    Parameter(
+        "touch_from_poles",
+        False,
+        "First contact is told by poles too, against those in air: the rest of the approach is slow then. "
+        "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
+        "for blocks of 0.4 s.",
+        read_only=True,
+    ),
+    Parameter(
+        "touch_false_alarm",
+        1e-6,
+        "Probability of a false alarm of one block [-].",
+        1e-12,
+        0.1,
+        read_only=True,
+    ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
     *contact_parameters(),
@@ -52,6 +73,9 @@ PARAMETERS = (
 
 POLL_S = 0.02
 FEEDBACK_EVERY = 5  # polls
+IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
+# A block whose middle lies so long after the last contact was taken in air as a whole.
+IN_AIR_FOR_NS = 1_000_000_000
 # How long the devices may be dead before the node gives up and is brought up anew.
 DEAD_CYCLES = 500
 _HOLDS = {
@@ -85,7 +109,7 @@ class ContactNode(ManagedNode):
         self.resources.callback(self._arm.close)
         self._force = contact_devices.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
-        self._tip_radius_m = contact_devices.tip_radius_m(self)
+        self._tip = contact_devices.tip_geometry(self)
         self._arm.connect()
         self._force.start()
         self._goal: ServerGoalHandle | None = None
@@ -93,6 +117,11 @@ class ContactNode(ManagedNode):
         self._fault: ArmError | ForceError | None = None
         self._dead = self._polls = self._unpublished = 0
         self._wrenches: list[WrenchSample] = []
+        from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
+        if from_poles:
+            self._touch = PolesTouch(false_alarm)
+            self._air_since_ns = time.time_ns()
+            self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self.every(POLL_S, self._poll)
         server = ActionServer(
@@ -111,7 +140,7 @@ class ContactNode(ManagedNode):
         gc.collect()
         gc.freeze()
         self._thread = ContactThread(
-            self._arm, self._force, self._settings, self._limits, self._on_cycle
+            self._arm, self._force, self._settings, self._limits, self._tip, self._on_cycle
         )
 
     def deactivate(self) -> None:
@@ -186,6 +215,11 @@ class ContactNode(ManagedNode):
         if self._thread is None:
             response.message = f"contact_node is {self.state_name()}"
             return response
+        try:
+            self._thread.make_ready()
+        except ArmError as error:
+            response.message = str(error)
+            return response
         self._thread.retract()
         response.success = True
         response.message = "asked; contact_state tells when it is idle"
@@ -205,7 +239,7 @@ class ContactNode(ManagedNode):
         axes = Rotation.from_quat(quaternion).as_matrix()
         given = np.array([request.normal.x, request.normal.y, request.normal.z])
         normal = given if given.any() else axes[:, 2]
-        touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], self._tip_radius_m)
+        touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], self._tip.ball_radius_m)
         return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
 
     def _goal_limits(self, request: MakeContact.Goal) -> Limits:
@@ -249,17 +283,45 @@ class ContactNode(ManagedNode):
         if self._finished is not None and not self._finished.done():
             self._finished.set_result(result)
 
+    def _on_poles(self, message: msg.Poles) -> None:
+        """Poles of a block taken in air are the reference, those of an approach are tested against it."""
+        thread, (poles, origin) = self._thread, poles_from_message(message)
+        if thread is None or not len(poles.f0_hz) or poles.covariance is None:
+            return
+        strongest = int(np.argmax(np.abs(poles.residues)))
+        pole = [poles.f0_hz[strongest], poles.damping_ratio[strongest]]
+        covariance, state = poles.covariance[strongest], thread.controller.state
+        try:
+            if state in IN_AIR and origin.time_ns > self._air_since_ns + IN_AIR_FOR_NS:
+                self._touch.add_air(pole, covariance)
+            elif state is not State.APPROACH or not self._touch.ready:
+                return
+            elif self._touch.touched(pole, covariance) and thread.tell_touch():
+                self.get_logger().info("the resonance tells the first contact")
+        except ValueError as error:
+            self.health.error(f"poles: {error}")
+
     # each cycle, in the loop's thread
 
     def _on_cycle(self, cycle: Cycle) -> None:
         self._dead = self._dead + 1 if cycle.fault is not None else 0
         self._fault = cycle.fault
+        if cycle.state not in IN_AIR:
+            self._air_since_ns = cycle.time_ns
         self._wrenches += cycle.wrenches
         self._unpublished += 1
         if self._unpublished < self._publish_every:
             return
         self._unpublished = 0
         wrenches, self._wrenches = self._wrenches, []
+        try:
+            self._publish(wrenches, cycle)
+        except RCLError:
+            # once ROS has been shut down nobody listens, but the tip is still to be drawn back
+            if self.context.ok():
+                raise
+
+    def _publish(self, wrenches: list[WrenchSample], cycle: Cycle) -> None:
         if cycle.arm is not None and self._pose.get_subscription_count():
             self._pose.publish(self._pose_message(cycle))
         if wrenches and self._wrench.get_subscription_count():

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ForceSource
 from tactile_resonance.contact.loop import ContactLoop, Cycle, WallClock
@@ -26,6 +27,7 @@ class ContactThread:
     arm, force : Arm, ForceSource
         Connected and started.
     parameters, limits : ContactParameters, Limits
+    tip : TipGeometry
     listener : callable
         Called with each cycle in the loop's thread; must return at once.
     """
@@ -36,11 +38,13 @@ class ContactThread:
         force: ForceSource,
         parameters: ContactParameters,
         limits: Limits,
+        tip: TipGeometry,
         listener: Callable[[Cycle], None],
     ) -> None:
-        self.controller = ContactController(parameters, limits)
+        self.controller = ContactController(parameters, limits, tip)
         self.loop = ContactLoop(arm, force, WallClock(), self.controller, listener)
         self.error: Exception | None = None
+        self._arm = arm
         self._lock = threading.Lock()
         self._running = True
         self._thread = threading.Thread(target=self._run, name="contact", daemon=True)
@@ -61,6 +65,17 @@ class ContactThread:
         """Draw the tip back, beginning with the next cycle."""
         with self._lock:
             self.controller.retract()
+
+    def tell_touch(self) -> bool:
+        """Pass on that another sensor tells the first contact; whether that is new in an approach."""
+        with self._lock:
+            return self.controller.tell_touch()
+
+    def make_ready(self) -> None:
+        """Start the program of an arm again that was stopped; ``ArmError`` where it is not released."""
+        with self._lock:
+            if self.controller.state is State.FAULT:
+                self._arm.connect()
 
     def close(self) -> None:
         """Draw the tip back where the link allows it, and end the loop."""

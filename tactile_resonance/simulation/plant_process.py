@@ -19,6 +19,7 @@ from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
+from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import STALL_S, SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.socketcand import SocketcandServer
@@ -211,6 +212,9 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     commands["place_surface"] = tabletop.place_surface
     commands["place_tissue"] = tabletop.place_tissue
     commands["truth"] = tabletop.truth
+    history = PlantHistory(tabletop.plant)
+    commands["history"] = history.since
+    robot.after_step.append(history.step)
     if cell is not None:
         commands["cell_fault"] = cell.inject
         robot.after_step.append(cell.step)

@@ -218,13 +218,14 @@ def test_tissue_that_is_taken_away_is_noticed(state):
     assert max(made.force_n[at:]) < 1.2 * contacts.FORCE_N
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(10))
 def test_tissue_ten_times_stiffer_than_the_stiffest_stays_below_the_hard_limit(seed):
     # 400 kPa under 2.5 mm: 370 N/m at 1 cN
     made = contact(stiffer(SOFT, 400 / 8.8), seed=seed)
     result = made.loop.make(made.goal)
     made.run(0.5)
-    assert max(made.force_n) < HARD_N
+    # taken off at once and faster than it came, the force stays below what the abort is set to
+    assert max(made.force_n) < Limits().abort_force_n
     if result.cause is not Cause.NONE:
         assert result.cause in {Cause.FORCE_RATE, Cause.FORCE_ABORT}
 

@@ -12,7 +12,8 @@ from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, to
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.loop import WallClock
+from tactile_resonance.contact.loop import ContactLoop, WallClock
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -20,6 +21,8 @@ from tactile_resonance.simulation.tracking import TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, started, stiffer
+
+EARLY = replace(QUICK, early_m=1.55e-3)
 
 
 @pytest.mark.parametrize("tissue", [stiffer(SOFT, 0.4), SOFT, stiffer(SOFT, 4.0)])
@@ -260,3 +263,54 @@ def test_stop_that_the_arm_did_not_hear_is_told_again():
     made.run(0.3)
     assert unheard
     assert abs(made.speed_m_s[-1]) < 1e-6
+
+
+def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
+    made = contact(height_m=0.0)
+    assert made.loop.make(made.goal).reached
+    # a new controller knows nothing of that; its goal lies 3 mm beside
+    touch = made.goal.touch
+    beside = ContactGoal(Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad), made.goal.aim)
+    controller = ContactController(QUICK, Limits())
+    loop = ContactLoop(made.bench.arm, made.bench.force, made.bench.clock, controller)
+    way, since = [], len(made.force_n)
+    made.bench.clock.on_step.append(lambda: way.append(made.bench.plant.tip_m[0]))
+    assert loop.make(beside).reached
+    force = np.array(made.force_n[since:])
+    lifted = int(np.argmax(force == 0))
+    assert lifted > 10
+    assert np.ptp(way[:lifted]) < 3e-5
+    assert way[-1] == pytest.approx(3e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_touch_told_by_noise_above_the_surface_is_no_early_surface(seed):
+    # 0.2 mm above the tissue the cell shows 3 mN for 10 ms; the surface lies within what is accepted
+    made = started(stiffer(SOFT, 2.0), height_m=1.5e-3, seed=seed, parameters=EARLY)
+    assert made.run_until(State.APPROACH)
+    tip = made.bench.clock.motion
+    made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1.7e-3)
+    made.bench.cell.faults.bias_step_n = -3e-3
+    made.run(0.01)
+    made.bench.cell.faults.bias_step_n = 0.0
+    made.loop.run_while(lambda: made.controller.result is None)
+    assert made.controller.result.reached, made.controller.result.message
+    assert made.controller.result.surface_m < EARLY.early_m
+
+
+def test_touch_told_by_the_resonance_slows_the_rest_of_the_approach():
+    made = started(height_m=0.0)
+    assert not made.controller.tell_touch()  # not in an approach
+    assert made.run_until(State.APPROACH)
+    tip = made.bench.clock.motion
+    made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1e-3)
+    told_m = tip.reported.position_m[2] - RADIUS_M
+    assert made.controller.tell_touch()
+    assert not made.controller.tell_touch()
+    made.run(0.1)
+    began = len(made.speed_m_s)
+    made.run(0.3)
+    np.testing.assert_allclose(made.speed_m_s[began:], -QUICK.told_speed_m_s, rtol=0.05)
+    made.loop.run_while(lambda: made.controller.result is None)
+    assert made.controller.result.reached
+    assert made.controller.result.told_m == pytest.approx(told_m, abs=2e-5)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was true of the tip at every step of the plant, kept for those who ask later.
+
+No instrument shows it: tests and benchmarks judge by it how deep, how hard and how long.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from tactile_resonance.simulation.plant import Plant
+
+KEEP_STEPS = 30_000
+"""A minute at 500 Hz."""
+
+MOST_STEPS = 250
+"""In one answer: to write more would hold the plant up."""
+
+
+class PlantHistory:
+    """Time, place of the tip and force on it, step by step.
+
+    Parameters
+    ----------
+    plant : Plant
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self._steps: deque[tuple[float, list[float], float]] = deque(maxlen=KEEP_STEPS)
+
+    def step(self) -> None:
+        """Note what is true now; to be called after each step of the plant."""
+        plant = self._plant
+        self._steps.append((plant.time_s, plant.tip_m.tolist(), plant.normal_force_n))
+
+    def since(self, fields: dict) -> dict:
+        """Control port: the first steps after field ``after_s``, 250 at most, oldest first.
+
+        Answers ``time_s`` (n,), ``tip_m`` (n, 3) in the base and ``normal_force_n`` (n,).
+        """
+        after_s = fields.get("after_s", 0.0)
+        if isinstance(after_s, bool) or not isinstance(after_s, (int, float)):
+            raise ValueError(f"after_s: {after_s!r}, expected a number")
+        if not math.isfinite(after_s):
+            raise ValueError(f"after_s: {after_s!r}, expected a finite number")
+        found: list[tuple[float, list[float], float]] = []
+        for step in reversed(self._steps):
+            if step[0] <= after_s:
+                break
+            found.append(step)
+        first = found[::-1][:MOST_STEPS]
+        return {
+            "time_s": [step[0] for step in first],
+            "tip_m": [step[1] for step in first],
+            "normal_force_n": [step[2] for step in first],
+        }

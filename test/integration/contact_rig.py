@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""contact_node and its manager as processes on a simulated robot with tissue and load cell; their client."""
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from rclpy.action import ActionClient
+from scipy.spatial.transform import Rotation
+from std_srvs.srv import Trigger
+from tactile_resonance.action import MakeContact
+
+from tactile_resonance import msg
+from tactile_resonance.nodes.client import NodeClient
+from tactile_resonance.nodes.running import NEWEST
+from tactile_resonance.processes import NodeProcesses, end_with_parent, may_take_priority
+from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
+from tactile_resonance.simulation.robot.control_port import order
+
+PRIORITY = 20
+HOST = f"127.0.13.{1 + os.getpid() % 250}"
+TURN = Rotation.from_rotvec(TABLE_IN_BASE[3:]).as_quat().tolist()
+
+
+class ContactClient(NodeClient):
+    """Asks for contacts and hears the state."""
+
+    def __init__(self, check):
+        super().__init__("contact_client", check)
+        self.state = None
+        self.states = []
+
+    def join(self):
+        self._action = ActionClient(self._node, MakeContact, "make_contact")
+        self._retract = self._node.create_client(Trigger, "retract")
+        self._node.create_subscription(msg.ContactState, "contact_state", self._on_state, NEWEST)
+
+    def _on_state(self, message):
+        self.state = message
+        if not self.states or self.states[-1] != message.state:
+            self.states.append(message.state)
+
+    def why(self):
+        return "" if self.state is None else f"{self.state.state}: {self.state.message}"
+
+    def idle(self, anew=False, timeout_s=40.0):
+        """Wait until the node is active and nothing is under way; `anew`: its loop begun again."""
+        cycles = self.state.cycles if anew else None
+        self.state = None
+
+        def there():
+            new = self.state is not None and (cycles is None or self.state.cycles < cycles)
+            return new and self.state.state == "idle"
+
+        self.wait(there, timeout_s, "contact_node to be idle")
+
+    def back(self, timeout_s=30.0):
+        """Ask for a retraction while a fault stands, until nothing is under way."""
+        deadline = time.monotonic() + timeout_s
+        self.state = None
+        while self.state is None or self.state.state != "idle":
+            assert time.monotonic() < deadline, f"contact_node does not come back ({self.why()})"
+            if self.state is not None and self.state.state == "fault":
+                self.retract()
+                self.state = None
+            self.spin(0.2)
+
+    def start(self, xy_m=(0.0, 0.0), timeout_s=20.0, **fields):
+        """Ask for a contact until the node takes it; return the goal's handle."""
+        goal = MakeContact.Goal(force_n=0.01, **fields)
+        goal.pose = PoseStamped()
+        goal.pose.header.frame_id = "base"
+        place, turn = goal.pose.pose.position, goal.pose.pose.orientation
+        place.x, place.y = (float(a + b) for a, b in zip(TABLE_IN_BASE, xy_m, strict=False))
+        place.z = TABLE_IN_BASE[2]
+        turn.x, turn.y, turn.z, turn.w = TURN
+        deadline = time.monotonic() + timeout_s
+        while True:
+            if self._action.server_is_ready():
+                future = self._action.send_goal_async(goal)
+                self.wait(future.done, 10.0, "an answer to the goal")
+                if future.result().accepted:
+                    return future.result()
+            assert time.monotonic() < deadline, f"no goal is taken ({self.why()})"
+            self.spin(0.05)
+
+    def result(self, handle, timeout_s=15.0):
+        future = handle.get_result_async()
+        self.wait(future.done, timeout_s, "the result")
+        return future.result().result
+
+    def retract(self):
+        future = self._retract.call_async(Trigger.Request())
+        self.wait(future.done, 5.0, "an answer to retract")
+        return future.result()
+
+
+class Bench:
+    """The plant's process and the nodes."""
+
+    def __init__(self, log, tissue="gel10", parameters=None):
+        self.parameters = {"robot_host": HOST, "force_host": HOST, **(parameters or {})}
+        priority = PRIORITY if may_take_priority(PRIORITY) else 0
+        self.plant = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
+                *("--tissue", tissue, "--priority", str(priority)),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        )
+        ready, _, _ = select.select([self.plant.stdout], [], [], 60)
+        line = self.plant.stdout.readline() if ready else "nothing"
+        assert line.startswith(READY), line
+        self.nodes = NodeProcesses(log)
+        self.nodes.bring_up(["contact_node"], {"contact_node": self.parameters})
+
+    def order(self, command, **fields):
+        return order(HOST, command, **fields)
+
+    def until_touching(self, ended=lambda: False, timeout_s=20.0):
+        """The plant's time [s] as soon as the tissue is touched anew; None where it ended before."""
+        deadline = time.monotonic() + timeout_s
+        touches = self.order("truth")["touches"]
+        while time.monotonic() < deadline and not ended():
+            true = self.order("truth")
+            if true["in_contact"] and true["touches"] > touches:
+                return true["time_s"] - true["contact_s"]
+            time.sleep(0.004)
+        return None
+
+    def history(self, since_s):
+        """Time (n,), place of the tip (n, 3) and true force (n,) of all steps after a time."""
+        parts, after = [], since_s
+        while True:
+            part = self.order("history", after_s=after)
+            if not part["time_s"]:
+                break
+            parts.append(part)
+            after = part["time_s"][-1]
+        return tuple(
+            np.concatenate([p[name] for p in parts])
+            for name in ("time_s", "tip_m", "normal_force_n")
+        )
+
+    def dashboard(self, line):
+        with socket.create_connection((HOST, 29999), 5) as channel:
+            lines = channel.makefile()
+            lines.readline()
+            channel.sendall(line.encode() + b"\n")
+            return lines.readline().strip()
+
+    def release(self):
+        """Release a protective stop, as soon as the robot takes it."""
+        deadline = time.monotonic() + 10.0
+        while self.dashboard("unlock protective stop") != "Protective stop releasing":
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+    def close(self):
+        self.nodes.stop()
+        self.plant.terminate()
+        output, _ = self.plant.communicate(timeout=10)
+        return output
+
+
+def last_way_down_s(time_s, tip_m, window_s=0.03, way_m=3e-5):
+    """Time of the last step from which the tip goes down by more than `way_m` within `window_s`.
+
+    1 mm/s; the vibration of the robot is a tenth of it. The first time where it never does.
+    """
+    height = tip_m[:, 2]
+    later = np.searchsorted(time_s, time_s + window_s)
+    later = np.minimum(later, len(time_s) - 1)
+    down = height - height[later] > way_m
+    return time_s[np.flatnonzero(down)[-1]] if down.any() else time_s[0]
