@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
@@ -27,6 +28,7 @@ from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.record import Contact
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.runner import (
+    ATTEMPTS,
     Check,
     Interrupted,
     Measured,
@@ -37,6 +39,7 @@ from tactile_resonance.scan.runner import (
 )
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.surface_search import Touch
 
 POLL_S = 0.005
 # A node that was started anew needs so long at most until it takes goals again.
@@ -46,7 +49,7 @@ RESULTS_WITHIN_S = 10.0
 GOAL_ENDS_WITHIN_S = 15.0
 RETRACT_WITHIN_S = 60.0  # a contact_node that is brought back draws the tip back too
 STATE_WITHIN_S = 1.0
-# What says nothing of the point: the contact is tried again.
+# What says nothing of the point: it comes again.
 DEVICE_CAUSES = frozenset(
     cause.value
     for cause in (
@@ -54,8 +57,9 @@ DEVICE_CAUSES = frozenset(
         *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
     )
 )
-ATTEMPTS = 3
 PLACE_FOR_S = 0.2
+# Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
+LEAST_TOUCH_STD_M = 2e-5
 
 
 class NodeHands:
@@ -108,22 +112,32 @@ class NodeHands:
             return
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
-        self._touching = True
-        for attempt in range(1, ATTEMPTS + 1):
-            handle = self._send(self._contact, goal, "make_contact", check)
-            result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
-            if result.reached:
-                break
-            if result.cause not in DEVICE_CAUSES or attempt == ATTEMPTS:
-                raise PointFailed(f"contact: {result.cause}: {result.message}")
-            self.retract()
-            self._touching = True
+        self._make_contact(goal, check)
         deadline = time.monotonic() + STATE_WITHIN_S
         while self._state is None or self._state.state != msg.ContactState.STATE_HOLD:
             if time.monotonic() > deadline:
                 self._check_contact()
             check()
             time.sleep(POLL_S)
+
+    def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
+        """Touch a point of the surface as it is expected and draw back; tell where the ball met it."""
+        if self._contact is None:
+            raise ScanEnded("surface.touch: nobody moves the tip (parameter contact is none)")
+        for left in reversed(range(ATTEMPTS)):
+            goal = MakeContact.Goal(pose=self._pose_of(point), force_n=force_n)
+            try:
+                result = self._make_contact(goal, check)
+            except PointDisturbed:
+                if not left:
+                    raise
+                continue
+            finally:
+                self.retract()
+            break
+        way = np.array(point.normal) * (ball_radius_m + result.surface_m)
+        x, y, z = (point.position_m + way).tolist()
+        return Touch((x, y, z), max(result.surface_std_m, LEAST_TOUCH_STD_M), result.force_n)
 
     def measure(
         self,
@@ -221,8 +235,7 @@ class NodeHands:
     def _check_contact(self) -> None:
         state = self._state
         if self._touching and state is not None and state.state != state.STATE_HOLD:
-            kind = PointDisturbed if state.cause in DEVICE_CAUSES else PointFailed
-            raise kind(f"contact: {state.cause}: {state.message}")
+            raise _contact_failure(state)
 
     def _on_state(self, message: msg.ContactState) -> None:
         self._state = message
@@ -245,7 +258,8 @@ class NodeHands:
             if time.monotonic() > deadline:
                 raise PointDisturbed(
                     f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
-                    "came"
+                    "came",
+                    "messages lost",
                 )
             check()
             time.sleep(POLL_S)
@@ -275,7 +289,7 @@ class NodeHands:
         try:
             while not future.done():
                 if not client.server_is_ready():
-                    raise PointDisturbed(f"{node} went away")
+                    raise PointDisturbed(f"{node} went away", f"{node} went away")
                 check()
                 each_poll()
                 time.sleep(POLL_S)
@@ -286,9 +300,27 @@ class NodeHands:
             raise
         return future.result().result
 
+    def _make_contact(self, goal: MakeContact.Goal, check: Check) -> MakeContact.Result:
+        """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
+        assert self._contact is not None
+        self._touching = True
+        handle = self._send(self._contact, goal, "make_contact", check)
+        result = self._follow(self._contact, handle, "contact_node", check, lambda: None)
+        if not result.reached:
+            raise _contact_failure(result)
+        return result
+
     @staticmethod
     def _done(future: Future, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
         while not future.done() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         return future.done()
+
+
+def _contact_failure(told: MakeContact.Result | msg.ContactState) -> PointFailed:
+    """What a contact that was not reached, or that ended, means for the point."""
+    text = f"contact: {told.cause}: {told.message}"
+    if told.cause in DEVICE_CAUSES:
+        return PointDisturbed(text, told.cause)
+    return PointFailed(text)

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES
+from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, RESULTS, SERIES
 from tactile_resonance.scan.runner import Recording
 
 
@@ -35,6 +35,7 @@ TOPICS = {
     "record": Recorded(msg.Record, RESULTS, counted=True),
     "frf": Recorded(msg.FRF, RESULTS, counted=True),
     "poles": Recorded(msg.Poles, RESULTS, counted=True),
+    "bench/truth": Recorded(msg.Poles, LATCHED, latched=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
     "contact_state": Recorded(msg.ContactState, SERIES),

@@ -75,7 +75,7 @@ class RunSource:
     def __init__(self, run: Path) -> None:
         content = read_run(run)
         self.entries = [
-            RecordedEntry(result.measurement_id, _file_of(run, result))
+            RecordedEntry(result.measurement_id, file_of(run, result))
             for result in content.results
             if result.measurement_id
         ]
@@ -133,5 +133,6 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
         )
 
 
-def _file_of(run: Path, result: PointResult) -> Path:
+def file_of(run: Path, result: PointResult) -> Path:
+    """File of one attempt at a point."""
     return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"
