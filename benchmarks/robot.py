@@ -36,6 +36,7 @@ SPEED_M_S, ACCELERATION_M_S2 = 0.02, 2.0
 MOVED_M_S = 0.0005
 RUNS = 3
 PERIOD_S = 0.004  # of the loop that commands
+LOST_S = 2.0  # a command without motion for so long was lost
 
 
 @dataclass(frozen=True)
@@ -150,10 +151,10 @@ def _respond(arm: UrArm, sign: int) -> tuple[float, float]:
     """Seconds from a command to motion: seen, and by the state's own time."""
     commanded_ns = time.time_ns()
     arm.speed(np.array([0, 0, sign * SPEED_M_S, 0, 0, 0]), ACCELERATION_M_S2)
-    while True:
-        sample = arm.state()
-        if abs(sample.tip_velocity[2]) > MOVED_M_S:
-            break
+    end_s = time.monotonic() + LOST_S
+    while abs((sample := arm.state()).tip_velocity[2]) <= MOVED_M_S:
+        if time.monotonic() > end_s:
+            raise ValueError(f"benchmark robot: no motion within {LOST_S:g} s of a command")
         time.sleep(0.0001)
     seen_ns = time.time_ns()
     _rest(arm, 0.05)

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests."""
 
+import time
 from pathlib import Path
 
 import pytest
+from stall_witness import StallWitness
 
 
 @pytest.fixture(scope="session")
@@ -15,12 +17,14 @@ def shared_data() -> Path:
     return folder
 
 
-# Tests in which processes meet on the wall clock: a machine that stands still for some hundredths of a
-# second fails them, as it would fail a real robot. Such a run says nothing and is repeated, four times at most.
+# Tests in which processes meet on the wall clock: a machine that stands still for some hundredths of a second
+# fails them, as it would fail a real robot. Such a run says nothing and is repeated; one that fails while the
+# machine kept its pace is a failure at once.
 WALL_CLOCK = (
     *("drivers/ur/", "drivers/test_can_wrench.py", "drivers/test_force_sources.py"),
     *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/test_scan.py"),
 )
+REPEATS = 4
 
 
 def pytest_collection_modifyitems(items):
@@ -29,4 +33,26 @@ def pytest_collection_modifyitems(items):
         if item.path.is_relative_to(here):
             where = item.path.relative_to(here).as_posix()
             if where.startswith(WALL_CLOCK):
-                item.add_marker(pytest.mark.flaky(reruns=4, reruns_delay=1))
+                mark = pytest.mark.flaky(
+                    reruns=REPEATS, reruns_delay=1, condition="config.machine_stood_still()"
+                )
+                item.add_marker(mark)
+                item.on_the_wall_clock = True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Have the machine watched while a test lives by the wall clock."""
+    if not getattr(item, "on_the_wall_clock", False):
+        return
+    config, start_s = item.config, time.monotonic()
+    if not hasattr(config, "stall_witness"):
+        config.stall_witness = StallWitness()
+        config.add_cleanup(config.stall_witness.end)
+    config.machine_stood_still = lambda: bool(config.stall_witness.stalls(start_s))
+
+
+def pytest_runtest_logreport(report):
+    """Say beside a failure that nothing excuses it."""
+    if report.failed and getattr(report, "rerun", REPEATS) < REPEATS:
+        report.sections.append(("wall clock", "the machine kept its pace: not repeated"))

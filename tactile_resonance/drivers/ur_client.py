@@ -228,13 +228,14 @@ class Client:
 
     def _kick(self) -> None:
         assert self._states is not None
+        assert self._motion is not None
         state = self._states.state()
         # never a command on a dead link or to a program that does not run: the library would wait for it
         if (
             self._states.healthy
             and motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None
         ):
-            self._control.kickWatchdog()
+            self._motion.feed()
         self._kicked_s = time.monotonic()
 
     def _leave(self) -> NoReturn:

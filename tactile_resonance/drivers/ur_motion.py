@@ -3,6 +3,11 @@
 
 No call here waits longer than the robot's watchdog allows without feeding it: the library's own
 ``speedStop`` and synchronous ``stopL`` do, so a speed is taken back to zero before its thread is ended.
+
+A velocity is not acknowledged: it stands in the command register until the robot's program looks, once a
+cycle. The library's ``kickWatchdog`` writes zero into that register, and where both arrive within one cycle
+(the robot's own, or a network that held packets back) the velocity is lost, be it the zero of a stop. So
+while a velocity holds the watchdog is fed by saying the velocity again.
 """
 
 from __future__ import annotations
@@ -31,8 +36,9 @@ class Motion:
 
     def __init__(self, control: Any) -> None:
         self._control = control
-        self._speed_m_s = 0.0
-        self._speeding = False
+        self._twist = [0.0] * 6  # newest velocity, and the acceleration towards it
+        self._acceleration_m_s2 = 0.0
+        self._speeding = False  # whether a velocity, zero included, is what the program follows
         self._rest_s = 0.0  # monotonic time from which a speed that was taken back is zero
         self._operation: int | None = None  # id of the asynchronous operation before our move
         self._do: dict[str, Callable[..., bool]] = {
@@ -44,7 +50,7 @@ class Motion:
     @property
     def commanded(self) -> bool:
         """Whether the arm moves, or would without end, by a command of ours."""
-        return self._speed_m_s > 0 or self.moving
+        return any(self._twist) or self.moving
 
     @property
     def moving(self) -> bool:
@@ -61,11 +67,19 @@ class Motion:
         """Do a command; False where the robot refused it."""
         return self._do[name](*values)
 
+    def feed(self) -> bool:
+        """Keep the robot's watchdog quiet without changing what the arm does."""
+        if self._speeding:
+            return self._control.speedL(self._twist, self._acceleration_m_s2, CYCLE_S)
+        return self._control.kickWatchdog()
+
     def _speed(self, twist: list[float], acceleration: float) -> bool:
         if self.moving and not self._end_move(acceleration):
             return False
-        self._speeding = True
-        self._speed_m_s = float(np.linalg.norm(twist))
+        return self._follow(twist, acceleration)
+
+    def _follow(self, twist: list[float], acceleration: float) -> bool:
+        self._twist, self._acceleration_m_s2, self._speeding = twist, acceleration, True
         return self._control.speedL(twist, acceleration, CYCLE_S)
 
     def _move(self, pose: list[float], speed: float, acceleration: float) -> bool:
@@ -89,14 +103,12 @@ class Motion:
         return done
 
     def _brake(self, deceleration: float) -> bool:
-        self._rest_s = time.monotonic() + self._speed_m_s / deceleration + SETTLE_S
-        done = self._control.speedL([0.0] * 6, deceleration, CYCLE_S)
-        if done:
-            self._speed_m_s = 0.0
-        return done
+        speed_m_s = float(np.linalg.norm(self._twist))
+        self._rest_s = time.monotonic() + speed_m_s / deceleration + SETTLE_S
+        return self._follow([0.0] * 6, deceleration)
 
     def _end_speed(self, deceleration: float) -> bool:
-        if self._speed_m_s > 0 and not self._brake(deceleration):
+        if any(self._twist) and not self._brake(deceleration):
             return False
         if not self._feed_while(lambda: time.monotonic() < self._rest_s):
             return False
@@ -111,7 +123,7 @@ class Motion:
         """Feed the watchdog while a condition holds; False where that takes too long."""
         end_s = time.monotonic() + LONGEST_STOP_S
         while condition():
-            if time.monotonic() > end_s or not self._control.kickWatchdog():
+            if time.monotonic() > end_s or not self.feed():
                 return False
             time.sleep(FEED_S)
         return True

@@ -212,6 +212,19 @@ def test_short_freeze_is_survived(robot, module_arm, start_arm):
     assert keep_for(arm, 0.1)[-1].tip_velocity[2] < 0
 
 
+def test_no_velocity_is_lost_where_packets_come_together(robot, high):
+    """Held back and let through at once, a velocity and what feeds the watchdog meet in one cycle."""
+    for _ in range(3):
+        robot.order("freeze", seconds=0.025)
+        high.speed(DOWN, ACCELERATION_M_S2)
+        keep_for(high, 0.025 + LAG_S)
+        assert high.state().tip_velocity[2] == pytest.approx(DOWN[2], rel=0.1)
+        robot.order("freeze", seconds=0.025)
+        high.stop(ACCELERATION_M_S2)
+        keep_for(high, 0.025 + LAG_S)
+        assert np.abs(high.state().tip_velocity).max() < 5e-4
+
+
 def test_connection_is_dropped(robot, high):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
