@@ -108,8 +108,15 @@ def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
         options.robot_host,
         options.seed,
         patient=options.patient,
-        notes=options.notes,
+        notes=_checked_notes(options.notes),
     )
+
+
+def _checked_notes(text: str) -> str:
+    from tactile_resonance.scan.notes import parse_notes
+
+    parse_notes(text, "notes")
+    return text
 
 
 def run_job(job: Job) -> int:

@@ -55,7 +55,7 @@ class PointDisturbed(PointFailed):
         The same in one or two words, to be counted.
     """
 
-    def __init__(self, message: str, kind: str) -> None:
+    def __init__(self, message: str, kind: str = "disturbed") -> None:
         super().__init__(message)
         self.kind = kind
 
