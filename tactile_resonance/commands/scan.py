@@ -41,4 +41,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _resume(options: argparse.Namespace) -> int:
     run = options.output.resolve()
     scene = run / "scene.yaml"
-    return run_job(Job(scene, run, options.robot_host, resume=True, patient=options.patient))
+    return run_job(
+        Job(scene, run, options.robot_host, resume=True, hardware_limits=options.hardware_limits)
+    )

@@ -243,9 +243,14 @@ class ExcitationNode(ManagedNode):
         )
 
     def _contact(self, start_ns: int, length_s: float) -> Contact:
-        """Force while the block was taken; where none was heard then, the last one, of unknown accuracy."""
+        """Force while the block was taken.
+
+        Where none was heard then: the last one, of unknown accuracy, from a source that tells changes
+        only; unknown from one that streams, for its forces are late and the last may be from before the
+        contact.
+        """
         force_n, std_n = self._forces.mean(start_ns, start_ns + round(length_s * 1e9))
-        if np.isnan(force_n):
+        if np.isnan(force_n) and not self._forces.streams:
             force_n = self._forces.newest()[1]
         return contact_from_message(self._pose, force_n, std_n)
 

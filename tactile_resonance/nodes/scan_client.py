@@ -90,6 +90,8 @@ class ScanClient(NodeClient):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            if str(Path(status.name).parent) != self._node.get_namespace():
+                continue  # of another sensor
             name = Path(status.name).name
             self._details[name] = {value.key: value.value for value in status.values}
             # why a node does not come up is told for seconds, that it does not for longer

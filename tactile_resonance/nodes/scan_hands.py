@@ -178,7 +178,7 @@ class NodeHands:
 
             result = self._follow(self._measure, handle, "excitation_node", check, each_poll)
             if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
-                raise PointFailed(f"measurement: {result.message}")
+                raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
             self._wait_for_results(result, check)
             take_poles()
         finally:

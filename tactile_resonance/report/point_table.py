@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ _HEAD = "point  x [mm]  y [mm]  force [mN]  f0 [Hz]   +- std   damping   +- std 
 _TRUTH_HEAD = "true f0   dev  true damping   dev"
 
 
-def point_table(results: Sequence[PointResult], truths: dict[int, PointTruth]) -> str:
+def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]) -> str:
     """One line per point; deviations from the truth in standard deviations of the point."""
     head = _HEAD + (_TRUTH_HEAD if truths else "")
     lines = [head.rstrip(), "-" * len(head.rstrip())]
@@ -36,7 +36,7 @@ def point_table(results: Sequence[PointResult], truths: dict[int, PointTruth]) -
     return "\n".join(lines)
 
 
-def table_notes(results: Sequence[PointResult], truths: dict[int, PointTruth]) -> list[str]:
+def table_notes(results: Sequence[PointResult], truths: Mapping[int, PointTruth]) -> list[str]:
     """Sentences below the table: how far from the truth, how often points were begun again."""
     notes = []
     off = deviations(results, truths)

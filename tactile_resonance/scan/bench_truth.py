@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,7 @@ def truths_of(run: RunContent) -> dict[int, PointTruth]:
     return found
 
 
-def deviations(results: Iterable[PointResult], truths: dict[int, PointTruth]) -> FloatArray:
+def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:
     """(n, 2) estimate less truth of f0 and damping ratio in standard deviations, where both are known."""
     rows = [deviation(r, truths[r.index]) for r in results if r.index in truths]
     return np.array(rows).reshape(-1, 2)
