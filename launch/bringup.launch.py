@@ -85,8 +85,8 @@ def generate_launch_description():
             "static_transforms",
             default_value="true",
             choices=["true", "false"],
-            description="Publish where the table stands in the robot's base, where tf2_ros is installed; for "
-            "hardware from the scan node's table_in_base in params_file.",
+            description="Publish where the simulated table stands in the robot's base, where tf2_ros is "
+            "installed; where a real one stands, its stack knows.",
         ),
         DeclareLaunchArgument(
             "table_frame",
