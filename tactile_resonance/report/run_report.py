@@ -39,9 +39,6 @@ _COLUMNS = (
     ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
     ("f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
     ("damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
-    ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
-    ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
-    ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
     ("tissue", lambda r: _tissue(r)),
     ("begun again", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
@@ -49,6 +46,12 @@ _COLUMNS = (
 )
 # Facts of the run that have a place of their own on the page.
 _SHOWN = {"skipped", "notes", "surface"}
+_AIR_COLUMNS = (
+    ("point", lambda r: f"{r.index + 1}"),
+    ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
+    ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
+    ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
+)
 _TRUTH_COLUMNS = ("true f0 [Hz]", "off by [std]", "true damping", "off by [std]")
 _TEXT = {"tissue", "begun again", "outcome"}
 
@@ -89,8 +92,11 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
     parts += ["</ul>"]
     if "surface" in run.facts:
         parts += ["<h2>Surface, found by touch</h2>", _touches(run.facts["surface"])]
-    parts += ["<h2>Points</h2>", _table(run.latest, truths)]
+    parts += ["<h2>Points</h2>", _table(run.latest)]
     parts += [f"<p>{html.escape(line)}</p>" for line in table_notes(run.latest, truths)]
+    measured = [result for result in run.latest if result.outcome is Outcome.DONE]
+    parts += [f"<h2>Against free air{' and the truth of the simulation' if truths else ''}</h2>"]
+    parts += [_air_table(measured, truths)]
     skipped = run.facts.get("skipped", [])
     if skipped:
         parts += ["<h2>Left out</h2><ul>"]
@@ -147,21 +153,27 @@ def skipped_lines(run: RunContent) -> list[str]:
     return lines
 
 
-def _table(results: Sequence[PointResult], truths: Truths) -> str:
-    def cell(kind: str, name: str, text: str) -> str:
-        css = ' class="text"' if name in _TEXT else ""
-        return f"<{kind}{css}>{html.escape(text)}</{kind}>"
+def _cell(kind: str, name: str, text: str) -> str:
+    css = ' class="text"' if name in _TEXT else ""
+    return f"<{kind}{css}>{html.escape(text)}</{kind}>"
 
-    names = [name for name, _ in _COLUMNS] + list(_TRUTH_COLUMNS if truths else ())
-    rows = ["<tr>" + "".join(cell("th", name, name) for name in names) + "</tr>"]
+
+def _table(results: Sequence[PointResult]) -> str:
+    rows = ["<tr>" + "".join(_cell("th", name, name) for name, _ in _COLUMNS) + "</tr>"]
     for result in results:
         css = "" if result.outcome is Outcome.DONE else ' class="failed"'
         rows.append(
-            f"<tr{css}>"
-            + "".join(cell("td", n, show(result)) for n, show in _COLUMNS)
-            + "".join(cell("td", "", text) for text in _against_truth(result, truths))
-            + "</tr>"
+            f"<tr{css}>" + "".join(_cell("td", n, show(result)) for n, show in _COLUMNS) + "</tr>"
         )
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _air_table(results: Sequence[PointResult], truths: Truths) -> str:
+    names = [name for name, _ in _AIR_COLUMNS] + list(_TRUTH_COLUMNS if truths else ())
+    rows = ["<tr>" + "".join(_cell("th", name, name) for name in names) + "</tr>"]
+    for result in results:
+        texts = [show(result) for _, show in _AIR_COLUMNS] + _against_truth(result, truths)
+        rows.append("<tr>" + "".join(_cell("td", "", text) for text in texts) + "</tr>")
     return f'<div class="wide"><table>{"".join(rows)}</table></div>'
 
 
