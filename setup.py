@@ -19,6 +19,7 @@ NODES = (
     "poles_node",
     "contact_node",
     "scan_node",
+    "scan_goal",
     "pole_map_node",
     "fake_hardware_node",
     "manager_node",

@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of a scan; with `use_mock_hardware` the simulated bench, robot and load cell too."""
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+import shutil
+import time
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -9,6 +13,13 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 PACKAGE = "tactile_resonance"
+# For the simulated robot and load cell alone; what `tactile_resonance demo` uses too.
+PATIENT = {
+    "limits.force_age_s": 0.06,
+    "limits.arm_age_s": 0.06,
+    "robot_config": "config/devices/ur5e_patient.yaml",
+    "force_config": "can_patient.yaml",
+}
 STREAM = ("excitation_node", "frf_node", "poles_node")
 # Where the simulated robot answers, and the phantom under its tip.
 MOCK_ROBOT = "127.0.1.1"
@@ -64,10 +75,41 @@ def generate_launch_description():
             description="Folder that receives the runs; empty: tactile_resonance/runs in $ROS_HOME.",
         ),
         DeclareLaunchArgument(
+            "patient",
+            default_value="false",
+            choices=["true", "false"],
+            description="Simulated robot and load cell only: their data may be 60 ms old, for a machine "
+            "without real-time priority or with much else to do.",
+        ),
+        DeclareLaunchArgument(
+            "static_transforms",
+            default_value="true",
+            choices=["true", "false"],
+            description="Publish where the simulated table stands in the robot's base, where tf2_ros is "
+            "installed; where a real one stands, its stack knows.",
+        ),
+        DeclareLaunchArgument(
+            "table_frame",
+            default_value="table",
+            description="Frame of scenes and map; with a namespace it is best one of its own.",
+        ),
+        DeclareLaunchArgument(
+            "base_frame",
+            default_value="base",
+            description="Frame of the robot's base, that of its driver.",
+        ),
+        DeclareLaunchArgument(
+            "record",
+            default_value="false",
+            choices=["true", "false"],
+            description="Record all topics of the namespace for as long as this runs, with ros2 bag (MCAP), "
+            "into session-DATE-TIME of the working folder. Scans record themselves, with or without it.",
+        ),
+        DeclareLaunchArgument(
             "rviz",
             default_value="false",
             choices=["true", "false"],
-            description="Start rviz2 with the view of the pole map; it must be installed.",
+            description="Start rviz2 with the view of the pole map, where it is installed.",
         ),
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
@@ -80,6 +122,11 @@ def _nodes(context):
         return LaunchConfiguration(name).perform(context)
 
     mock, robot = given("use_mock_hardware") == "true", given("robot") == "true"
+    patient = given("patient") == "true"
+    if patient and not mock:
+        raise ValueError("patient:=true is for use_mock_hardware:=true: never for a robot")
+    if patient and given("force_config") != "can_simulated.yaml":
+        raise ValueError("patient:=true brings a force_config of its own, another was given")
     host = given("robot_ip") or (MOCK_ROBOT if mock else "")
     simulated_cell = host if mock and given("force_config") == "can_simulated.yaml" else ""
     own = {
@@ -90,12 +137,15 @@ def _nodes(context):
         },
         "contact_node": {
             "robot_host": host,
+            "base_frame": given("base_frame"),
             "force_config": given("force_config"),
             "force_host": simulated_cell,
+            **(PATIENT if patient else {}),
         },
         "scan_node": {
             "contact": "robot" if robot else "none",
             "run_folder": given("run_folder"),
+            "base_frame": given("base_frame"),
             **({"table_in_base": MOCK_TABLE} if mock and robot else {}),
         },
     }
@@ -119,7 +169,59 @@ def _nodes(context):
         )
         for name in [*names, "manager_node"]
     ]
+    wanted = []
+    if mock and robot and given("static_transforms") == "true":
+        wanted.append(_table_in_base(given("base_frame"), given("table_frame")))
     if given("rviz") == "true":
         view = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "pole_map.rviz"])
-        nodes.append(Node(package="rviz2", executable="rviz2", arguments=["-d", view]))
+        wanted.append(
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                namespace=LaunchConfiguration("namespace"),
+                arguments=["-d", view],
+            )
+        )
+    for node in wanted:
+        nodes.append(node if _installed(node.node_package) else _left_out(node.node_package))
+    if given("record") == "true":
+        nodes.append(_recorder(given("namespace")))
     return nodes
+
+
+def _installed(package):
+    try:
+        get_package_prefix(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def _left_out(package):
+    return LogInfo(msg=f"{package} is not installed here: left out")
+
+
+def _table_in_base(base_frame, table_frame):
+    """Static transform of the simulated table."""
+    x, y, z, roll, pitch, yaw = (
+        MOCK_TABLE  # its rotation is about z alone: rotation vector and angles agree
+    )
+    values = {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
+    arguments = [text for name, value in values.items() for text in (f"--{name}", str(value))]
+    return Node(
+        package="tf2_ros",
+        executable="static_transform_publisher",
+        name="table_in_base",
+        namespace=LaunchConfiguration("namespace"),
+        arguments=[*arguments, "--frame-id", base_frame, "--child-frame-id", table_frame],
+    )
+
+
+def _recorder(namespace):
+    if shutil.which("ros2") is None:
+        return LogInfo(msg="ros2 bag is not installed here: nothing is recorded beside the scans")
+    topics = ["-e", f"^/{namespace}/.*|^/diagnostics$|^/tf_static$"] if namespace else ["-a"]
+    folder = time.strftime("session-%Y%m%d-%H%M%S") + (f"-{namespace}" if namespace else "")
+    return ExecuteProcess(
+        cmd=["ros2", "bag", "record", "-s", "mcap", "-o", folder, *topics], output="screen"
+    )

@@ -39,14 +39,17 @@ class NodeProcesses:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def start(self, node: str, parameters: Mapping[str, object] | None = None) -> None:
+    def start(
+        self, node: str, parameters: Mapping[str, object] | None = None, niceness: int = 0
+    ) -> None:
         """Start ``python -m tactile_resonance.nodes.<node>`` with parameters of its own.
 
         The node is told to end should this process die, and does not hear the terminal's Ctrl-C: this
         process ends it in order.
         """
         module = f"tactile_resonance.nodes.{node}"
-        command = [*self._prefix, sys.executable, "-m", module, "--ros-args"]
+        nice = ["nice", "-n", str(niceness)] if niceness else []
+        command = [*nice, *self._prefix, sys.executable, "-m", module, "--ros-args"]
         for name, value in (parameters or {}).items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-p", f"{name}:={text}"]
@@ -65,12 +68,13 @@ class NodeProcesses:
         self,
         nodes: Sequence[str],
         parameters: Mapping[str, Mapping[str, object]] | None = None,
+        niceness: Mapping[str, int] | None = None,
     ) -> None:
         """Start nodes and the manager that configures and activates them in this order."""
         given = dict(parameters or {})
         given["manager_node"] = {"nodes": f"[{','.join(nodes)}]"}
         for node in (*nodes, "manager_node"):
-            self.start(node, given.get(node))
+            self.start(node, given.get(node), (niceness or {}).get(node, 0))
 
     def kill(self, *nodes: str) -> None:
         """End nodes as a crash would, with SIGKILL, all before the first is waited for."""

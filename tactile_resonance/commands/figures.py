@@ -48,12 +48,14 @@ def _simulation(output: Path) -> None:
     from tactile_resonance.configuration import share_path
     from tactile_resonance.report import simulation_figures
     from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.scan.scene import read_scan_scene
     from tactile_resonance.simulation.bench import SimulatedBench
     from tactile_resonance.simulation.library import read_tissues
     from tactile_resonance.simulation.scene import read_scene
 
     bench, library = SimulatedBench.from_configuration(), read_tissues()
-    scene = read_scene(library, share_path("config/scenes/inclusion.yaml"))
+    path = share_path("config/scenes/inclusion.yaml")
+    scene, positions_m = read_scene(library, path), read_scan_scene(path).positions_m
     gels = ("gel10", "gel12", "gel14", "gel16")
     organs = ("cortex", "white", "liver")
     figures = {
@@ -61,7 +63,7 @@ def _simulation(output: Path) -> None:
         "indentation": simulation_figures.draw_indentation(
             bench, library, ("gel10", "cortex", "liver")
         ),
-        "scene": simulation_figures.draw_scene(bench, scene),
+        "scene": simulation_figures.draw_scene(bench, scene, positions_m[:, :2]),
         "creep": simulation_figures.draw_creep(bench, library, ("gel10", "cortex", "liver")),
     }
     for name, figure in figures.items():

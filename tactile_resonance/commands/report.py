@@ -29,17 +29,23 @@ def run(options: argparse.Namespace) -> int:
     except ImportError as error:
         raise ValueError(f"report: {error.name} not found; pip install rosbags") from error
     from tactile_resonance.report.drawing import figure_bytes
+    from tactile_resonance.report.point_table import point_table, table_notes
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import as_page, pole_map_of, skipped_lines, summary
+    from tactile_resonance.scan.bench_truth import truths_of
 
     content = read_run(options.run_folder)
+    truths = truths_of(content)
     pole_map = pole_map_of(content)
     picture = None
     if pole_map.points:
         title = f"Pole map, {options.run_folder.resolve().name}"
         picture = figure_bytes(draw_pole_map(pole_map, title), ".png")
         write_whole(options.run_folder / "pole_map.png", picture)
-    write_whole(options.run_folder / "report.html", as_page(content, picture).encode())
+    write_whole(options.run_folder / "report.html", as_page(content, picture, truths).encode())
+    if content.latest:
+        print(point_table(content.latest, truths))
+        print("\n".join(table_notes(content.latest, truths)))
     for line in (*summary(content), *(f"left out: {line}" for line in skipped_lines(content))):
         print(line)
     for problem in content.problems:

@@ -10,6 +10,7 @@ import numpy as np
 
 BATCHES = 8
 LEAST_SAMPLES = 4 * BATCHES
+STREAM_GAP_NS = 500_000_000  # a source that tells no more often tells changes only
 
 
 class ForceHistory:
@@ -56,6 +57,13 @@ class ForceHistory:
             return float(forces.mean()), float("nan")
         means = np.array([batch.mean() for batch in np.array_split(forces, BATCHES)])
         return float(forces.mean()), float(means.std(ddof=1) / np.sqrt(BATCHES))
+
+    @property
+    def streams(self) -> bool:
+        """Whether forces come again and again: then one that is not there is late, not unchanged."""
+        with self._lock:
+            newest = list(self._samples)[-2:]
+        return len(newest) == 2 and newest[1][0] - newest[0][0] < STREAM_GAP_NS
 
     def newest(self) -> tuple[int, float]:
         """Time [ns] and force [N] heard last; 0 and NaN before the first."""

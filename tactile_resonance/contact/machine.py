@@ -476,6 +476,7 @@ class ContactController:
             stiffness_n_per_m=estimate.stiffness_n_per_m if estimate is not None else None,
             surface_m=estimate.surface_m if estimate is not None else None,
             told_m=self._told_m,
+            surface_std_m=estimate.depth_std_m if estimate is not None else None,
             contact_s=(now_ns - self._contact_ns) * 1e-9 if estimate is not None else None,
             total_s=(now_ns - self._start_ns) * 1e-9,
             peak_force_n=self._observer.watch.peak_n,

@@ -67,8 +67,9 @@ class ContactResult:
         Past the first touch when reached [m].
     stiffness_n_per_m : float or None
         When reached [N/m], the beam included.
-    surface_m : float or None
-        Height of the first touch above the expected one [m].
+    surface_m, surface_std_m : float or None
+        Height of the first touch above the expected one, and its standard deviation from the force's
+        noise [m].
     told_m : float or None
         Height at which another sensor told the touch, on the same scale [m]; None where none did.
     contact_s : float or None
@@ -89,6 +90,7 @@ class ContactResult:
     depth_m: float | None
     stiffness_n_per_m: float | None
     surface_m: float | None
+    surface_std_m: float | None
     contact_s: float | None
     total_s: float
     peak_force_n: float

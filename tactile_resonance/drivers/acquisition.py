@@ -104,6 +104,10 @@ class AcquisitionDevice(Protocol):
         """The next period. No block is skipped: a device that lost one raises."""
         ...
 
+    def interrupt(self) -> None:
+        """Let a `read_block` that waits raise soon, where that can be done; from any thread."""
+        ...
+
     def stop(self) -> None:
         """Output to zero, inputs off; harmless when nothing plays."""
         ...

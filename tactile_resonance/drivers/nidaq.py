@@ -163,6 +163,9 @@ class NiDaqDevice:
             except DeviceError as error:
                 raise self._stopped_after(error) from error
 
+    def interrupt(self) -> None:
+        """Nothing: the library's call ends with its block."""
+
     def read_block(self, timeout_s: float) -> Block:
         """The next period, whole; on any error the output is set to 0 V first."""
         task, output, excitation = self._input, self._output, self._armed

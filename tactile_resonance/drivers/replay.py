@@ -178,6 +178,10 @@ class ReplayDevice:
         self._start_ns = time.time_ns()
         self._stopped.clear()
 
+    def interrupt(self) -> None:
+        """End the wait for a block."""
+        self._stopped.set()
+
     def read_block(self, timeout_s: float) -> Block:
         """The next block, when its last sample would have been taken; a gap is an error."""
         excitation = self._armed

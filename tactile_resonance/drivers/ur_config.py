@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import ipaddress
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,14 @@ import numpy as np
 import yaml
 
 from tactile_resonance.contact.samples import Pose
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether an address can be none but this machine's; a name may be anybody's."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _no_offset() -> Pose:
@@ -36,7 +45,8 @@ class UrArmConfig:
     rate_hz : float
         Of the robot's states; 500 is what an e-series sends.
     watchdog_hz : float
-        The robot stops by itself where commands come less often; at least 25.
+        The robot stops by itself where commands come less often; at least 25, for a simulated robot
+        (127.x.y.z) at least 5.
     max_state_age_s : float
         An older state is refused as stale.
     owner_timeout_s : float
@@ -72,7 +82,7 @@ class UrArmConfig:
             raise ValueError(f"host: {self.host!r}, expected a name or an address")
         for name, low, high in (
             ("rate_hz", 25.0, 500.0),
-            ("watchdog_hz", 25.0, 125.0),
+            ("watchdog_hz", 5.0 if _is_loopback(self.host) else 25.0, 125.0),
             ("max_state_age_s", 0.004, 1.0),
             ("owner_timeout_s", 0.005, 1.0),
             ("connect_timeout_s", 1.0, 120.0),

@@ -31,7 +31,8 @@ class BenchDevice:
         self._frame_id = frame_id
         self._play_client = node.create_client(Play, "bench/play")
         self._stop_client = node.create_client(Trigger, "bench/stop")
-        self._blocks: queue.SimpleQueue[msg.Record] = queue.SimpleQueue()
+        self._blocks: queue.SimpleQueue[msg.Record | None] = queue.SimpleQueue()  # None: wake up
+        self._interrupted = False
         self._armed: Excitation | None = None
         self._next_index = 0
         node.create_subscription(msg.Record, "bench/block", self._blocks.put, RESULTS)
@@ -61,6 +62,7 @@ class BenchDevice:
         """Remember what to play: the bench loads nothing beforehand."""
         self._armed = excitation
         self._next_index = 0
+        self._interrupted = False
 
     def play(self) -> None:
         """Ask the bench to play."""
@@ -73,6 +75,11 @@ class BenchDevice:
         if not answer.accepted:
             raise DeviceError(f"device: the bench refuses: {answer.message}")
 
+    def interrupt(self) -> None:
+        """End the wait for a block."""
+        self._interrupted = True
+        self._blocks.put(None)
+
     def read_block(self, timeout_s: float) -> Block:
         """Next block of what is armed; blocks of what was stopped before are passed over."""
         deadline = time.monotonic() + timeout_s
@@ -81,6 +88,10 @@ class BenchDevice:
                 message = self._blocks.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 raise DeviceError(f"device: no block within {timeout_s:g} s") from None
+            if self._interrupted:
+                raise DeviceError("device: interrupted")
+            if message is None:
+                continue
             # blocks of an excitation that was stopped may still be under way
             if self._armed and message.excitation_id == self._armed.excitation_id:
                 break

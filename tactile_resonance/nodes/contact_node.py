@@ -376,7 +376,8 @@ def _result_message(result: ContactResult) -> MakeContact.Result:
         reached=result.reached, cause=result.cause.value, message=result.message
     )
     for name in (
-        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m", "surface_m"),
+        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m"),
+        *("surface_m", "surface_std_m"),
         *("contact_s", "total_s", "peak_force_n"),
     ):
         value = getattr(result, name)

@@ -18,26 +18,26 @@ from geometry_msgs.msg import PoseStamped
 from tactile_resonance import msg, srv
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.result import Poles, PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.result import Poles
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.from_messages import (
     BETWEEN_SAMPLES,
     GRIDS,
     INPUT_KINDS,
+    POLES_STATUS,
     array_of,
     contact_from_message,  # noqa: F401 - for those who convert both ways
     excitation_from_message,  # noqa: F401 - for those who convert both ways
     key_of,
     origin_from_message,
+    poles_from_message,  # noqa: F401 - for those who convert both ways
     record_from_message,  # noqa: F401 - for those who convert both ways
     time_from_message,  # noqa: F401 - for those who convert both ways
 )
 from tactile_resonance.simulation.truth import Truth
 
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
-POLES_STATUS = {status: getattr(msg.Poles, f"STATUS_{status.name}") for status in PolesStatus}
 
 COVARIANCE_ARRAYS = ("sensor_variance", "actuator_variance", "covariance_real", "covariance_imag")
 FRF_ARRAYS = (
@@ -196,37 +196,6 @@ def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
         if covariance is not None:
             _fill(getattr(message, name), covariance, float)
     return message
-
-
-def poles_from_message(message: msg.Poles) -> tuple[Poles, Origin]:
-    """Poles of a message, and what they belong to; the fitted model itself does not travel."""
-    real = array_of(message.real_rad_s)
-    n = real.size
-
-    def blocks(values: array.array) -> npt.NDArray[np.float64] | None:
-        return array_of(values).reshape(n, 2, 2) if len(values) else None
-
-    structure = ModelStructure()
-    if message.order:
-        structure = ModelStructure(message.order, message.numerator_order)
-    poles = Poles(
-        poles_rad_s=real + 1j * array_of(message.imag_rad_s),
-        f0_hz=array_of(message.f0_hz),
-        damping_ratio=array_of(message.damping_ratio),
-        residues=array_of(message.residue_real) + 1j * array_of(message.residue_imag),
-        covariance=blocks(message.covariance),
-        total_covariance=blocks(message.total_covariance),
-        structure=structure,
-        band_hz=(message.band_low_hz, message.band_high_hz),
-        lines=message.lines,
-        cost=message.cost,
-        expected_cost=message.expected_cost,
-        condition_number=message.condition_number,
-        method=message.method,
-        status=key_of(POLES_STATUS, message.status, "status"),
-        message=message.message,
-    )
-    return poles, origin_from_message(message)
 
 
 def truth_to_response(truth: Truth, response: srv.Truth.Response) -> None:

@@ -74,6 +74,8 @@ class ExcitationNode(ManagedNode):
         self._pose = PoseStamped()
         self._forces = ForceHistory()
         self._busy = threading.Lock()
+        self._cancelled = threading.Event()
+        self._measured: ServerGoalHandle | None = None
         self._measurements = 0
         self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.listen(WrenchStamped, "wrench", self._on_wrench, SERIES)
@@ -83,13 +85,20 @@ class ExcitationNode(ManagedNode):
             "measure",
             self._on_goal,
             goal_callback=self._on_request,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
             result_timeout=RESULT_TIMEOUT_S,
         )
         self.resources.callback(server.destroy)
 
     def _on_request(self, _: Measure.Goal) -> GoalResponse:
         return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
+
+    def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+        """At once where the device can, for a block under way is of no use to anybody."""
+        if goal is self._measured:
+            self._cancelled.set()
+            self._device.interrupt()
+        return CancelResponse.ACCEPT
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._pose = message
@@ -112,6 +121,8 @@ class ExcitationNode(ManagedNode):
             result.outcome = Measure.Result.NOT_READY
             result.message = "a measurement is running, cancel it or wait for its result"
             return result
+        self._cancelled.clear()
+        self._measured = goal
         try:
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
@@ -196,7 +207,12 @@ class ExcitationNode(ManagedNode):
             self._device.arm(excitation)
             self._device.play()
             for _ in range(excitation.periods):
-                block = self._device.read_block(timeout_s)
+                try:
+                    block = self._device.read_block(timeout_s)
+                except DeviceError as error:
+                    if self._cancelled.is_set():
+                        raise Cancelled from error
+                    raise
                 record = self._record(block, excitation, info)
                 if store is not None:
                     store.add_record(record)
@@ -205,7 +221,7 @@ class ExcitationNode(ManagedNode):
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
                 )
-                if goal.is_cancel_requested:
+                if self._cancelled.is_set() or goal.is_cancel_requested:
                     raise Cancelled
                 if not self.active:
                     raise DeviceError("device: stopped, the node was deactivated")
@@ -239,9 +255,14 @@ class ExcitationNode(ManagedNode):
         )
 
     def _contact(self, start_ns: int, length_s: float) -> Contact:
-        """Force while the block was taken; where none was heard then, the last one, of unknown accuracy."""
+        """Force while the block was taken.
+
+        Where none was heard then: the last one, of unknown accuracy, from a source that tells changes
+        only; unknown from one that streams, for its forces are late and the last may be from before the
+        contact.
+        """
         force_n, std_n = self._forces.mean(start_ns, start_ns + round(length_s * 1e9))
-        if np.isnan(force_n):
+        if np.isnan(force_n) and not self._forces.streams:
             force_n = self._forces.newest()[1]
         return contact_from_message(self._pose, force_n, std_n)
 

@@ -24,6 +24,7 @@ from tactile_resonance.nodes.conversions import (
     pose_to_message,
     record_to_message,
     time_from_message,
+    time_message,
     truth_to_response,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -131,7 +132,8 @@ class FakeHardwareNode(ManagedNode):
     Without a robot the tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there
     is tissue; the force comes back on `wrench`. With one the tip is where the robot holds it, and the
     contact that of the plant as an excitation begins: its force held from then on, the tissue creeping.
-    What the simulation knows of the poles is on `bench/truth` (latched, all modes).
+    What the simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it
+    is put somewhere or an excitation begins; of a contact that creeps also with each block.
     """
 
     def __init__(self) -> None:
@@ -165,6 +167,11 @@ class FakeHardwareNode(ManagedNode):
         self.serve(Trigger, "bench/stop", self._on_stop)
         self.serve(Truth, "bench/get_truth", self._on_truth)
         self._said_lines = 0
+        self._stalls = 0
+
+    def details(self) -> dict[str, str]:
+        """How often the simulated robot stood still, as of the last measurement."""
+        return {"simulator stalls": str(self._stalls)} if getattr(self, "_stalls", 0) else {}
 
     def deactivate(self) -> None:
         """Silence the output."""
@@ -182,10 +189,9 @@ class FakeHardwareNode(ManagedNode):
         wrench.header.frame_id = self._frame_id
         wrench.wrench.force.z = self._tip.force_n
         self._wrench.publish(wrench)
-        self._publish_truth(message)
+        self._publish_truth(message, self._tip)
 
-    def _publish_truth(self, pose: PoseStamped) -> None:
-        tip = self._tip
+    def _publish_truth(self, pose: PoseStamped, tip: Tip, measurement_id: int = 0) -> None:
         modes = truth_of(tip.coupled(self._bench), ()).modes
         truth = Poles(
             poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
@@ -197,6 +203,7 @@ class FakeHardwareNode(ManagedNode):
             message="exact poles of the simulated sensor on this tissue",
         )
         origin = Origin(
+            measurement_id=measurement_id,
             time_ns=time_from_message(pose.header.stamp),
             final=True,
             frame_id=self._frame_id,
@@ -218,12 +225,14 @@ class FakeHardwareNode(ManagedNode):
             true = self._plant.truth()
         except OSError as error:
             raise ValueError(f"the simulated robot does not answer: {error}") from error
+        self._stalls = true.stalls
         touching = true.force_n > 0
         tissue = self._laid.tissue_at(true.tip_m) if touching else None
         self._tip = Tip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
         x, y, z = true.tip_m.tolist()
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=time.time_ns())
-        self._publish_truth(pose_to_message(place))
+        self._pose = pose_to_message(place)
+        self._publish_truth(self._pose, self._tip)
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         if not self.active:
@@ -257,7 +266,10 @@ class FakeHardwareNode(ManagedNode):
         self._silence()
         self._stop = threading.Event()
         self._playing = threading.Thread(
-            target=self._play, args=(run, excitation, self._stop), name="bench", daemon=True
+            target=self._play,
+            args=(run, excitation, self._stop, self._pose, self._tip),
+            name="bench",
+            daemon=True,
         )
         self._playing.start()
         response.accepted = True
@@ -302,8 +314,19 @@ class FakeHardwareNode(ManagedNode):
             self._playing.join()
             self._playing = None
 
-    def _play(self, run: BenchRun, excitation: Excitation, stop: threading.Event) -> None:
-        """Publish block after block, each when its last sample would have been taken."""
+    def _play(
+        self,
+        run: BenchRun,
+        excitation: Excitation,
+        stop: threading.Event,
+        pose: PoseStamped,
+        tip: Tip,
+    ) -> None:
+        """Publish block after block, each when its last sample would have been taken.
+
+        A contact that creeps has its truth with every block: that of the middle of all blocks so far, with
+        the stamp that their poles will have.
+        """
         (speed,) = values(self, "speed")
         start_ns = time.time_ns()
         for block in run.play(excitation, excitation.periods):
@@ -312,6 +335,11 @@ class FakeHardwareNode(ManagedNode):
                 stop.wait(max(0, due_ns - time.time_ns()) / 1e9)
             if stop.is_set():
                 return
+            if tip.creeping:
+                half_s = (block.index + 1) * excitation.period_s / 2
+                middle = replace(tip, since_s=tip.since_s + half_s)
+                pose.header.stamp = time_message(start_ns + round(half_s * 1e9))
+                self._publish_truth(pose, middle, excitation.measurement_id)
             first_ns = start_ns + round(block.start_time_s * 1e9)
             self._blocks.publish(record_to_message(self._record(block, excitation, first_ns)))
             if speed == 0:

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.processes import end_with_parent, may_take_priority
-from tactile_resonance.simulation.plant_defaults import READY
+from tactile_resonance.simulation.plant_defaults import PRIORITY, READY
 from tactile_resonance.simulation.robot.control_port import order
 
 START_WITHIN_S = 30.0
 END_WITHIN_S = 3.0
-PRIORITY = 20  # of the simulated controller, as a real one has hardware of its own
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,14 @@ class TrueContact:
         Along the normal; 0 out of contact.
     since_s : float
         How long the contact has lasted.
+    stalls : int
+        How often the simulation has stood still for more than 10 ms.
     """
 
     tip_m: NDArray[np.float64]
     force_n: float
     since_s: float
+    stalls: int
 
 
 class PlantChild:
@@ -107,7 +109,10 @@ class PlantChild:
         """
         answer = order(self._host, "truth", timeout_s=1.0)
         return TrueContact(
-            np.array(answer["tip_m"]), float(answer["normal_force_n"]), float(answer["contact_s"])
+            np.array(answer["tip_m"]),
+            float(answer["normal_force_n"]),
+            float(answer["contact_s"]),
+            int(answer["stalls"]),
         )
 
     def close(self) -> None:

@@ -30,6 +30,7 @@ class ScanClient(NodeClient):
     def __init__(self, check: Callable[[], None]) -> None:
         super().__init__("scan_client", check)
         self.states: dict[str, str] = {}
+        self._details: dict[str, dict[str, str]] = {}
 
     def join(self) -> None:
         """Client of the action, reader of the diagnostics."""
@@ -40,6 +41,10 @@ class ScanClient(NodeClient):
         """What the diagnostics say of each node."""
         told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
         return told or "no diagnostics"
+
+    def details(self, node: str) -> dict[str, str]:
+        """Figures of a node's diagnostics, as heard last."""
+        return self._details.get(node, {})
 
     def wait_until_up(self, timeout_s: float) -> None:
         """Until the manager tells that all nodes are active.
@@ -85,7 +90,10 @@ class ScanClient(NodeClient):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            if str(Path(status.name).parent) != self._node.get_namespace():
+                continue  # of another sensor
             name = Path(status.name).name
+            self._details[name] = {value.key: value.value for value in status.values}
             # why a node does not come up is told for seconds, that it does not for longer
             refused = self.states.get(name, "").startswith(f"{status.message}: ")
             if status.level == DiagnosticStatus.ERROR or not refused:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
@@ -28,6 +29,7 @@ from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.record import Contact
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.runner import (
+    ATTEMPTS,
     Check,
     Interrupted,
     Measured,
@@ -38,6 +40,7 @@ from tactile_resonance.scan.runner import (
 )
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.surface_search import Touch
 
 POLL_S = 0.005
 # A node that was started anew needs so long at most until it takes goals again.
@@ -50,7 +53,7 @@ STATE_WITHIN_S = 1.0
 STATE_STALE_S = 2.0
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
-# What says nothing of the point: the contact is tried again.
+# What says nothing of the point: it comes again.
 DEVICE_CAUSES = frozenset(
     cause.value
     for cause in (
@@ -58,8 +61,9 @@ DEVICE_CAUSES = frozenset(
         *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
     )
 )
-ATTEMPTS = 3
 PLACE_FOR_S = 0.2
+# Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
+LEAST_TOUCH_STD_M = 2e-5
 
 
 class NodeRenewed(PointDisturbed):
@@ -118,23 +122,32 @@ class NodeHands:
             return
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
-        self._touching = True
-        for attempt in range(1, ATTEMPTS + 1):
-            watch = PublisherWatch(self._node, ("contact_state",))
-            handle = self._send(self._contact, goal, "make_contact", check)
-            result = self._follow(self._contact, handle, "contact_node", check, watch)
-            if result.reached:
-                break
-            if result.cause not in DEVICE_CAUSES or attempt == ATTEMPTS:
-                raise PointFailed(f"contact: {result.cause}: {result.message}")
-            self.retract()
-            self._touching = True
+        self._make_contact(goal, check)
         deadline = time.monotonic() + STATE_WITHIN_S
         while self._state is None or self._state.state != msg.ContactState.STATE_HOLD:
             if time.monotonic() > deadline:
                 self._check_contact()
             check()
             time.sleep(POLL_S)
+
+    def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
+        """Touch a point of the surface as it is expected and draw back; tell where the ball met it."""
+        if self._contact is None:
+            raise ScanEnded("surface.touch: nobody moves the tip (parameter contact is none)")
+        for left in reversed(range(ATTEMPTS)):
+            goal = MakeContact.Goal(pose=self._pose_of(point), force_n=force_n)
+            try:
+                result = self._make_contact(goal, check)
+            except PointDisturbed:
+                if not left:
+                    raise
+                continue
+            finally:
+                self.retract()
+            break
+        way = np.array(point.normal) * (ball_radius_m + result.surface_m)
+        x, y, z = (point.position_m + way).tolist()
+        return Touch((x, y, z), max(result.surface_std_m, LEAST_TOUCH_STD_M), result.force_n)
 
     def measure(
         self,
@@ -187,7 +200,7 @@ class NodeHands:
                     break
                 time.sleep(NOT_READY_POLL_S)
             if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
-                raise PointDisturbed(f"measurement: {result.message}")
+                raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
             self._wait_for_results(result, watch, check)
             take_poles()
         finally:
@@ -246,10 +259,10 @@ class NodeHands:
             return
         silent_s = time.monotonic() - self._state_s
         if silent_s > STATE_STALE_S:
-            raise PointDisturbed(f"contact_node: nothing heard of it for {silent_s:.1f} s")
+            text = f"contact_node: nothing heard of it for {silent_s:.1f} s"
+            raise PointDisturbed(text, "contact_node silent")
         if state.state != state.STATE_HOLD:
-            kind = PointDisturbed if state.cause in DEVICE_CAUSES else PointFailed
-            raise kind(f"contact: {state.cause}: {state.message}")
+            raise _contact_failure(state)
 
     def _on_state(self, message: msg.ContactState) -> None:
         self._state, self._state_s = message, time.monotonic()
@@ -285,7 +298,8 @@ class NodeHands:
             if time.monotonic() > deadline or watch.renewed():
                 raise PointDisturbed(
                     f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
-                    "came"
+                    "came",
+                    "messages lost",
                 )
             check()
             time.sleep(POLL_S)
@@ -316,9 +330,10 @@ class NodeHands:
         try:
             while not future.done():
                 if not client.server_is_ready():
-                    raise PointDisturbed(f"{node} went away")
+                    raise PointDisturbed(f"{node} went away", f"{node} went away")
                 if topic := watch.renewed():
-                    raise NodeRenewed(f"{topic}: who publishes it was started anew")
+                    text = f"{topic}: who publishes it was started anew"
+                    raise NodeRenewed(text, "node started anew")
                 check()
                 each_poll()
                 time.sleep(POLL_S)
@@ -329,9 +344,28 @@ class NodeHands:
             raise
         return future.result().result
 
+    def _make_contact(self, goal: MakeContact.Goal, check: Check) -> MakeContact.Result:
+        """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
+        assert self._contact is not None
+        self._touching = True
+        watch = PublisherWatch(self._node, ("contact_state",))
+        handle = self._send(self._contact, goal, "make_contact", check)
+        result = self._follow(self._contact, handle, "contact_node", check, watch)
+        if not result.reached:
+            raise _contact_failure(result)
+        return result
+
     @staticmethod
     def _done(future: Future, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
         while not future.done() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         return future.done()
+
+
+def _contact_failure(told: MakeContact.Result | msg.ContactState) -> PointFailed:
+    """What a contact that was not reached, or that ended, means for the point."""
+    text = f"contact: {told.cause}: {told.message}"
+    if told.cause in DEVICE_CAUSES:
+        return PointDisturbed(text, told.cause)
+    return PointFailed(text)

@@ -7,6 +7,7 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,26 @@ from tactile_resonance.nodes.running import run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.scan.facts import run_facts
-from tactile_resonance.scan.plan import Plan, make_plan
+from tactile_resonance.scan.measurement import design_measurement
+from tactile_resonance.scan.notes import parse_notes
+from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
-from tactile_resonance.scan.runner import Controls, Progress, Request, ScanRunner, Summary
+from tactile_resonance.scan.runner import (
+    Controls,
+    Interrupted,
+    PointFailed,
+    Progress,
+    Request,
+    ScanEnded,
+    ScanRunner,
+    Summary,
+)
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
+from tactile_resonance.scan.surface import TouchRequest
+from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
+from tactile_resonance.simulation.parameters import read_sensor
 
 PARAMETERS = (
     Parameter(
@@ -140,35 +156,32 @@ class ScanNode(ManagedNode):
         if not self._busy.acquire(blocking=False):
             result.message = "a scan is running, cancel it or wait for its result"
             return result
+        self._controls, tell = Controls(), self._tell_of(goal)
         try:
-            scene, plan, run, seed = self._prepare(goal.request)
-        except (ValueError, OSError) as error:
-            self._busy.release()
-            result.message = str(error)
-            self.health.error(f"refused: {error}")
-            return result
-        self._controls = Controls()
-        result.run_directory, result.points = str(run.path), len(plan.points)
-        self.get_logger().info(f"run goes to {run.path}")
-        try:
+            scene, plan, run, seed = self._prepare(goal.request, tell)
+            result.run_directory, result.points = str(run.path), len(plan.points)
+            result.outcome = Scan.Result.ENDED
+            self.get_logger().info(f"run goes to {run.path}")
             with run:
-                runner = ScanRunner(
-                    scene, plan, run, self._hands, self._controls, self._tell_of(goal), seed
-                )
+                runner = ScanRunner(scene, plan, run, self._hands, self._controls, tell, seed)
                 _fill(result, runner.run())
+        except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
+            result.message = str(error) or "cancelled before the first point"
+            self.health.error(result.message)
         finally:
             self._controls = self._progress = None
             self._busy.release()
         return result
 
-    def _prepare(self, request: Scan.Goal) -> tuple[ScanScene, Plan, RunDirectory, int]:
+    def _prepare(
+        self, request: Scan.Goal, tell: Callable[[Progress], None]
+    ) -> tuple[ScanScene, Plan, RunDirectory, int]:
         """Scene, plan and the open run of a goal; ValueError where it is refused."""
         if request.resume:
             run = RunDirectory.open(Path(request.run_directory).expanduser())
             try:
                 scene = read_scan_scene(run.path / "scene.yaml")
-                points = run.content.points
-                plan = replace(make_plan(_with_points(scene, points)), points=points)
+                plan = plan_points(scene, run.content.points)
                 return scene, plan, run, int(run.content.facts["seed"])
             except BaseException:
                 run.close()
@@ -177,26 +190,48 @@ class ScanNode(ManagedNode):
             raise ValueError("scene: empty, expected a scene file")
         path = Path(request.scene).expanduser()
         path = path if path.is_absolute() else share_path(request.scene)
-        scene = read_scan_scene(path)
-        plan = make_plan(scene)
-        if request.poses.poses:
-            plan = replace(plan, points=_points_of(request.poses, scene))
+        scene, text = read_scan_scene(path), path.read_text(encoding="utf-8")
+        if request.notes:
+            scene = replace(scene, notes=parse_notes(request.notes, "notes"))
         (seed,) = values(self, "seed")
         seed = request.seed or seed
-        design = plan.measurement
-        run = RunDirectory.create(
-            self._run_path(request.run_directory),
-            path.read_text(encoding="utf-8"),
-            plan.points,
-            self._facts(scene, plan, seed),
-            expected_bytes(
-                len(plan.points),
-                design.periods * design.realisations,
-                round(50e3 * design.block_s),
-                design.lines,
-            ),
-        )
+        where = self._run_path(request.run_directory)
+        design = design_measurement(scene)
+        blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
+        points = max(len(scene.positions_m), len(request.poses.poses))
+        needed = expected_bytes(points, blocks, samples, design.lines)
+        RunDirectory.check_new(where, needed)
+        found: FoundSurface | None = None
+        if request.poses.poses:
+            plan = plan_points(scene, _points_of(request.poses, scene))
+        elif isinstance(scene.surface, TouchRequest):
+            found = self._find_surface(scene, scene.surface, tell)
+            plan = make_plan(scene, found.surface)
+        else:
+            plan = make_plan(scene)
+        facts = self._facts(scene, plan, seed)
+        if found is not None:
+            facts["surface"] = found.as_json()
+        run = RunDirectory.create(where, text, plan.points, facts, needed)
         return scene, plan, run, seed
+
+    def _find_surface(
+        self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
+    ) -> FoundSurface:
+        """Touch it; ValueError, PointFailed or ScanEnded where it is not found."""
+        controls = self._controls
+        assert controls is not None
+        radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
+
+        def touch(point: ScanPoint) -> Touch:
+            tell(Progress(point, "surface", point.index, len(asked.xy_m)))
+            try:
+                return self._hands.find(point, asked.force_n, radius_m, controls.check)
+            except PointFailed as error:
+                raise PointFailed(f"surface.touch: touch {point.index + 1}: {error}") from error
+
+        self._hands.retract()
+        return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
 
     def _run_path(self, given: str) -> Path:
         if given:
@@ -217,7 +252,8 @@ class ScanNode(ManagedNode):
         names = ("contact", "table_in_base", "base_frame")
         own = dict(zip(names, values(self, *names), strict=True))
         own["table_in_base"] = list(own["table_in_base"])
-        return run_facts(plan, seed, {"name": scene.name, "scan_node": own})
+        notes = scene.notes.as_json()
+        return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
         last = [("", -math.inf)]
@@ -258,11 +294,6 @@ def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
     return tuple(points)
 
 
-def _with_points(scene: ScanScene, points: tuple[ScanPoint, ...]) -> ScanScene:
-    """The scene with the places of a run's plan, which may have been given as poses."""
-    return replace(scene, positions_m=np.array([point.position_m for point in points]))
-
-
 def _feedback(progress: Progress) -> Scan.Feedback:
     feedback = Scan.Feedback(
         point=progress.point.index if progress.point else progress.finished,
@@ -271,6 +302,7 @@ def _feedback(progress: Progress) -> Scan.Feedback:
         phase=progress.phase,
         blocks=progress.blocks,
         time_left_s=float(progress.time_left_s),
+        repeats=progress.repeats,
     )
     nan = math.nan
     feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
@@ -292,8 +324,19 @@ def _feedback(progress: Progress) -> Scan.Feedback:
 
 def _fill(result: Scan.Result, summary: Summary) -> None:
     result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
-    for name in ("message", "done", "failed", "skipped", "blocks", "blocks_saved", "saved_s"):
+    for name in (
+        "message",
+        "done",
+        "failed",
+        "skipped",
+        "blocks",
+        "blocks_saved",
+        "saved_s",
+        "repeats",
+    ):
         setattr(result, name, getattr(summary, name))
+    result.sensor_drifted = summary.health is SensorHealth.DRIFTED
+    result.sensor_health = summary.health_sentence
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES
+from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, RESULTS, SERIES
 from tactile_resonance.scan.runner import Recording
 
 
@@ -40,6 +40,7 @@ TOPICS = {
     "record": Recorded(msg.Record, RESULTS, measured=True, counted=True),
     "frf": Recorded(msg.FRF, RESULTS, measured=True, counted=True),
     "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True),
+    "bench/truth": Recorded(msg.Poles, LATCHED, latched=True, measured=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
     "contact_state": Recorded(msg.ContactState, SERIES),

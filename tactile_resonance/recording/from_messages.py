@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitations and records of messages, of ROS and of any reader of its recordings alike.
+"""Excitations, records and poles of messages, of ROS and of any reader of its recordings alike.
 
 A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays may be those of rclpy
 (`array.array`) or of numpy.
@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
@@ -22,6 +24,18 @@ from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 GRIDS = {Grid.CUSTOM: 0, Grid.FULL: 1, Grid.ODD: 2, Grid.ODD_RANDOM: 3}
 INPUT_KINDS = {InputKind.MEASURED: 0, InputKind.COMMANDED: 1}
 BETWEEN_SAMPLES = {BetweenSamples.BAND_LIMITED: 0, BetweenSamples.ZERO_ORDER_HOLD: 1}
+POLES_STATUS = {
+    PolesStatus.OK: 0,
+    PolesStatus.MODEL_ERROR: 1,
+    PolesStatus.NOT_CONVERGED: 2,
+    PolesStatus.TOO_FEW_LINES: 3,
+    PolesStatus.ILL_CONDITIONED: 4,
+    PolesStatus.UNSTABLE_POLE: 5,
+    PolesStatus.NO_COVARIANCE: 6,
+    PolesStatus.NO_RESONANCE: 7,
+    PolesStatus.FAILED: 8,
+    PolesStatus.TRUTH: 100,
+}
 
 E = TypeVar("E", bound=Enum)
 
@@ -86,6 +100,37 @@ def record_from_message(message: Any) -> Record:
         anti_alias_filter=message.anti_alias_filter,
         origin=origin_from_message(message),
     )
+
+
+def poles_from_message(message: Any) -> tuple[Poles, Origin]:
+    """Poles of a message, and what they belong to; the fitted model itself does not travel."""
+    real = array_of(message.real_rad_s)
+    n = real.size
+
+    def blocks(values: Any) -> npt.NDArray[np.float64] | None:
+        return array_of(values).reshape(n, 2, 2) if len(values) else None
+
+    structure = ModelStructure()
+    if message.order:
+        structure = ModelStructure(message.order, message.numerator_order)
+    poles = Poles(
+        poles_rad_s=real + 1j * array_of(message.imag_rad_s),
+        f0_hz=array_of(message.f0_hz),
+        damping_ratio=array_of(message.damping_ratio),
+        residues=array_of(message.residue_real) + 1j * array_of(message.residue_imag),
+        covariance=blocks(message.covariance),
+        total_covariance=blocks(message.total_covariance),
+        structure=structure,
+        band_hz=(message.band_low_hz, message.band_high_hz),
+        lines=message.lines,
+        cost=message.cost,
+        expected_cost=message.expected_cost,
+        condition_number=message.condition_number,
+        method=message.method,
+        status=key_of(POLES_STATUS, message.status, "status"),
+        message=message.message,
+    )
+    return poles, origin_from_message(message)
 
 
 def time_from_message(stamp: Any) -> int:

@@ -6,24 +6,31 @@ from __future__ import annotations
 import base64
 import html
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import yaml
 
 from tactile_resonance.report.drawing import SIMULATED
+from tactile_resonance.report.point_table import table_notes
+from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap, point_of_result
+from tactile_resonance.scan.references import SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import DriftLimits, read_scan_scene
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;
   padding: 0 1rem; color: #222 }
 img { max-width: 100% } table { border-collapse: collapse; font-size: 13px }
 td, th { border-bottom: 1px solid #ddd; padding: .2rem .6rem; text-align: right }
+.wide { overflow-x: auto } td { white-space: nowrap } th { vertical-align: bottom }
 td.text, th.text { text-align: left } tr.failed td { color: #b00 } .mark { color: #b00; font-weight: 600 }
 pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px }
 """
+Truths = Mapping[int, PointTruth]
 _COLUMNS = (
     ("point", lambda r: f"{r.index + 1}" + (f" (attempt {r.attempt + 1})" if r.attempt else "")),
     ("x [mm]", lambda r: _number(1e3 * r.x_m, 2)),
@@ -34,9 +41,19 @@ _COLUMNS = (
     ("damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
     ("tissue", lambda r: _tissue(r)),
+    ("begun again", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
     ("outcome", lambda r: _outcome(r)),
 )
-_TEXT = {"tissue", "outcome"}
+# Facts of the run that have a place of their own on the page.
+_SHOWN = {"skipped", "notes", "surface"}
+_AIR_COLUMNS = (
+    ("point", lambda r: f"{r.index + 1}"),
+    ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
+    ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
+    ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
+)
+_TRUTH_COLUMNS = ("true f0 [Hz]", "off by [std]", "true damping", "off by [std]")
+_TEXT = {"tissue", "begun again", "outcome"}
 
 
 def pole_map_of(run: RunContent) -> PoleMap:
@@ -48,8 +65,16 @@ def pole_map_of(run: RunContent) -> PoleMap:
     return pole_map
 
 
-def as_page(run: RunContent, picture: bytes | None) -> str:
-    """HTML with the picture (PNG) in it; nothing is fetched from elsewhere."""
+def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
+    """HTML with the picture (PNG) in it; nothing is fetched from elsewhere.
+
+    Parameters
+    ----------
+    run : RunContent
+    picture : bytes or None
+    truths : mapping of int to PointTruth
+        What the simulated bench knew, by point; empty for hardware.
+    """
     name = _scene_name(run)
     parts = [f"<h1>{html.escape(name)}</h1>"]
     if any(result.simulated for result in run.latest):
@@ -58,7 +83,20 @@ def as_page(run: RunContent, picture: bytes | None) -> str:
     if picture is not None:
         data = base64.b64encode(picture).decode()
         parts.append(f'<img alt="pole map" src="data:image/png;base64,{data}">')
+    health, sentence = sensor_health(run, _drift_limits(run))
+    css = "" if health is SensorHealth.STEADY else ' class="mark"'
+    parts += ["<h2>Sensor in free air</h2>", f"<p{css}>{html.escape(sentence)}</p>"]
+    notes = run.facts.get("notes") or {"notes": "none"}
+    parts += ["<h2>Notes of the session</h2><ul>"]
+    parts += [f"<li>{html.escape(f'{name}: {value}')}</li>" for name, value in notes.items()]
+    parts += ["</ul>"]
+    if "surface" in run.facts:
+        parts += ["<h2>Surface, found by touch</h2>", _touches(run.facts["surface"])]
     parts += ["<h2>Points</h2>", _table(run.latest)]
+    parts += [f"<p>{html.escape(line)}</p>" for line in table_notes(run.latest, truths)]
+    measured = [result for result in run.latest if result.outcome is Outcome.DONE]
+    parts += [f"<h2>Against free air{' and the truth of the simulation' if truths else ''}</h2>"]
+    parts += [_air_table(measured, truths)]
     skipped = run.facts.get("skipped", [])
     if skipped:
         parts += ["<h2>Left out</h2><ul>"]
@@ -69,7 +107,7 @@ def as_page(run: RunContent, picture: bytes | None) -> str:
         parts += [f"<li>{html.escape(problem)}</li>" for problem in run.problems]
         parts += ["</ul>"]
     parts += ["<h2>Scene</h2>", f"<pre>{html.escape(run.scene)}</pre>"]
-    facts = yaml.safe_dump({k: v for k, v in run.facts.items() if k != "skipped"}, sort_keys=False)
+    facts = yaml.safe_dump({k: v for k, v in run.facts.items() if k not in _SHOWN}, sort_keys=False)
     parts += ["<h2>Made with</h2>", f"<pre>{html.escape(facts)}</pre>"]
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
@@ -115,18 +153,68 @@ def skipped_lines(run: RunContent) -> list[str]:
     return lines
 
 
-def _table(results: Sequence[PointResult]) -> str:
-    def cell(kind: str, name: str, text: str) -> str:
-        css = ' class="text"' if name in _TEXT else ""
-        return f"<{kind}{css}>{html.escape(text)}</{kind}>"
+def _cell(kind: str, name: str, text: str) -> str:
+    css = ' class="text"' if name in _TEXT else ""
+    return f"<{kind}{css}>{html.escape(text)}</{kind}>"
 
-    rows = ["<tr>" + "".join(cell("th", name, name) for name, _ in _COLUMNS) + "</tr>"]
+
+def _table(results: Sequence[PointResult]) -> str:
+    rows = ["<tr>" + "".join(_cell("th", name, name) for name, _ in _COLUMNS) + "</tr>"]
     for result in results:
         css = "" if result.outcome is Outcome.DONE else ' class="failed"'
         rows.append(
-            f"<tr{css}>" + "".join(cell("td", n, show(result)) for n, show in _COLUMNS) + "</tr>"
+            f"<tr{css}>" + "".join(_cell("td", n, show(result)) for n, show in _COLUMNS) + "</tr>"
         )
-    return f"<table>{''.join(rows)}</table>"
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _air_table(results: Sequence[PointResult], truths: Truths) -> str:
+    names = [name for name, _ in _AIR_COLUMNS] + list(_TRUTH_COLUMNS if truths else ())
+    rows = ["<tr>" + "".join(_cell("th", name, name) for name in names) + "</tr>"]
+    for result in results:
+        texts = [show(result) for _, show in _AIR_COLUMNS] + _against_truth(result, truths)
+        rows.append("<tr>" + "".join(_cell("td", "", text) for text in texts) + "</tr>")
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _against_truth(result: PointResult, truths: Truths) -> list[str]:
+    if not truths:
+        return []
+    truth = truths.get(result.index)
+    if truth is None:
+        return ["-"] * len(_TRUTH_COLUMNS)
+    off = deviation(result, truth)
+    return [
+        _number(truth.estimate[0], 3),
+        f"{off[0]:+.1f}",
+        _number(truth.estimate[1], 5),
+        f"{off[1]:+.1f}",
+    ]
+
+
+def _touches(surface: Mapping[str, Any]) -> str:
+    """What the surface rests on."""
+    names = ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]")
+    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in names) + "</tr>"]
+    for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
+        x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
+        z += f" ± {1e3 * touch['std_m']:.2g}"
+        cells = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    told = {
+        True: "The touches lie on it as well as their noise allows.",
+        False: "The touches lie off it by more than their noise explains.",
+        None: "There was no touch to spare to check it.",
+    }[surface["consistent"]]
+    return f"<p>A {surface['form']}. {told}</p><table>{''.join(rows)}</table>"
+
+
+def _drift_limits(run: RunContent) -> DriftLimits:
+    """Limits of the run's scene."""
+    try:
+        return read_scan_scene(run.path / "scene.yaml").drift_limits
+    except ValueError:  # a run is reported whatever became of its scene
+        return DriftLimits()
 
 
 def _scene_name(run: RunContent) -> str:

@@ -152,9 +152,8 @@ def _approach(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatA
     return time, at_base, at_tip
 
 
-def draw_scene(bench: SimulatedBench, scene: PhantomScene) -> Figure:
-    """Truth over the surface of a scene with something buried in it."""
-    points = np.array(scene.scan_points_m)[:, :2]
+def draw_scene(bench: SimulatedBench, scene: PhantomScene, points: np.ndarray) -> Figure:
+    """Truth over the surface of a scene with something buried in it, about positions (n, 2) of a scan [m]."""
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = (np.linspace(a, b, 31) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x, y), axis=-1)  # (31, 31, 2)

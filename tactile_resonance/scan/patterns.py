@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to touch, seen from above: grid, spiral, list, region of interest."""
+"""Where to touch, seen from above: grid, spiral, list, the same about several centres, region of interest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from tactile_resonance.fields import known_keys, number, numbers, require, section
 
 FloatArray = npt.NDArray[np.float64]
-FORMS = ("grid", "spiral", "list", "region")
+FORMS = ("grid", "spiral", "list", "around", "region")
 ORDERS = ("serpentine", "raster")
 MOST_POINTS = 100_000
 
@@ -89,6 +89,12 @@ def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     if form == "list":
         return read_list(fields["list"], f"{where}.list")
     content, where = section(fields, form, where), f"{where}.{form}"
+    if form == "around":
+        known_keys(content, {"centres_m", "offsets_m"}, where)
+        centres, offsets = (
+            read_list(content.get(key), f"{where}.{key}") for key in ("centres_m", "offsets_m")
+        )
+        return (centres[:, None] + offsets).reshape(-1, 3)  # centre by centre
     if form == "spiral":
         known_keys(content, {"center_m", "radius_m", "spacing_m"}, where)
         center = numbers(content.get("center_m"), f"{where}.center_m", 2)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,10 +112,6 @@ def make_plan(
         )
         for index in range(len(where))
     )
-    shortest_s, longest_s = (
-        duration_s(points, blocks, measurement, timing)
-        for blocks in (scene.blocks.least, scene.blocks.most)
-    )
     each_s = timing.approach_s + timing.settle_s + timing.retract_s
     each_s += scene.blocks.most * measurement.realisations * measurement.block_s
     skipped = [
@@ -125,6 +122,23 @@ def make_plan(
         )
         if left.any()
     ]
+    return plan_points(scene, points, skipped, measurement, timing)
+
+
+def plan_points(
+    scene: ScanScene,
+    points: tuple[ScanPoint, ...],
+    skipped: Sequence[Skipped] = (),
+    measurement: MeasurementDesign | None = None,
+    timing: Timing | None = None,
+) -> Plan:
+    """Plan of points that are known: of poses given, of a run that is gone on with."""
+    timing = Timing() if timing is None else timing
+    measurement = design_measurement(scene) if measurement is None else measurement
+    shortest_s, longest_s = (
+        duration_s(points, blocks, measurement, timing)
+        for blocks in (scene.blocks.least, scene.blocks.most)
+    )
     per_point = [Skipped(s.what, s.why, s.saved_s * len(points)) for s in measurement.skipped]
     return Plan(points, measurement, (*skipped, *per_point), shortest_s, longest_s)
 

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
+from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import map_point
+from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 
@@ -24,6 +26,7 @@ def measured_result(
     *,
     time_ns: int,
     duration_s: float,
+    air: AirReference | None = None,
     notes: str = "",
 ) -> PointResult:
     """Result of a point that was measured; `FAILED` where there is no pole.
@@ -34,17 +37,16 @@ def measured_result(
         Of the poles; its contact must tell where the tip was.
     decision : Decision
         That ended the measurement.
+    air : AirReference or None
+        What the poles are compared with.
     time_ns : int
         When the point was finished (UNIX time) [ns].
     duration_s : float
         From the move to the point until the tip was free again [s].
     """
-    found = map_point(poles, origin, scene.tissue_classes)
-    pole = complex("nan+nanj")
-    for candidate, f0_hz in zip(poles.poles_rad_s, poles.f0_hz, strict=True):
-        if f0_hz == found.estimate[0]:
-            pole = complex(candidate)
+    found, pole = map_point(poles, origin, scene.tissue_classes), main_mode(poles).pole_rad_s
     std = found.std
+    relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
     blank = unmeasured_result(
         point,
         attempt,
@@ -64,6 +66,7 @@ def measured_result(
         damping_ratio=float(found.estimate[1]),
         damping_ratio_std=float(std[1]),
         f0_damping_covariance_hz=float(found.covariance[0, 1]),
+        **relative,
         pole_real_rad_s=pole.real,
         pole_imag_rad_s=pole.imag,
         cost=float(poles.cost),

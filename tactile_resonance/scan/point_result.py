@@ -54,6 +54,12 @@ class PointResult:
     damping_ratio: float = NAN
     damping_ratio_std: float = NAN
     f0_damping_covariance_hz: float = NAN
+    f0_shift_hz: float = NAN
+    f0_shift_std_hz: float = NAN
+    f0_over_air: float = NAN
+    f0_over_air_std: float = NAN
+    damping_shift: float = NAN
+    damping_shift_std: float = NAN
     pole_real_rad_s: float = NAN
     pole_imag_rad_s: float = NAN
     cost: float = NAN
@@ -68,6 +74,8 @@ class PointResult:
     duration_s: float = NAN
     measurement_id: int = 0
     simulated: bool = False
+    repeats: int = 0
+    disturbances: str = ""
     notes: str = ""
     time_ns: int = 0
     frame_id: str = ""

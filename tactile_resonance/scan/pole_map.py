@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
+from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 
@@ -89,23 +90,16 @@ def map_point(
         raise ValueError(
             f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
         )
-    estimate, covariance = np.full(2, np.nan), np.full((2, 2), np.nan)
-    if poles.f0_hz.size:
-        # height of a mode's peak: |residue| / |Re pole|
-        k = int(np.argmax(np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)))
-        estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
-        for known in (poles.covariance, poles.total_covariance):
-            if known is not None and np.all(np.isfinite(known[k])):
-                covariance = known[k]
+    mode = main_mode(poles)
     name, probability = "", float("nan")
-    if classes and np.isfinite(estimate[0]):
-        call = classify(estimate, covariance, classes, unknown_level)
+    if classes and mode.found:
+        call = classify(mode.estimate, mode.covariance, classes, unknown_level)
         name, probability = call.name, call.probability
     return MapPoint(
         position_m=np.array(contact.position_m),
         normal=Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2],
-        estimate=estimate,
-        covariance=covariance,
+        estimate=mode.estimate,
+        covariance=mode.covariance,
         force_n=contact.force_n,
         tissue_class=name,
         tissue_probability=probability,

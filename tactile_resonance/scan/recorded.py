@@ -76,15 +76,14 @@ class RunSource:
 
     def __init__(self, run: Path) -> None:
         content = read_run(run)
-        folder = Path(run) / RECORDING
-        points = {_file_name(result): result.measurement_id for result in content.results}
+        points = {file_of(run, result): result.measurement_id for result in content.results}
         self.entries: list[RecordedEntry] = []
         for file in sorted(content.files, key=lambda file: (file.start_ns, file.name)):
-            path = folder / file.name
-            if file.name not in points:
+            path = Path(run) / RECORDING / file.name
+            if path not in points:
                 self.entries += [RecordedEntry(key, path, True) for key in _ids_of(path)]
-            elif points[file.name]:
-                self.entries.append(RecordedEntry(points[file.name], path))
+            elif points[path]:
+                self.entries.append(RecordedEntry(points[path], path))
 
     def read(self, entry: RecordedEntry) -> StoredMeasurement:
         """One of `entries`.
@@ -147,5 +146,6 @@ def _ids_of(path: Path) -> list[int]:
     return list(dict.fromkeys(int(excitation.measurement_id) for excitation in excitations))
 
 
-def _file_name(result: PointResult) -> str:
-    return f"point-{result.index:05d}-{result.attempt:02d}.mcap"
+def file_of(run: Path, result: PointResult) -> Path:
+    """File of one attempt at a point."""
+    return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"

@@ -91,15 +91,7 @@ class RunDirectory:
         if [point.index for point in points] != list(range(len(points))) or not points:
             indices = [point.index for point in points][:10]
             raise ValueError(f"points: got indices {indices}; accepted are 0, 1, 2 ... in order")
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ValueError(f"run: {path} holds something; accepted is a new or empty folder")
-        parent = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-        free = shutil.disk_usage(parent).free
-        if needed_bytes > free:
-            raise ValueError(
-                f"run: {parent} has {free / 1e6:.0f} MB free, the run may take "
-                f"{needed_bytes / 1e6:.0f} MB"
-            )
+        cls.check_new(path, needed_bytes)
         content = {
             "format": FORMAT,
             "facts": dict(facts),
@@ -119,6 +111,19 @@ class RunDirectory:
         except BaseException:
             os.close(lock)
             raise
+
+    @staticmethod
+    def check_new(path: Path, needed_bytes: int) -> None:
+        """Raise ``ValueError`` where a new run cannot begin in a folder, for it or its disk is not empty."""
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ValueError(f"run: {path} holds something; accepted is a new or empty folder")
+        parent = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        free = shutil.disk_usage(parent).free
+        if needed_bytes > free:
+            raise ValueError(
+                f"run: {parent} has {free / 1e6:.0f} MB free, the run may take "
+                f"{needed_bytes / 1e6:.0f} MB"
+            )
 
     @classmethod
     def open(cls, path: Path) -> RunDirectory:

@@ -23,12 +23,20 @@ from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.references import (
+    AFTER,
+    BEFORE,
+    AirReference,
+    SensorHealth,
+    read_reference,
+    sensor_health,
+)
 from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording, RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold, OnFailure, ScanScene
 
 PAUSE_POLL_S = 0.05
-ATTEMPTS = 3  # at a point that is disturbed
+ATTEMPTS = 6  # at a point or reference that is disturbed
 SKIPPED = "skipped on request"
 Recording = PointRecording | ReferenceRecording
 
@@ -38,7 +46,18 @@ class PointFailed(Exception):
 
 
 class PointDisturbed(PointFailed):
-    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away."""
+    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away.
+
+    Parameters
+    ----------
+    message : str
+    kind : str
+        The same in one or two words, to be counted.
+    """
+
+    def __init__(self, message: str, kind: str = "disturbed") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class ScanEnded(Exception):
@@ -153,6 +172,8 @@ class Progress:
         At this point so far.
     time_left_s : float
         Estimated from the points so far, or the plan.
+    repeats : int
+        Attempts so far that were disturbed and begun again.
     """
 
     point: ScanPoint | None
@@ -162,6 +183,7 @@ class Progress:
     blocks: int = 0
     poles: Poles | None = None
     time_left_s: float = float("nan")
+    repeats: int = 0
 
 
 @dataclass(frozen=True)
@@ -178,6 +200,11 @@ class Summary:
     blocks, blocks_saved : int
     saved_s : float
         Measuring time saved by ending points early.
+    repeats : int
+        Attempts that were disturbed and begun again.
+    health : SensorHealth
+    health_sentence : str
+        What the references in air say of the sensor.
     """
 
     complete: bool
@@ -188,6 +215,9 @@ class Summary:
     blocks: int
     blocks_saved: int
     saved_s: float
+    repeats: int
+    health: SensorHealth
+    health_sentence: str
 
 
 class ScanRunner:
@@ -220,7 +250,8 @@ class ScanRunner:
         self._hands, self._controls, self._tell = hands, controls, tell
         self._seed = seed
         self._durations_s: list[float] = []
-        self._disturbed: Counter[int] = Counter()
+        self._disturbed: dict[int, Counter[str]] = {}
+        self._air: AirReference | None = None
 
     def run(self) -> Summary:
         """Finish every point that is not; the references of free air are taken before and after."""
@@ -228,13 +259,14 @@ class ScanRunner:
         message = ""
         try:
             self._hands.retract()
-            self._reference("air-before")
+            self._reference(BEFORE)
+            self._air = read_reference(self._run.content, BEFORE)
             while (point := self._next()) is not None:
                 spent_s = time.monotonic() - begun_s
                 if spent_s > self._scene.time_limits.scan_s:
                     raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
                 self._point(point)
-            self._reference("air-after")
+            self._reference(AFTER)
         except ScanEnded as error:
             message = str(error)
         except Interrupted:
@@ -301,8 +333,9 @@ class ScanRunner:
                     check,
                 )
             except PointDisturbed as error:
-                self._disturbed[point.index] += 1
-                if self._disturbed[point.index] < ATTEMPTS:
+                disturbed = self._disturbed.setdefault(point.index, Counter())
+                if disturbed.total() < ATTEMPTS - 1:
+                    disturbed[error.kind] += 1
                     self._hands.retract()  # nothing is kept of it, and the point comes again
                     return
                 reason = str(error)
@@ -336,7 +369,10 @@ class ScanRunner:
                     decisions[-1],
                     time_ns=time.time_ns(),
                     duration_s=duration_s,
+                    air=self._air,
                 )
+            disturbed = self._disturbed.pop(point.index, Counter())
+            result = replace(result, repeats=disturbed.total(), disturbances=_told(disturbed))
             recording.finish(result)
         self._durations_s.append(duration_s)
         if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
@@ -360,6 +396,8 @@ class ScanRunner:
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
         self._say(None, "reference")
+        # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
+        seed = self._seed + len(self._plan.points) + (name == AFTER)
 
         def all_blocks(poles: Poles, blocks: int) -> bool:
             return False
@@ -370,7 +408,7 @@ class ScanRunner:
                     self._hands.measure(
                         replace(self._plan.measurement, periods=self._scene.blocks.least),
                         "air",
-                        self._seed,
+                        seed,
                         all_blocks,
                         recording,
                         self._controls.check,
@@ -390,12 +428,19 @@ class ScanRunner:
         if self._durations_s:
             each_s = sum(self._durations_s) / len(self._durations_s)
         left_s = each_s * (points - finished)
-        self._tell(Progress(point, phase, finished, points, blocks, poles, left_s))
+        repeats = self._repeats()
+        self._tell(Progress(point, phase, finished, points, blocks, poles, left_s, repeats))
+
+    def _repeats(self) -> int:
+        """Of the points that are finished and of the one under way."""
+        finished = sum(result.repeats for result in self._run.content.results)
+        return finished + sum(counts.total() for counts in self._disturbed.values())
 
     def _summary(self, message: str) -> Summary:
         latest = self._run.content.latest
         count = {o: sum(result.outcome is o for result in latest) for o in Outcome}
         complete = self._run.content.next_point is None
+        health, sentence = sensor_health(self._run.content, self._scene.drift_limits)
         return Summary(
             complete=complete,
             message=message or ("complete" if complete else "ended early"),
@@ -405,4 +450,11 @@ class ScanRunner:
             blocks=sum(result.blocks for result in latest),
             blocks_saved=sum(result.blocks_saved for result in latest),
             saved_s=float(np.nansum([result.saved_s for result in latest])),
+            repeats=self._repeats(),
+            health=health,
+            health_sentence=sentence,
         )
+
+
+def _told(disturbed: Counter[str]) -> str:
+    return ", ".join(f"{kind} {count}" for kind, count in sorted(disturbed.items()))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan's scene: what is on the table and what is wanted from it.
 
-The same file may hold ``regions``, which the simulated bench reads (`tactile_resonance.simulation.scene`)
-and a scan does not need.
+The same file may hold ``regions`` and what is ``buried``, which the simulated bench reads
+(`tactile_resonance.simulation.scene`) and a scan does not need.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from tactile_resonance.fields import (
     section,
 )
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
+from tactile_resonance.scan.notes import Notes, read_notes
 from tactile_resonance.scan.patterns import read_positions
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
-from tactile_resonance.simulation.scene import read_scan_points
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.references import parse_classes, read_classes
 
@@ -36,8 +36,9 @@ E = TypeVar("E", bound=Enum)
 # Of the simulated bench: what lies on its table.
 BENCH_KEYS = {"regions", "buried"}
 _KEYS = {
-    *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions", "scan_points"),
+    *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
     *("outputs", "precision", "blocks", "tissue_classes", "on_failure", "time_limits"),
+    *("drift_limits", "notes"),
     *BENCH_KEYS,
 }
 
@@ -110,6 +111,21 @@ class TimeLimits:
             require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
 
 
+@dataclass(frozen=True)
+class DriftLimits:
+    """How far the poles in air may move during a scan; what is less is no warning, however significant.
+
+    Both are this project's choice: a fiftieth of what tells 10 from 12 % gelatine (arXiv 1805.00682).
+    """
+
+    f0_hz: float = 0.05
+    damping_ratio: float = 5e-5
+
+    def __post_init__(self) -> None:
+        for name in ("f0_hz", "damping_ratio"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+
+
 @dataclass(frozen=True, eq=False)
 class ScanScene:
     """What a scan is to do.
@@ -134,6 +150,10 @@ class ScanScene:
         What points are told to be; empty: no tissue is called.
     on_failure : OnFailure
     time_limits : TimeLimits
+    drift_limits : DriftLimits
+        Of the poles in air, before the sensor counts as drifted.
+    notes : Notes
+        What people know of the session and no instrument tells.
     """
 
     name: str
@@ -149,6 +169,8 @@ class ScanScene:
     tissue_classes: tuple[TissueClass, ...] = ()
     on_failure: OnFailure = OnFailure.CONTINUE
     time_limits: TimeLimits = field(default_factory=TimeLimits)
+    drift_limits: DriftLimits = field(default_factory=DriftLimits)
+    notes: Notes = field(default_factory=Notes)
 
 
 def read_scan_scene(path: Path) -> ScanScene:
@@ -176,7 +198,7 @@ def read_scan_scene(path: Path) -> ScanScene:
     return ScanScene(
         name=str(content.get("name", path.stem)),
         force_n=force_n,
-        positions_m=_read_positions(content, where),
+        positions_m=read_positions(section(content, "positions", where), f"{where}: positions"),
         frame_id=frame_id,
         hold=_choice(content, "hold", Hold.FORCE, where),
         sensor=_part(SensorUse, content, "sensor", where),
@@ -187,20 +209,9 @@ def read_scan_scene(path: Path) -> ScanScene:
         tissue_classes=classes,
         on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),
         time_limits=_part(TimeLimits, content, "time_limits", where),
+        drift_limits=_part(DriftLimits, content, "drift_limits", where),
+        notes=read_notes(section({"notes": {}, **content}, "notes", where), f"{where}: notes"),
     )
-
-
-def _read_positions(content: Mapping[str, Any], where: str) -> npt.NDArray[np.float64]:
-    """From ``positions``, or from ``scan_points`` as the simulated bench reads them."""
-    given = [key for key in ("positions", "scan_points") if key in content]
-    require(len(given) == 1, f"{where}: positions", given, "exactly one of positions, scan_points")
-    fields = section(content, given[0], where)
-    if given == ["positions"]:
-        return read_positions(fields, f"{where}: positions")
-    points = read_scan_points(fields, where)
-    positions = np.full((len(points), 3), np.nan)
-    positions[:, : len(points[0])] = points
-    return positions
 
 
 def _read_outputs(content: Mapping[str, Any], where: str) -> tuple[Output, ...]:

@@ -131,10 +131,19 @@ class TouchRequest:
         Where to touch [m].
     form : str
         plane or quadric.
+    expected_height_m : float
+        Where the first touch is expected [m]; those after it follow from those before.
+    force_n : float
+        That ends each touch [N].
+    tolerance_m : float
+        By which a touch may lie off the form fitted through all [m].
     """
 
     xy_m: tuple[tuple[float, float], ...]
     form: str
+    expected_height_m: float = 0.0
+    force_n: float = 0.005
+    tolerance_m: float = 2e-4
 
 
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:
@@ -191,7 +200,8 @@ def _read_height_field(content: Mapping[str, Any], folder: Path, where: str) -> 
 
 
 def _read_touch(content: Mapping[str, Any], where: str) -> TouchRequest:
-    known_keys(content, {"points_m", "form"}, where)
+    options = ("expected_height_m", "force_n", "tolerance_m")
+    known_keys(content, {"points_m", "form", *options}, where)
     form = content.get("form", "plane")
     require(form in ("plane", "quadric"), f"{where}.form", form, "plane or quadric")
     points = content.get("points_m")
@@ -200,7 +210,10 @@ def _read_touch(content: Mapping[str, Any], where: str) -> TouchRequest:
     require(good, f"{where}.points_m", points, f"{least} positions or more for a {form}")
     assert isinstance(points, list)
     read = [numbers(point, f"{where}.points_m[{i}]", 2) for i, point in enumerate(points)]
-    return TouchRequest(tuple((x, y) for x, y in read), form)
+    given = {key: number(content[key], f"{where}.{key}") for key in options if key in content}
+    for key in ("force_n", "tolerance_m"):
+        require(given.get(key, 1.0) > 0, f"{where}.{key}", given.get(key), "a number above 0")
+    return TouchRequest(tuple((x, y) for x, y in read), form, **given)
 
 
 def _file(content: Mapping[str, Any], folder: Path, where: str) -> Path:

@@ -4,6 +4,9 @@
 READY = "simulated UR5e ready at"
 """Begins the line that says that all ports are open."""
 
+PRIORITY = 30
+"""SCHED_FIFO priority of the simulated controller, above the control loop's: a real one has its own cores."""
+
 TABLE_IN_BASE = [-0.49, -0.13, 0.2, 0.0, 0.0, -1.5707963267948966]
 """Frame of a scene in the robot's base, position [m] and rotation vector [rad]: under the tip as the
 simulated robot starts, x of the scene along its beam."""

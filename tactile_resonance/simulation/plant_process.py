@@ -211,7 +211,7 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     commands = robot.control.commands
     commands["place_surface"] = tabletop.place_surface
     commands["place_tissue"] = tabletop.place_tissue
-    commands["truth"] = tabletop.truth
+    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.pace.stalls}
     history = PlantHistory(tabletop.plant)
     commands["history"] = history.since
     robot.after_step.append(history.step)

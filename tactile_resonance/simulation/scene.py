@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,17 +14,15 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
     known_keys,
     number,
-    numbers,
     read_yaml,
     require,
-    section,
 )
 from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.materials import Material, mixture, read_material, read_tissue
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.shapes import SHAPES, Point, Shape, read_shape
+from tactile_resonance.simulation.shapes import SHAPES, Shape, read_shape
 from tactile_resonance.simulation.tissue import Tissue
 
 
@@ -77,8 +74,6 @@ class PhantomScene:
     force_n : float
         Contact force asked for [N].
     regions : tuple of Region
-    scan_points_m : tuple of (x, y) or (x, y, z)
-        Where to measure [m]; empty where the scene says it in another form.
     buried : tuple of Buried
         Felt from the surface of whatever region is there.
     tip_radius_m, poisson_ratio : float
@@ -88,7 +83,6 @@ class PhantomScene:
     name: str
     force_n: float
     regions: tuple[Region, ...]
-    scan_points_m: tuple[Point, ...]
     buried: tuple[Buried, ...] = ()
     tip_radius_m: float = 2.5e-3
     poisson_ratio: float = 0.49
@@ -133,8 +127,8 @@ class PhantomScene:
 def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene:
     """Read the phantoms of a scene file; by default ``config/scenes/gelatine_phantoms.yaml``.
 
-    Only the fields ``name``, ``force_n``, ``regions``, ``buried`` and ``scan_points`` are read
-    here, the last two where they are there; the tip is that of ``config/sensors/bimorph.yaml``.
+    Only the fields ``name``, ``force_n``, ``regions`` and, where it is there, ``buried`` are read
+    here; the tip is that of ``config/sensors/bimorph.yaml``.
 
     Raises
     ------
@@ -157,11 +151,6 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
         regions=tuple(
             _read_region(entry, library, f"{where}: regions[{i}]")
             for i, entry in enumerate(entries)
-        ),
-        scan_points_m=(
-            read_scan_points(section(content, "scan_points", where), where)
-            if "scan_points" in content
-            else ()
         ),
         buried=tuple(
             _read_buried(entry, library, f"{where}: buried[{i}]") for i, entry in enumerate(buried)
@@ -190,40 +179,3 @@ def _read_buried(entry: object, library: TissueLibrary, where: str) -> Buried:
     known_keys(entry, {"name", "tissue", "gelatine_percent", "sphere", "box", "half_space"}, where)
     tissue = read_tissue(entry, library, where)
     return Buried(str(entry.get("name", tissue.name)), read_shape(entry, where), tissue)
-
-
-def read_scan_points(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
-    """Read ``centres_m`` x ``offsets_m``, centre by centre, or a ``grid``, row by row in x."""
-    where = f"{where}: scan_points"
-    known_keys(fields, {"centres_m", "offsets_m", "grid"}, where)
-    if "grid" in fields:
-        require(len(fields) == 1, where, sorted(fields), "either a grid or centres_m, offsets_m")
-        return _read_grid(section(fields, "grid", where), f"{where}.grid")
-
-    def points(key: str) -> list[Point]:
-        value = fields.get(key)
-        good = isinstance(value, list) and len(value) > 0
-        require(good, f"{where}.{key}", value, "a list of one position or more")
-        assert isinstance(value, list)
-        read = [numbers(item, f"{where}.{key}[{i}]") for i, item in enumerate(value)]
-        same = len({len(item) for item in read}) == 1 and len(read[0]) in (2, 3)
-        require(same, f"{where}.{key}", value, "positions of 2, or all of 3, coordinates")
-        return read
-
-    centres, offsets = points("centres_m"), points("offsets_m")
-    same = len(centres[0]) == len(offsets[0])
-    require(same, f"{where}.offsets_m", offsets[0], f"{len(centres[0])} coordinates")
-    pairs = [(centre, offset) for centre in centres for offset in offsets]
-    return tuple(tuple(a + b for a, b in zip(*pair, strict=True)) for pair in pairs)
-
-
-def _read_grid(fields: Mapping[str, Any], where: str) -> tuple[Point, ...]:
-    known_keys(fields, {"low_m", "high_m", "counts"}, where)
-    low, high = (numbers(fields.get(key), f"{where}.{key}", 2) for key in ("low_m", "high_m"))
-    counts = fields.get("counts")
-    good = isinstance(counts, list) and len(counts) == 2
-    good = good and all(type(n) is int and n >= 1 for n in counts or ())
-    require(good, f"{where}.counts", counts, "two integers of 1 or above")
-    assert isinstance(counts, list)
-    x, y = (np.linspace(a, b, n).tolist() for a, b, n in zip(low, high, counts, strict=True))
-    return tuple((a, b) for b in y for a in x)

@@ -44,6 +44,16 @@ def test_what_was_not_heard_is_unknown():
     assert np.isnan(std)
 
 
+def test_a_source_that_tells_changes_only_is_no_stream():
+    history = ForceHistory()
+    assert not history.streams
+    for time_ns in (0, 3 * 10**9):
+        history.add(time_ns, 0.01)
+        assert not history.streams
+    history.add(3 * 10**9 + STEP_NS, 0.01)
+    assert history.streams
+
+
 def test_a_clock_set_back_forgets_what_was_before():
     history = filled([0.5] * 10)
     history.add(0, 0.01)

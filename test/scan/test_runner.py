@@ -23,6 +23,7 @@ from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import (
+    ATTEMPTS,
     Controls,
     Measured,
     PointDisturbed,
@@ -141,25 +142,31 @@ def test_a_point_that_fails_is_kept_with_its_reason_and_the_scan_goes_on(tmp_pat
     assert np.isnan(failed.f0_hz)
 
 
-def test_a_point_that_is_disturbed_comes_again_and_fails_the_third_time(tmp_path):
+def test_a_point_that_is_disturbed_comes_again_and_fails_in_the_end(tmp_path):
     def disturb(times):
         left = [times]
 
         def on_measure(bench, blocks):
             if bench.log[-1] == ("touch", 1) and left[0]:
                 left[0] -= 1
-                raise PointDisturbed("contact: force_stale: 11 ms")
+                raise PointDisturbed("contact: force_stale: 11 ms", "force_stale")
 
         return Bench(on_measure=on_measure)
 
     bench = disturb(2)
-    summary, run, _ = scan(tmp_path / "twice", scene(), bench)
+    summary, run, told = scan(tmp_path / "twice", scene(), bench)
     assert (summary.done, summary.failed) == (4, 0)
     assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [0, 1, 1, 1, 2, 3]
     assert [(r.index, r.attempt) for r in run.results] == [(k, 0) for k in range(4)]
-    summary, run, _ = scan(tmp_path / "thrice", scene(), disturb(3))
+    assert [(r.repeats, r.disturbances) for r in run.results] == [
+        (0, ""), (2, "force_stale 2"), (0, ""), (0, "")
+    ]  # fmt: skip
+    assert summary.repeats == 2
+    assert told[-1].repeats == 2
+    summary, run, _ = scan(tmp_path / "always", scene(), disturb(ATTEMPTS))
     assert (summary.done, summary.failed) == (3, 1)
     assert "force_stale" in run.latest[1].reason
+    assert run.latest[1].repeats == ATTEMPTS - 1
 
 
 def test_a_reference_that_is_disturbed_comes_again(tmp_path):

@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.materials import Uniform
 from tactile_resonance.simulation.parameters import read_sensor
@@ -101,8 +102,8 @@ def test_a_wrong_tissue_field_is_named(tmp_path):
 def test_gelatine_scene_lies_as_described(library):
     scene = read_scene(library)
     assert scene.force_n == 0.01
-    assert len(scene.scan_points_m) == 20
-    percent = [scene.tissue_at(point).gelatine_percent for point in scene.scan_points_m]
+    positions = read_scan_scene(share_path("config/scenes/gelatine_phantoms.yaml")).positions_m
+    percent = [scene.tissue_at(place[:2]).gelatine_percent for place in positions]
     assert percent == [10] * 5 + [12] * 5 + [14] * 5 + [16] * 5
     assert scene.tissue_at((0.03, 0.0)) is None
     grid = np.stack(np.meshgrid([0, 0.03, 0.06], [0.0, 0.026]), axis=-1)  # (2, 3, 2)
@@ -119,7 +120,6 @@ def test_later_regions_cover_earlier_ones(library):
             Region("right", HalfSpace((0.5, 0.0), (-1.0, 0.0)), Uniform(liver)),
             Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), Uniform(library["gel16"])),
         ),
-        (),
     )
     assert scene.region_at((0.0, 0.15)).name == "nodule"  # height 0
     assert scene.region_at((0.0, 0.15, -0.3)).name == "block"

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asks scan_node for one scan, tells how it goes and ends with it: for launch files."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+from rclpy.executors import ExternalShutdownException
+
+from tactile_resonance.action import Scan
+from tactile_resonance.nodes.client import NoAnswer
+from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.scan_client import ScanClient
+
+PARAMETERS = (
+    Parameter(
+        "scene",
+        "config/scenes/demo.yaml",
+        "Scene file, absolute or in the package's share folder.",
+        read_only=True,
+    ),
+    Parameter(
+        "run_directory",
+        "",
+        "New or empty folder of the run, or the run that is gone on with; empty: made by scan_node.",
+        read_only=True,
+    ),
+    Parameter("resume", False, "Go on with the run in run_directory.", read_only=True),
+    Parameter(
+        "notes",
+        "",
+        "Of the session, in place of the scene's: {temperature_c: 21.5, tip_wetness: wet}.",
+        read_only=True,
+    ),
+    Parameter(
+        "start_within_s",
+        120.0,
+        "Longest wait for the nodes to come up [s].",
+        1.0,
+        3600.0,
+        read_only=True,
+    ),
+)
+SCAN_WITHIN_S = 24 * 3600.0
+
+
+class ScanGoal(ScanClient):
+    """A node of that name with the goal's fields as parameters."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda: None)
+        self._name = "scan_goal"
+        self._said = ""
+
+    def join(self) -> None:
+        """As every client; and the parameters."""
+        super().join()
+        declare(self._node, PARAMETERS)
+
+    def run(self) -> Scan.Result:
+        """Wait for the nodes, scan."""
+        names = ("scene", "run_directory", "resume", "notes")
+        goal = Scan.Goal(**dict(zip(names, values(self._node, *names), strict=True)))
+        self.wait_until_up(values(self._node, "start_within_s")[0])
+        result = self.scan(goal, self._tell, SCAN_WITHIN_S)
+        say = self._node.get_logger().info
+        say(
+            f"{result.message}: {result.done} of {result.points} points with poles, {result.failed} failed, "
+            f"{result.skipped} skipped, {result.repeats} times begun again; run in {result.run_directory}"
+        )
+        if result.sensor_health:
+            say(result.sensor_health)
+        return result
+
+    def _tell(self, feedback: Scan.Feedback) -> None:
+        text = f"{feedback.finished} of {feedback.points} points finished"
+        if feedback.phase in ("surface", "reference", "paused"):
+            text = feedback.phase
+        elif feedback.finished and feedback.time_left_s > 0:
+            text += f", {feedback.time_left_s:.0f} s left"
+        key = f"{feedback.phase if feedback.phase == text else ''}{feedback.finished}"
+        if key != self._said:
+            self._said = key
+            self._node.get_logger().info(text)
+
+
+def main() -> None:
+    """Console script: 0 where every point of the plan is finished."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with ScanGoal() as client:
+            result = client.run()
+        sys.exit(0 if result.outcome == Scan.Result.COMPLETE else 1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (NoAnswer, ValueError) as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

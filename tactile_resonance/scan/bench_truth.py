@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulated bench knew of the points of a run, out of its recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.result import PolesStatus
+from tactile_resonance.recording.from_messages import poles_from_message
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.recorded import file_of
+from tactile_resonance.scan.references import POLES
+from tactile_resonance.scan.run_content import RunContent
+
+SAME_MIDDLE_NS = 50_000_000  # a quarter of what one block more makes
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PointTruth:
+    """The true mode of one point, in the middle of its measurement: contacts creep.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio.
+    tissue : str
+        Under the tip.
+    force_n : float
+    """
+
+    estimate: FloatArray
+    tissue: str
+    force_n: float
+
+
+def truths_of(run: RunContent) -> dict[int, PointTruth]:
+    """Truth of the latest attempts, by point; empty for a run on hardware.
+
+    Raises
+    ------
+    ValueError
+        If a file is damaged.
+    """
+    found = {}
+    for result in run.latest:
+        if result.simulated and result.outcome is Outcome.DONE:
+            truth = _truth_of(run, result)
+            if truth is not None:
+                found[result.index] = truth
+    return found
+
+
+def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:
+    """(n, 2) estimate less truth of f0 and damping ratio in standard deviations, where both are known."""
+    rows = [deviation(r, truths[r.index]) for r in results if r.index in truths]
+    return np.array(rows).reshape(-1, 2)
+
+
+def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
+    """(2,) estimate less truth in standard deviations of the point."""
+    return (result.estimate - truth.estimate) / np.sqrt(np.diag(result.covariance))
+
+
+def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
+    """What the bench told of the blocks that the last poles rest on, its mode next to the estimate."""
+    told, middle_ns, store = [], 0, message_types()
+    for _, _, cdr in read_messages_of_type(file_of(run.path, result), POLES):
+        poles, origin = poles_from_message(store.deserialize_cdr(cdr, POLES))
+        if origin.measurement_id != result.measurement_id:
+            continue
+        if poles.status is PolesStatus.TRUTH:
+            told.append((poles, origin))
+        else:
+            middle_ns = origin.time_ns
+    # the bench may have played on, and of truths only the newest travel for sure
+    near = [(p, o) for p, o in told if abs(o.time_ns - middle_ns) < SAME_MIDDLE_NS]
+    if not near:
+        return None
+    poles, origin = near[0]
+    k = int(np.argmin(np.abs(poles.f0_hz - result.f0_hz)))
+    estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
+    return PointTruth(estimate, origin.label, origin.contact.force_n)

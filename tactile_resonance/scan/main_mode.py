@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mode that a map shows: of several identified ones that with the highest peak."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.result import Poles
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MainMode:
+    """One mode.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio; NaN where no pole was found.
+    covariance : (2, 2) float
+        Of the estimate, total where known, else from noise; NaN where neither is.
+    pole_rad_s : complex
+        With positive imaginary part.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+    pole_rad_s: complex
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pole."""
+        return bool(np.isfinite(self.estimate[0]))
+
+
+def main_mode(poles: Poles) -> MainMode:
+    """Mode with the highest peak, |residue| / |Re pole|."""
+    covariance = np.full((2, 2), np.nan)
+    if not poles.f0_hz.size:
+        return MainMode(np.full(2, np.nan), covariance, complex("nan+nanj"))
+    k = int(np.argmax(np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)))
+    for known in (poles.covariance, poles.total_covariance):
+        if known is not None and np.all(np.isfinite(known[k])):
+            covariance = known[k]
+    estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
+    return MainMode(estimate, covariance, complex(poles.poles_rad_s[k]))

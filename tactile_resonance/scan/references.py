@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles in free air before and after a scan: what points are compared with, and the sensor's health."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.recording.from_messages import poles_from_message
+from tactile_resonance.scan.main_mode import main_mode
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.run_content import RECORDING, RunContent
+from tactile_resonance.scan.scene import DriftLimits
+
+FloatArray = npt.NDArray[np.float64]
+BEFORE, AFTER = "air-before", "air-after"
+POLES = "tactile_resonance/msg/Poles"
+# A difference beyond so many of its standard deviations is no noise: once in 16 000.
+_SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class AirReference:
+    """Poles of the sensor touching nothing.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio.
+    covariance : (2, 2) float
+        NaN where unknown.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+
+    @property
+    def std(self) -> FloatArray:
+        """(2,) of f0 [Hz] and damping ratio."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True)
+class RelativeToAir:
+    """A pole against that of free air; uncertainties are of both.
+
+    Attributes
+    ----------
+    f0_shift_hz, f0_shift_std_hz : float
+        f0 less that in air [Hz].
+    f0_over_air, f0_over_air_std : float
+        f0 over that in air.
+    damping_shift, damping_shift_std : float
+        Damping ratio less that in air.
+    """
+
+    f0_shift_hz: float
+    f0_shift_std_hz: float
+    f0_over_air: float
+    f0_over_air_std: float
+    damping_shift: float
+    damping_shift_std: float
+
+
+class SensorHealth(str, Enum):
+    """What the references say of the sensor."""
+
+    UNKNOWN = "unknown"
+    STEADY = "steady"
+    DRIFTED = "drifted"
+
+
+def reference_of(poles: Poles) -> AirReference | None:
+    """Reference of poles measured in air; None where there is no pole."""
+    mode = main_mode(poles)
+    return AirReference(mode.estimate, mode.covariance) if mode.found else None
+
+
+def relative_to_air(
+    estimate: FloatArray, covariance: FloatArray, air: AirReference
+) -> RelativeToAir:
+    """Compare f0 [Hz] and damping ratio (2,) of covariance (2, 2) with those in air.
+
+    The two measurements are independent: variances add, those of the ratio to first order.
+    """
+    shift = estimate - air.estimate
+    std = np.sqrt(np.diag(covariance) + np.diag(air.covariance))
+    ratio = estimate[0] / air.estimate[0]
+    relative = np.sqrt(
+        covariance[0, 0] / estimate[0] ** 2 + air.covariance[0, 0] / air.estimate[0] ** 2
+    )
+    return RelativeToAir(
+        float(shift[0]),
+        float(std[0]),
+        float(ratio),
+        float(ratio * relative),
+        float(shift[1]),
+        float(std[1]),
+    )
+
+
+def judge_drift(
+    before: AirReference | None, after: AirReference | None, limits: DriftLimits
+) -> tuple[SensorHealth, str]:
+    """Whether the poles in air moved during the scan: beyond their uncertainty and beyond the limits.
+
+    Returns
+    -------
+    health : SensorHealth
+    sentence : str
+        For people, with the figures.
+    """
+    missing = [name for name, r in (("before", before), ("after", after)) if r is None]
+    if before is None or after is None:
+        return (
+            SensorHealth.UNKNOWN,
+            f"sensor health unknown: no poles in air {' and '.join(missing)}",
+        )
+    change = after.estimate - before.estimate
+    std = np.sqrt(np.diag(before.covariance) + np.diag(after.covariance))
+    most = np.array([limits.f0_hz, limits.damping_ratio])
+    figures = (
+        f"f0 in air {before.estimate[0]:.3f} Hz before, {change[0]:+.3f} +- {std[0]:.2g} Hz after; damping "
+        f"ratio {before.estimate[1]:.5f} before, {change[1]:+.2g} +- {std[1]:.2g} after "
+        f"(limits {most[0]:g} Hz, {most[1]:g})"
+    )
+    if not np.all(np.isfinite(std)):
+        return SensorHealth.UNKNOWN, f"sensor health unknown, no uncertainty in air: {figures}"
+    if np.any((np.abs(change) > _SIGNIFICANT * std) & (np.abs(change) > most)):
+        return (
+            SensorHealth.DRIFTED,
+            f"warning: the sensor drifted, poles relative to air are off by as much: {figures}",
+        )
+    return SensorHealth.STEADY, f"sensor steady: {figures}"
+
+
+def read_reference(run: RunContent, name: str) -> AirReference | None:
+    """Reference of a run by its name, from the last poles of its file; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If its file is damaged.
+    """
+    found = None
+    for file in run.files:
+        if not file.name.endswith(f"-{name}.mcap"):
+            continue
+        for _, topic, cdr in read_messages_of_type(run.path / RECORDING / file.name, POLES):
+            if topic.rsplit("/", 1)[-1] == "poles":
+                poles, _ = poles_from_message(message_types().deserialize_cdr(cdr, POLES))
+                found = reference_of(poles)
+    return found
+
+
+def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
+    """What the references of a run say of the sensor."""
+    return judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A surface found by touching it: where the ball met it, a form fitted through that, judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.scan.plan import tip_orientation
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.surface import TouchRequest
+from tactile_resonance.scan.touch import TouchedSurface, fit_surface
+
+FloatArray = npt.NDArray[np.float64]
+UP = (0.0, 0.0, 1.0)
+# Turns of the fit and of the normals along which the ball meets it; each leaves a hundredth of the error.
+_TURNS = 4
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch from above.
+
+    Attributes
+    ----------
+    ball_m : (3,) tuple
+        Centre of the ball at the first touch, in the scan's frame [m].
+    std_m : float
+        Standard deviation of its height [m].
+    force_n : float
+        That was reached [N].
+    """
+
+    ball_m: tuple[float, float, float]
+    std_m: float
+    force_n: float
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSurface:
+    """A surface and the touches it rests on.
+
+    Attributes
+    ----------
+    surface : TouchedSurface
+    touches : tuple of Touch
+    """
+
+    surface: TouchedSurface
+    touches: tuple[Touch, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """What a run keeps of it; lengths in metres."""
+        spare = len(self.touches) - self.surface.coefficients_m.size
+        return {
+            "form": self.surface.form,
+            "touches": [
+                {"ball_m": list(touch.ball_m), "std_m": touch.std_m, "force_n": touch.force_n}
+                for touch in self.touches
+            ],
+            "residuals_m": self.surface.residuals_m.tolist(),
+            "consistent": self.surface.consistent if spare else None,
+            "center_m": self.surface.center_m.tolist(),
+            "scale_m": self.surface.scale_m,
+            "coefficients_m": self.surface.coefficients_m.tolist(),
+        }
+
+
+def find_surface(
+    request: TouchRequest,
+    ball_radius_m: float,
+    heading_rad: float,
+    touch: Callable[[ScanPoint], Touch],
+) -> FoundSurface:
+    """Touch all places of a request and fit its form.
+
+    The first places are expected at the height that the request tells, the others where those before
+    tell: on their plane as soon as it is known.
+
+    Parameters
+    ----------
+    request : TouchRequest
+    ball_radius_m, heading_rad : float
+        Of the tip; direction of the beam, seen from above.
+    touch : callable
+        Touches a point of the surface as it is expected, from above; what it raises is passed on.
+
+    Raises
+    ------
+    ValueError
+        If the touches do not determine the form, or do not lie on it.
+    """
+    turn = tuple(tip_orientation(UP, heading_rad).tolist())
+    touches: list[Touch] = []
+    for index, (x, y) in enumerate(request.xy_m):
+        height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
+        label = f"surface, touch {index + 1}"
+        touches.append(touch(ScanPoint(index, (x, y, height), UP, turn, label)))
+    found = fit_touches(touches, request.form, ball_radius_m)
+    worst = int(np.argmax(np.abs(found.surface.residuals_m)))
+    off = float(found.surface.residuals_m[worst])
+    if abs(off) > request.tolerance_m:
+        x, y = request.xy_m[worst]
+        raise ValueError(
+            f"surface.touch: the touch at x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm lies {1e3 * off:+.2f} mm off "
+            f"the {request.form} through all; accepted are {1e3 * request.tolerance_m:g} mm (tolerance_m). "
+            "Another form, or a touch that was none?"
+        )
+    return found
+
+
+def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> FoundSurface:
+    """Surface that all balls touch.
+
+    A ball that comes down on a slope meets it beside its lowest point: one radius along the normal
+    from its centre. The normals are those of the fit, found in turns.
+    """
+    balls = np.array([touch.ball_m for touch in touches])
+    std = np.array([touch.std_m for touch in touches])
+    normals = np.broadcast_to(UP, balls.shape)
+    for _ in range(_TURNS):
+        surface = fit_surface(balls - ball_radius_m * normals, std, form)
+        normals = surface.normal((balls - ball_radius_m * normals)[:, :2])
+    return FoundSurface(surface, tuple(touches))
+
+
+def _expected(
+    touches: Sequence[Touch], xy_m: tuple[float, float], height_m: float, ball_radius_m: float
+) -> float:
+    """Height at which the next touch is expected: on the plane through those before, else as told."""
+    if len(touches) >= 3:
+        try:
+            return float(fit_touches(touches, "plane", ball_radius_m).surface.height_m(xy_m))
+        except ValueError:  # on one line: no plane yet
+            pass
+    if touches:
+        return touches[-1].ball_m[2] - ball_radius_m
+    return height_m

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A table that stands elsewhere than the scan believes is found by touch, through robot and load cell."""
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+pytest.importorskip("rtde_control", reason="ur-rtde is not here")
+
+from scipy.spatial.transform import Rotation
+from tactile_resonance.action import Scan
+
+from tactile_resonance.commands.bench_scan import NODES, PATIENT
+from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.processes import NodeProcesses, may_take_priority
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+
+SCENE = """
+name: tilted table
+force_n: 0.01
+regions:
+  - {name: gelatine 12 %, gelatine_percent: 12.0, box: {low_m: [-0.1, -0.1], high_m: [0.1, 0.1]}}
+surface:
+  touch: {points_m: [[-0.01, -0.01], [0.01, -0.01], [0.01, 0.01], [-0.01, 0.01]], form: plane}
+positions:
+  list: [[0.004, -0.003]]
+precision: {f0_std_hz: 0.02}
+blocks: {least: 2, most: 4}
+"""
+HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
+TILT_RAD, LIFT_M = np.array([0.06, -0.04, 0.0]), 1e-3
+
+
+@pytest.mark.skipif(
+    not may_take_priority(30), reason="a simulated robot beside nodes on these cores needs rtprio"
+)
+def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
+    scene, run_path = tmp_path / "tilted.yaml", tmp_path / "run"
+    scene.write_text(SCENE)
+    told = np.array(TABLE_IN_BASE)
+    believed = Rotation.from_rotvec(told[3:])
+    tilt = Rotation.from_rotvec(TILT_RAD)  # in the frame of the scene
+    true = np.concatenate([told[:3] + [0.0, 0.0, LIFT_M], (believed * tilt).as_rotvec()])
+    parameters = {
+        "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": listed(true)},
+        "excitation_node": {"record_folder": tmp_path / "records"},
+        "contact_node": {"robot_host": HOST, "force_host": HOST, **PATIENT},
+        "scan_node": {"table_in_base": listed(told)},
+    }
+    with NodeProcesses(tmp_path / "log") as nodes, ScanClient(nodes.check) as client:
+        nodes.bring_up(NODES, parameters)
+        client.wait_until_up(90.0)
+        phases = []
+        goal = Scan.Goal(scene=str(scene), run_directory=str(run_path), notes="{tip_wetness: wet}")
+        result = client.scan(goal, lambda feedback: phases.append(feedback.phase), 240.0)
+        assert result.outcome == Scan.Result.COMPLETE, result.message
+        # gone on with, there is nothing left to do and nothing is touched again
+        phases.clear()
+        goal = Scan.Goal(run_directory=str(run_path), resume=True)
+        again = client.scan(goal, lambda feedback: phases.append(feedback.phase), 60.0)
+        assert (again.outcome, again.done) == (Scan.Result.COMPLETE, 1)
+        assert "surface" not in phases
+    run = read_run(run_path)
+    assert run.facts["notes"] == {"tip_wetness": "wet"}
+    assert len(run.facts["surface"]["touches"]) == 4
+    normal = tilt.as_matrix()[:, 2]
+    (point,) = run.points
+    x, y, z = point.position_m
+    true_height = LIFT_M - (normal[0] * x + normal[1] * y) / normal[2]
+    # a touch of soft tissue is known to a tenth of a millimetre, over 20 mm the tilt to half a degree
+    assert z == pytest.approx(true_height, abs=1.5e-4)
+    assert np.arccos(np.clip(np.array(point.normal) @ normal, -1, 1)) < 0.009
+    assert np.arccos(normal[2]) > 0.07
+    (measured,) = run.latest
+    assert measured.force_n == pytest.approx(0.01, abs=5e-4)
+    assert np.isfinite(measured.f0_hz)
+
+
+def listed(pose):
+    return f"[{','.join(repr(float(value)) for value in pose)}]"

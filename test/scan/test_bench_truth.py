@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The truth of a point is that of the blocks its poles rest on, and the table says how far off they are."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.report.point_table import point_table, repeats_sentence, table_notes
+from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_directory import RunDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from runs import POLES, START_NS, blank, plan, result
+
+TRUTH = 100
+
+
+def poles(recording, topic, status, measurement_id, middle_ns, f0_hz):
+    types = message_types().types
+    stamp_ns = START_NS + middle_ns
+    time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = types["std_msgs/msg/Header"](stamp=time, frame_id="tip")
+    values = {"f0_hz": [f0_hz], "damping_ratio": [0.03], "real_rad_s": [-50.0]}
+    values |= {"imag_rad_s": [1600.0], "residue_real": [1.0], "residue_imag": [0.0]}
+    message = blank(
+        types,
+        POLES,
+        header=header,
+        status=status,
+        measurement_id=measurement_id,
+        label="gel10",
+        **{name: np.array(value) for name, value in values.items()},
+    )
+    cdr = message_types().serialize_cdr(message, POLES)
+    recording.write(topic, POLES, stamp_ns, cdr, topic.endswith("truth"))
+
+
+@pytest.fixture
+def run(tmp_path):
+    with RunDirectory.create(tmp_path / "run", "name: t\n", plan(3), {"seed": 1}) as run:
+        with run.begin_point(0) as recording:
+            poles(recording, "/left/bench/truth", TRUTH, 6, 400_000_000, 200.0)  # the one before
+            for block in (1, 2, 3):  # the bench played on for one block more
+                middle_ns = block * 200_000_000
+                poles(recording, "/left/bench/truth", TRUTH, 7, middle_ns, 250.0 + 0.01 * block)
+                if block < 3:
+                    poles(recording, "/left/poles", 0, 7, middle_ns, 250.5)
+            measured = {"f0_hz": 250.05, "f0_std_hz": 0.01, "damping_ratio": 0.0301}
+            measured |= {"damping_ratio_std": 1e-4, "repeats": 3}
+            measured |= {"disturbances": "arm_stale 1, force_stale 2", "force_n": 0.01}
+            recording.finish(result(0, measurement_id=7, simulated=True, **measured))
+        with run.begin_point(1) as recording:  # of hardware: nobody knows the truth
+            poles(recording, "/poles", 0, 8, 400_000_000, 251.0)
+            recording.finish(result(1, measurement_id=8))
+        with run.begin_point(2) as recording:
+            recording.finish(result(2, outcome=Outcome.FAILED, reason="contact: surface_missing"))
+    return read_run(tmp_path / "run")
+
+
+def test_truth_is_that_of_the_same_blocks(run):
+    truths = truths_of(run)
+    assert list(truths) == [0]
+    np.testing.assert_allclose(truths[0].estimate, [250.02, 0.03])
+    assert truths[0].tissue == "gel10"
+    np.testing.assert_allclose(deviations(run.latest, truths), [[3.0, 1.0]])
+
+
+def test_the_table_tells_truth_failures_and_repeats(run):
+    lines = point_table(run.latest, truths_of(run)).split("\n")
+    assert lines[2].split()[-4:] == ["250.020", "+3.0", "0.03000", "+1.0"]
+    assert lines[3].rstrip().endswith("-")
+    assert lines[4].endswith("failed: contact: surface_missing")
+    deviation, repeats = table_notes(run.latest, truths_of(run))
+    assert "rms 3.00 of f0, 1.00 of the damping ratio; largest 3.0" in deviation
+    assert (
+        repeats == "3 times a point was begun again, at 1 of 3 points: force_stale 2, arm_stale 1"
+    )
+    assert "true f0" not in point_table(run.latest, {})
+    assert repeats_sentence(run.latest[1:]) == "no point had to be begun again"
