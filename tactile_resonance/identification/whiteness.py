@@ -28,7 +28,7 @@ MOST_COMPONENTS = 128
 
 
 @lru_cache(maxsize=64)
-def components(lines: int, parameters: int) -> tuple[IntArray, ComplexArray]:
+def components(lines: int, parameters: int) -> tuple[IntArray, FloatArray]:
     """(levels,) how many cosine coefficients are compared with the rest, and (F, J) the cosines.
 
     The fit has taken its own parameters out of the smooth ones, half a coefficient each, so the
@@ -41,8 +41,7 @@ def components(lines: int, parameters: int) -> tuple[IntArray, ComplexArray]:
         levels = np.append(levels[0] // 2, levels)
     line, k = np.ogrid[:lines, :most]
     cosines = np.cos(np.pi * k * (line + 0.5) / lines) * np.sqrt(np.where(k == 0, 1, 2) / lines)
-    # complex, so that products with residuals need no conversion
-    return levels, cosines.astype(complex)
+    return levels, cosines
 
 
 def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
@@ -73,9 +72,10 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     if lines < 3:
         return np.full(residual.shape[:-1], np.nan)
     counts, cosines = components(lines, parameters)
-    power = _squared(residual @ cosines).cumsum(axis=-1)
+    parts = np.stack([residual.real, residual.imag])  # (2, ..., F)
+    power = _squared(parts @ cosines).cumsum(axis=-1)
     smooth = power[..., counts - 1]
-    total = _squared(residual).sum(axis=-1, keepdims=True)
+    total = _squared(parts).sum(axis=-1, keepdims=True)
     used = lines if residual.all() else np.count_nonzero(residual, axis=-1)[..., None]
     others = np.maximum(used - counts, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,6 +86,6 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
 
 
-def _squared(values: ComplexArray) -> FloatArray:
-    """Squared moduli."""
-    return np.asarray(values.real**2 + values.imag**2)
+def _squared(parts: FloatArray) -> FloatArray:
+    """(...) squared moduli of real over imaginary parts (2, ...)."""
+    return np.asarray(parts[0] ** 2 + parts[1] ** 2)
