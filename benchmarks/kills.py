@@ -53,7 +53,7 @@ class Kill:
     finished : int
         Points that were finished then.
     in_the_midst : bool
-        A point was being recorded.
+        A point or reference was being recorded.
     phase : str
         That the scan had told last.
     """
@@ -286,7 +286,7 @@ def _report(kills: Sequence[Kill], scans: Sequence[Mapping], compared: bool, too
         "",
         " ".join(__doc__.split()),
         "",
-        "| killed | times | while a point was recorded |",
+        "| killed | times | while a point or reference was being recorded |",
         "|---|---|---|",
     ]
     for victim in dict.fromkeys(sorted(kill.victim for kill in kills)):

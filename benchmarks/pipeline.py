@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the last sample of a block to the poles of all blocks so far, stage by stage.
 
-The nodes run as processes of their own on the simulated bench in real time. Stages are told apart by what every
-message of ROS carries: when it was handed to the middleware, and when the middleware of a listener received it.
+The nodes run as processes of their own on the simulated bench in real time. Stages are told apart by when each
+message was handed to the middleware, which it carries; transport is in the stage of the node that receives.
 """
 
 from __future__ import annotations
@@ -34,14 +34,13 @@ CASES = {
 }
 STAGES = (
     "bench: last sample to block published",
-    "block received, on disk, handed out",
-    "transport of the record",
-    "FRF",
-    "transport of the FRF",
-    "poles",
-    "transport of the poles",
+    "block to excitation_node, on disk, handed out",
+    "record to frf_node, FRF handed out",
+    "FRF to poles_node, poles handed out",
+    "poles to a reader",
 )
-COMPUTING = (3, 5)
+COMPUTING = (2, 3)
+TRANSPORTS = ("record", "FRF", "poles")
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,8 @@ class Latencies:
     Attributes
     ----------
     stages_s : (blocks, stages) array
+    transports_s : (blocks, 3) array
+        Until a reader beside the nodes received a message; a node may have it earlier or later.
     periods : (blocks,) array
         Of the record that the FRF rests on.
     record_bytes : int
@@ -58,12 +59,13 @@ class Latencies:
     """
 
     stages_s: FloatArray
+    transports_s: FloatArray
     periods: NDArray[np.int64]
     record_bytes: int
 
     @property
     def computing_s(self) -> FloatArray:
-        """FRF and poles, waiting for the processor included."""
+        """FRF and poles with the transport to their nodes: an upper bound of the computing alone."""
         return self.stages_s[:, COMPUTING].sum(axis=1)
 
     @property
@@ -117,9 +119,15 @@ def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
                 for k in range(measurements)
             ]
             times_ns, size = listener.times_ns(keys)
-    # (blocks, 8): last sample; block, record sent; record received; FRF sent, received; poles sent, received
-    stages_s = np.diff(times_ns, axis=1) * 1e-9
-    return Latencies(stages_s, np.tile(np.arange(1, PERIODS + 1), measurements), size)
+    # what each node itself has done: the reader's times would put its own delay into a node's stage
+    stages_s = np.diff(times_ns[:, :6], axis=1) * 1e-9
+    if not np.all(stages_s > 0):
+        raise ValueError(
+            "benchmark pipeline: a message was sent before its cause; was the clock set?"
+        )
+    transports_s = (times_ns[:, [6, 7, 5]] - times_ns[:, 2:5]) * 1e-9
+    periods = np.tile(np.arange(1, PERIODS + 1), measurements)
+    return Latencies(stages_s, transports_s, periods, size)
 
 
 def _report(results: Mapping[str, Latencies], raised: bool) -> str:
@@ -145,19 +153,24 @@ def _report(results: Mapping[str, Latencies], raised: bool) -> str:
         row = " | ".join(cells(result.stages_s[:, index]) for result in each)
         lines.append(f"| {stage} | {row} |")
     for name, values in (
-        ("**FRF and poles**", [result.computing_s for result in each]),
+        ("**FRF and poles, transport included**", [result.computing_s for result in each]),
         ("**last sample to poles**", [result.total_s for result in each]),
     ):
         lines.append(f"| {name} | " + " | ".join(cells(value) for value in values) + " |")
     for periods in (1, PERIODS):
         values = [result.computing_s[result.periods == periods] for result in each]
         row = " | ".join(cells(value) for value in values)
-        lines.append(f"| FRF and poles, {periods} period{'s' if periods > 1 else ''} | {row} |")
-    lines += ["", "Goal for the median of FRF and poles together: below 10 ms."]
+        lines.append(
+            f"| FRF and poles, record of {periods} period{'s' if periods > 1 else ''} | {row} |"
+        )
+    for index, name in enumerate(TRANSPORTS):
+        row = " | ".join(cells(result.transports_s[:, index]) for result in each)
+        lines.append(f"| transport of the {name}, to a reader beside | {row} |")
+    lines += ["", "Goal for the median of FRF and poles, transport not counted: below 10 ms."]
     for name, result in results.items():
         median_ms = 1e3 * float(np.median(result.computing_s))
-        verdict = "met" if median_ms < GOAL_MS else "missed"
-        lines.append(f"{name[0].upper()}{name[1:]}: {median_ms:.1f} ms, {verdict}.")
+        verdict = "met" if median_ms < GOAL_MS else "not shown to be met"
+        lines.append(f"{name[0].upper()}{name[1:]}: {median_ms:.1f} ms with transport, {verdict}.")
     lines += [
         "",
         "A stage ends where the next begins: what waits for a processor is in the stage that waits. The bench",
@@ -177,11 +190,11 @@ def _draw(results: Mapping[str, Latencies], path: Path) -> None:
     figure, panels = plt.subplots(
         1, len(results), figsize=(12, 4.2), layout="constrained", sharex=True, sharey=True
     )
-    names = [*STAGES, "FRF and poles", "last sample to poles"]
+    names = [*STAGES, "FRF and poles, transport included", "last sample to poles"]
     for axes, (name, result) in zip(panels, results.items(), strict=True):
         columns = [*result.stages_s.T, result.computing_s, result.total_s]
         axes.boxplot(
-            [column[column > 0] * 1e3 for column in columns],
+            [column * 1e3 for column in columns],
             vert=False,
             whis=(1, 99),
             showfliers=False,

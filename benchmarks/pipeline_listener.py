@@ -59,8 +59,8 @@ class PipelineListener(ScanSession):
         Returns
         -------
         (blocks, 8) int
-            Last sample; block and record sent, record received; FRF sent, received; poles sent, received
-            (UNIX time) [ns].
+            Last sample; block, record, FRF and poles sent; poles, record and FRF received here (UNIX
+            time) [ns].
         int
             Bytes.
 
@@ -82,22 +82,13 @@ class PipelineListener(ScanSession):
             )
         rows = []
         for place in sorted(heard["record"]):
-            message, record = heard["record"][place]
-            samples = record_from_message(message)
+            samples = record_from_message(heard["record"][place][0])
             last_ns = samples.origin.time_ns + round(1e9 * samples.duration_s)
-            rows.append(
-                (
-                    last_ns,
-                    heard["bench/block"][place][1]["source_timestamp"],
-                    record["source_timestamp"],
-                    record["received_timestamp"],
-                    *(
-                        heard[topic][place][1][name]
-                        for topic in ("frf", "poles")
-                        for name in ("source_timestamp", "received_timestamp")
-                    ),
-                )
-            )
+            sent = [heard[topic][place][1]["source_timestamp"] for topic in TOPICS]
+            received = [
+                heard[topic][place][1]["received_timestamp"] for topic in ("poles", "record", "frf")
+            ]
+            rows.append((last_ns, *sent, *received))
         return np.array(rows, np.int64), len(self._kept["record"][-1][0])
 
     def _by_block(

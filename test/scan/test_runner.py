@@ -180,7 +180,7 @@ def test_a_reference_that_is_disturbed_comes_again(tmp_path):
                 raise PointDisturbed("frf: who publishes it was started anew")
             return super().measure(design, label, *rest)
 
-    for disturbed, kept in ((2, ["air-before", "air-after"]), (3, ["air-after"])):
+    for disturbed, kept in ((2, ["air-before", "air-after"]), (ATTEMPTS, ["air-after"])):
         path = tmp_path / f"{disturbed}"
         summary, run, _ = scan(path, scene(), Disturbed(left=disturbed))
         assert (summary.complete, summary.done) == (True, 4)
