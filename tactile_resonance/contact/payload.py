@@ -122,6 +122,10 @@ def identify_payload(
             f"shapes: rotations {rotations.shape} and wrenches {wrenches.shape}, "
             "expected (n, 3, 3) and (n, 6)"
         )
+    # NaN compares as false
+    turned = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0) < 1e-6
+    if not (turned and np.all(np.linalg.det(rotations) > 0)):
+        raise ValueError("rotations: expected rotation matrices, orthonormal and not mirrored")
     sigma = np.broadcast_to(np.asarray(std, float), (n, 6))
     if not (np.all(sigma > 0) and np.all(np.isfinite(wrenches))):
         raise ValueError("std, wrenches: expected finite wrenches and standard deviations above 0")

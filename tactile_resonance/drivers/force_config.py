@@ -193,6 +193,9 @@ def _can(content: dict[str, Any], folder: Path) -> CanConfig:
         rows = content["matrix"]
         require(isinstance(rows, list) and len(rows) == 6, "matrix", rows, "6 rows of 6 numbers")
         scale = np.array([numbers(row, f"matrix[{i}]", 6) for i, row in enumerate(rows)])
+        # some load would be shown as none
+        blind = np.linalg.matrix_rank(scale / np.maximum(np.abs(scale).max(1), 1e-300)[:, None]) < 6
+        require(not blind, "matrix", rows, "rows that are independent")
         for name in ("counts_per_n", "counts_per_nm"):
             require(name not in content, name, content.get(name), "nothing beside matrix")
     else:

@@ -150,7 +150,8 @@ class Client:
         if self._states.revived:
             # a program that went on, or began, without us finds the old velocity in its register
             with contextlib.suppress(Exception):
-                self._motion.execute("stop", [deceleration])
+                if self._motion.execute("stop", [deceleration]):
+                    self._owed = None
 
     def _answer(self, action: Any) -> None:
         try:

@@ -170,3 +170,10 @@ def test_a_cable_that_pulls_is_no_noise():
 def test_shapes_are_checked(rotations):
     with pytest.raises(ValueError, match=r"orientations|shapes"):
         identify_payload(rotations, readings()[: 2 if len(rotations) == 2 else 3], STD)
+
+
+@pytest.mark.parametrize("factor", [2.0, -1.0, np.nan])
+def test_what_is_no_rotation_is_refused(factor):
+    rotations = Rotation.from_euler("xy", [[0, 0], [60, 0], [-60, 0], [0, 60], [0, -60]], True)
+    with pytest.raises(ValueError, match="rotations: expected rotation matrices"):
+        identify_payload(factor * rotations.as_matrix(), np.zeros((5, 6)), np.ones(6))

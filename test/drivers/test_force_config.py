@@ -46,6 +46,10 @@ def test_a_topic_is_read():
     assert read_force_config(Path("topic.yaml"), force_n=0.01).topic == "wrench_raw"
 
 
+# Fx is shown as Fy
+BLIND = [[0.0] * 5 + [1e-3]] * 2 + [[float(i == j) for j in range(6)] for i in range(4)]
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -58,12 +62,13 @@ def test_a_topic_is_read():
         ({"payload": {"mass_kg": 0.1, "centre_m": [0, 0, 0]}}, "payload"),
         ({"limits": {"silent_s": 0.001}}, "limits.silent_s: got 0.001"),
         ({"limits": {"jumps": 1}}, "limits.jumps"),
+        ({"matrix": BLIND, "resolution_n": 1e-4}, "matrix: .*rows that are independent"),
         ({"limits": {"lost_tolerated": 0.5}}, "limits.lost_tolerated"),
         ({"bus": {"channel": "can0"}}, "bus.interface"),
         ({"stamps": "gps"}, "stamps"),
         ({"frames": None}, "frames"),
         ({"matrix": [[1] * 6] * 5}, "matrix"),
-        ({"matrix": [[1] * 6] * 6}, "counts_per_n"),
+        ({"matrix": np.eye(6).tolist()}, "counts_per_n"),
         ({"topic": "wrench"}, "topic"),
     ],
 )

@@ -122,6 +122,8 @@ def test_program_that_another_starts_is_not_ours(robot, high):
     high.speed(UP, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     robot.dashboard("stop")
+    robot.until(runtime_state="STOPPED")
+    keep_for(high, 0.05)  # a robot takes longer than that to begin a program
     with socket.create_connection((robot.host, 30003), 5) as channel:
         channel.sendall(b"def rtde_control():\n  reg_offset_int = 0\nend\n")
         robot.until(runtime_state="PLAYING")
