@@ -81,9 +81,8 @@ class TipGeometry:
         """
         rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
         run = self.beam_length_m * math.cos(self.beam_tilt_rad)
-        edge = (rise - self.housing_below_m) * turn[:, 2] - run * turn[
-            :, 0
-        ]  # from the ball's centre
+        # from the ball's centre
+        edge = (rise - self.housing_below_m) * turn[:, 2] - run * turn[:, 0]
         return float(self.ball_radius_m + height_m + normal @ edge)
 
     def worst_height(self, depth_m: float, off_rad: float) -> float:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """contact_node and its manager as processes on a simulated robot with tissue and load cell; their client."""
 
+import contextlib
 import os
 import select
 import socket
@@ -16,7 +17,7 @@ from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
 
 from tactile_resonance import msg
-from tactile_resonance.nodes.client import NodeClient
+from tactile_resonance.nodes.client import NoAnswer, NodeClient
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses, end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
@@ -66,7 +67,8 @@ class ContactClient(NodeClient):
         while self.state is None or self.state.state != "idle":
             assert time.monotonic() < deadline, f"contact_node does not come back ({self.why()})"
             if self.state is not None and self.state.state == "fault":
-                self.retract()
+                with contextlib.suppress(NoAnswer):  # the node may be being made anew
+                    self.retract()
                 self.state = None
             self.spin(0.2)
 
