@@ -226,10 +226,11 @@ class ScanNode(ManagedNode):
         def touch(point: ScanPoint) -> Touch:
             tell(Progress(point, "surface", point.index, len(asked.xy_m)))
             try:
-                return self._hands.find(point, asked.force_n, radius_m, controls.check)
+                return self._hands.find(point, force_n, radius_m, controls.check)
             except PointFailed as error:
                 raise PointFailed(f"surface.touch: touch {point.index + 1}: {error}") from error
 
+        force_n = asked.force_n or scene.force_n
         self._hands.retract()
         return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
 

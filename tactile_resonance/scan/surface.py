@@ -133,8 +133,8 @@ class TouchRequest:
         plane or quadric.
     expected_height_m : float
         Where the first touch is expected [m]; those after it follow from those before.
-    force_n : float
-        That ends each touch [N].
+    force_n : float or None
+        That ends each touch [N]; None: that of the scene.
     tolerance_m : float
         By which a touch may lie off the form fitted through all [m].
     """
@@ -142,7 +142,7 @@ class TouchRequest:
     xy_m: tuple[tuple[float, float], ...]
     form: str
     expected_height_m: float = 0.0
-    force_n: float = 0.005
+    force_n: float | None = None
     tolerance_m: float = 2e-4
 
 

@@ -97,7 +97,7 @@ def test_inclusions_are_felt_more_the_shallower_and_the_nearer(library):
     soft, hard = library["white"], library["tumour"]
     scene = [
         PhantomScene(
-            "one", 0.01, (Region("all", EVERYWHERE, Uniform(soft)),), (),
+            "one", 0.01, (Region("all", EVERYWHERE, Uniform(soft)),),
             (Buried("ball", Sphere((0.0, 0.0, -0.002 - below), 0.002), hard),),
         )
         for below in (0.0, 1e-3, 3e-3, 1e-2)
