@@ -32,7 +32,8 @@ precision: {f0_std_hz: 0.02}
 blocks: {least: 2, most: 4}
 """
 HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
-TILT_RAD, LIFT_M = np.array([0.06, -0.04, 0.0]), 1e-3
+# beyond limits.misalignment_rad = 0.05 the contact node refuses to turn the tip where it stands
+TILT_RAD, LIFT_M = np.array([0.035, -0.025, 0.0]), 1e-3
 
 
 @pytest.mark.skipif(
@@ -58,6 +59,7 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
         goal = Scan.Goal(scene=str(scene), run_directory=str(run_path), notes="{tip_wetness: wet}")
         result = client.scan(goal, lambda feedback: phases.append(feedback.phase), 240.0)
         assert result.outcome == Scan.Result.COMPLETE, result.message
+        assert result.done == 1, read_run(run_path).latest[0].reason
         # gone on with, there is nothing left to do and nothing is touched again
         phases.clear()
         goal = Scan.Goal(run_directory=str(run_path), resume=True)
@@ -74,7 +76,7 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
     # a touch of soft tissue is known to a tenth of a millimetre, over 20 mm the tilt to half a degree
     assert z == pytest.approx(true_height, abs=1.5e-4)
     assert np.arccos(np.clip(np.array(point.normal) @ normal, -1, 1)) < 0.009
-    assert np.arccos(normal[2]) > 0.07
+    assert np.arccos(normal[2]) > 0.04
     (measured,) = run.latest
     assert measured.force_n == pytest.approx(0.01, abs=5e-4)
     assert np.isfinite(measured.f0_hz)
