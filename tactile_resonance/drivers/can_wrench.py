@@ -247,9 +247,11 @@ class CanWrench:
                 elif self._take(message):
                     last_s = now_s
                     last_stamp_s = message.timestamp
-                elif stamped and message.timestamp - last_stamp_s > silent_s:
+                elif stamped:
                     # the bus is never empty, but its frames are already those of later
-                    raise self._silence(bus, message.timestamp - last_stamp_s)
+                    last_stamp_s = min(last_stamp_s, message.timestamp)
+                    if message.timestamp - last_stamp_s > silent_s:
+                        raise self._silence(bus, message.timestamp - last_stamp_s)
                 if request is None and flow.short(now_s, self.received + self.lost):
                     text = (
                         f"{self._where}: {flow.rate_hz:.0f} wrenches/s of {1 / period_s:.0f} arrive"

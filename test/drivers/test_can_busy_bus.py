@@ -83,9 +83,11 @@ def test_others_frames_are_passed_over(shared):
     assert driver.lost == 0
 
 
-def test_silence_is_found_though_the_bus_is_never_quiet(shared):
+@pytest.mark.parametrize("heard_s", [0.0, 0.1])
+def test_silence_is_found_though_the_bus_is_never_quiet(shared, heard_s):
     bus, driver = shared
     driver.start()
+    read_for(driver, heard_s)
     bus.cell.faults.inject("silent", 1)
     with pytest.raises(ForceError, match="silent for 3") as error:
         read_for(driver, 5.0)

@@ -173,8 +173,8 @@ def test_protective_stop_is_named_and_the_tip_stays(bench, client):
     assert np.ptp(tip_m[-50:, 2]) < 5e-5
     bench.release()
     assert height_m(bench) < 0, "released, it moves only when it is told to"
-    # told to
-    assert client.retract().success
+    # told to, once the newest state no longer shows the stop
+    client.wait(lambda: client.retract().success, 2.0, "a retraction to be taken")
     client.wait(lambda: height_m(bench) > STANDOFF_M - 2e-4, 5.0, "the tip to be drawn back")
     client.idle()
 
