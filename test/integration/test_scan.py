@@ -15,7 +15,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 from rosbags.rosbag2 import Reader
 from tactile_resonance.action import Scan
 
-from tactile_resonance.commands.scan import NODES
+from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses, may_take_priority
 from tactile_resonance.scan.run_content import read_run
