@@ -88,6 +88,7 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
     jobs = [(setup.name, setup, None) for setup in SETUPS]
     jobs += [(f"{name} *", REFERENCE, law) for name, law in LAWS.items()]
     outcomes: dict[str, list[Outcome]] = {}
+    drivers = contact_drivers.available() or contact_drivers.run()
     with tqdm(total=len(jobs) * len(chosen), desc="contacts", unit="") as progress:
         for name, setup, law in jobs:
             outcomes[name] = []
@@ -97,8 +98,6 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
                 progress.update()
     series = contact_series(1000 if full else 20 if quick else 60)
     peaks = stiff_peaks(10 if quick else 60)
-    missing = contact_drivers.available()
-    drivers = missing or contact_drivers.run()
     text = _report(outcomes, series, peaks, drivers, len(chosen))
     output.mkdir(parents=True, exist_ok=True)
     (output / "contact.md").write_text(text, encoding="utf-8")

@@ -26,7 +26,7 @@ WALL_CLOCK = (
     "integration/test_contact_faults.py",
     *("integration/test_demo.py", "integration/test_touch.py"),
 )
-REPEATS = 4
+REPEATS = 2
 
 
 def pytest_collection_modifyitems(items):

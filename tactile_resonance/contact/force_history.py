@@ -10,7 +10,8 @@ import numpy as np
 
 BATCHES = 8
 LEAST_SAMPLES = 4 * BATCHES
-STREAM_GAP_NS = 500_000_000  # a source that tells no more often tells changes only
+# Sources that stream do so at 100 Hz or more; one that tells changes only may tell each a few times over.
+STREAM_SAMPLES, STREAM_SPAN_NS = 200, 4_000_000_000
 
 
 class ForceHistory:
@@ -62,8 +63,9 @@ class ForceHistory:
     def streams(self) -> bool:
         """Whether forces come again and again: then one that is not there is late, not unchanged."""
         with self._lock:
-            newest = list(self._samples)[-2:]
-        return len(newest) == 2 and newest[1][0] - newest[0][0] < STREAM_GAP_NS
+            if len(self._samples) < STREAM_SAMPLES:
+                return False
+            return self._samples[-1][0] - self._samples[-STREAM_SAMPLES][0] < STREAM_SPAN_NS
 
     def newest(self) -> tuple[int, float]:
         """Time [ns] and force [N] heard last; 0 and NaN before the first."""

@@ -46,11 +46,13 @@ def test_what_was_not_heard_is_unknown():
 
 def test_a_source_that_tells_changes_only_is_no_stream():
     history = ForceHistory()
-    assert not history.streams
-    for time_ns in (0, 3 * 10**9):
-        history.add(time_ns, 0.01)
-        assert not history.streams
-    history.add(3 * 10**9 + STEP_NS, 0.01)
+    # each change ten times over within 0.2 s, one a second
+    for change in range(30):
+        for k in range(10):
+            history.add(change * 10**9 + k * 20_000_000, 0.01)
+            assert not history.streams
+    for k in range(200):
+        history.add(31 * 10**9 + k * 10_000_000, 0.01)
     assert history.streams
 
 

@@ -139,7 +139,12 @@ def height_m(bench):
     return bench.order("truth")["tip_m"][2] - TABLE_IN_BASE[2] - 2.5e-3
 
 
-@pytest.mark.parametrize("name", FORCE_FAULTS)
+def thinned(names, always):
+    """All of them; those beside `always` only where slow tests are asked for."""
+    return [n if n in always else pytest.param(n, marks=pytest.mark.slow) for n in names]
+
+
+@pytest.mark.parametrize("name", thinned(FORCE_FAULTS, {"silent", "sign flipped"}))
 def test_fault_of_the_cell_stops_the_tip_and_draws_it_back(bench, client, name):
     inject, end, causes = FORCE_FAULTS[name]
     try:
@@ -153,7 +158,7 @@ def test_fault_of_the_cell_stops_the_tip_and_draws_it_back(bench, client, name):
     client.idle(anew=True)  # the source is started anew
 
 
-@pytest.mark.parametrize("name", ARM_FAULTS)
+@pytest.mark.parametrize("name", thinned(ARM_FAULTS, {"client killed"}))
 def test_lost_arm_is_stopped_by_its_watchdog_where_it_is(bench, client, name):
     result, tip_m = pressed_then(bench, client, ARM_FAULTS[name])
     assert not result.reached

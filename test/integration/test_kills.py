@@ -9,7 +9,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from benchmarks.kills import ALL, KilledScan
 
-VICTIMS = ("excitation_node", "frf_node", "scan_node", ALL)
+VICTIMS = ("frf_node", "scan_node", ALL)
 
 
 def test_no_finished_point_is_lost_or_repeated(domain, tmp_path):
