@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests."""
 
+import os
 import time
 from pathlib import Path
 
@@ -24,9 +25,11 @@ WALL_CLOCK = (
     *("drivers/ur/", "drivers/test_can_wrench.py", "drivers/test_force_sources.py"),
     *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/test_scan.py"),
     "integration/test_contact_faults.py",
-    *("integration/test_demo.py", "integration/test_touch.py"),
+    *("integration/test_demo.py", "integration/test_touch.py", "integration/test_kills.py"),
 )
 REPEATS = 2
+COVERAGE = "COVERAGE_PROCESS_CONFIG"
+_TRACING = {}
 
 
 def pytest_collection_modifyitems(items):
@@ -45,13 +48,24 @@ def pytest_collection_modifyitems(items):
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Have the machine watched while a test lives by the wall clock."""
-    if not getattr(item, "on_the_wall_clock", False):
+    on_the_wall_clock = getattr(item, "on_the_wall_clock", False)
+    _trace_processes(not on_the_wall_clock)
+    if not on_the_wall_clock:
         return
     config, start_s = item.config, time.monotonic()
     if not hasattr(config, "stall_witness"):
         config.stall_witness = StallWitness()
         config.add_cleanup(config.stall_witness.end)
     config.machine_stood_still = lambda: bool(config.stall_witness.stalls(start_s))
+
+
+def _trace_processes(wanted):
+    """Let coverage follow processes that tests start, or not: traced, they need half as much time again."""
+    if wanted:
+        os.environ.update(_TRACING)
+        _TRACING.clear()
+    elif (value := os.environ.pop(COVERAGE, None)) is not None:
+        _TRACING[COVERAGE] = value
 
 
 def pytest_runtest_logreport(report):

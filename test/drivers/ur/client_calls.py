@@ -310,19 +310,19 @@ def four(*hosts):
         assert robot.control.speedL([0, 0, -speed, 0, 0, 0], 0.5, 0.002)
     robots[0].wait(0.2)
 
-    def now(robot, host):
-        # time stamps go on while the simulation stands still, motion does not
-        still = order(host, "state")["stood_still_s"]
-        return robot.receive.getTimestamp() - still, robot.pose()
+    def now(host):
+        # one answer: time of the simulation, which stands still when its process does, and pose at that time
+        state = order(host, "state")
+        return state["time_s"], np.array(state["tcp_pose"])
 
-    marks = [now(robot, host) for robot, host in zip(robots, hosts, strict=True)]
+    marks = [now(host) for host in hosts]
     robots[0].wait(1.0)
-    for robot, host, speed, (stamp, pose) in zip(robots, hosts, speeds, marks, strict=True):
-        stamp_now, pose_now = now(robot, host)
-        took, moved = stamp_now - stamp, pose_now - pose
-        # time stamp and pose are read one after the other: up to a few cycles between them
-        near(moved[2], -speed * took, speed * 0.03 + 2e-5)
+    for robot, host, speed, (before_s, pose) in zip(robots, hosts, speeds, marks, strict=True):
+        now_s, pose_now = now(host)
+        near((pose_now - pose)[2], -speed * (now_s - before_s), speed * 0.004 + 2e-5)
         assert robot.control.speedStop(1.0)
+        robot.wait(0.3)
+        same_pose(robot.pose(), now(host)[1], 5e-5)  # each client sees its own robot
 
 
 if __name__ == "__main__":
