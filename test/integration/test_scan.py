@@ -15,7 +15,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 from rosbags.rosbag2 import Reader
 from tactile_resonance.action import Scan
 
-from tactile_resonance.commands.bench_scan import NODES
+from tactile_resonance.commands.bench_scan import NODES, PATIENT
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses, may_take_priority
 from tactile_resonance.scan.run_content import read_run
@@ -47,7 +47,7 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     parameters = {
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": table},
         "excitation_node": {"record_folder": tmp_path / "records"},
-        "contact_node": {"robot_host": HOST, "force_host": HOST},
+        "contact_node": {"robot_host": HOST, "force_host": HOST, **PATIENT},
         "scan_node": {"table_in_base": table},
     }
     with NodeProcesses(tmp_path / "log") as nodes, ScanClient(lambda: None) as client:
