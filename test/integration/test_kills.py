@@ -12,6 +12,7 @@ from benchmarks.kills import ALL, KilledScan
 VICTIMS = ("frf_node", "scan_node", ALL)
 
 
+@pytest.mark.slow
 def test_no_finished_point_is_lost_or_repeated(domain, tmp_path):
     random = np.random.default_rng(8)
     victims = [str(name) for name in random.permutation(VICTIMS)]

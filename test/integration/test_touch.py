@@ -39,6 +39,7 @@ TILT_RAD, LIFT_M = np.array([0.035, -0.025, 0.0]), 1e-3
 @pytest.mark.skipif(
     not may_take_priority(30), reason="a simulated robot beside nodes on these cores needs rtprio"
 )
+@pytest.mark.slow
 def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
     scene, run_path = tmp_path / "tilted.yaml", tmp_path / "run"
     scene.write_text(SCENE)
