@@ -8,10 +8,6 @@ stood still for more than 10 ms says nothing and is repeated once.
 from __future__ import annotations
 
 import os
-import select
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.contact_case import DEEPEST_M, FORCE_N, Outcome
+from benchmarks.simulated_robot import simulated_robot
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
@@ -34,8 +31,8 @@ from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
-from tactile_resonance.processes import end_with_parent, may_take_priority, take_priority
-from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
+from tactile_resonance.processes import may_take_priority, take_priority
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.robot.control_port import order
 
 HOST = "127.0.13.77"
@@ -72,7 +69,7 @@ def run() -> DriversResult:
     """Run all cases, each a second time where the simulation stalled in it."""
     outcomes: list[Outcome] = []
     stalls = repeated = overruns = cycles = 0
-    with _simulated_robot(), _real_time():
+    with simulated_robot(HOST, PRIORITY, "--rigid-tip"), _real_time():
         for number, (tissue, place) in enumerate((t, p) for t in TISSUES for p in PLACES):
             for attempt in range(2):
                 before = order(HOST, "state")["stalls"]
@@ -196,29 +193,3 @@ def _real_time() -> Iterator[None]:
         yield
     finally:
         os.sched_setscheduler(0, *before)
-
-
-@contextmanager
-def _simulated_robot() -> Iterator[None]:
-    robot = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
-            *("--tissue", "gel12", "--rigid-tip", "--priority", str(PRIORITY)),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        preexec_fn=end_with_parent if sys.platform == "linux" else None,
-    )
-    try:
-        assert robot.stdout is not None
-        ready, _, _ = select.select([robot.stdout], [], [], 60)
-        line = robot.stdout.readline() if ready else "no answer within 60 s"
-        if not line.startswith(READY):
-            raise ValueError(
-                f"benchmark contact: the simulated robot does not start: {line.strip()}"
-            )
-        yield
-    finally:
-        robot.send_signal(signal.SIGTERM)
-        robot.communicate(timeout=10)

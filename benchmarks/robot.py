@@ -8,12 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,10 +17,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.simulated_robot import simulated_robot
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 from tactile_resonance.simulation.robot.control_port import order
 
@@ -111,7 +106,7 @@ def run(output: Path, quick: bool) -> str:
 
 def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
     """Start robot and arm, command speeds back and forth, then watch the states."""
-    with _simulated_robot(priority) as robot:
+    with simulated_robot(HOST, priority) as robot:
         arm = UrArm(
             UrArmConfig(
                 HOST,
@@ -190,30 +185,6 @@ def _watch(arm: UrArm, seconds: float) -> tuple[FloatArray, FloatArray]:
         time.sleep(0.0003)
     arm.stop(ACCELERATION_M_S2)
     return np.array(ages), np.array(stamps)
-
-
-@contextlib.contextmanager
-def _simulated_robot(priority: int) -> Iterator[subprocess.Popen]:
-    robot = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
-            *("--tissue", "gel12", "--priority", str(priority)),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        preexec_fn=end_with_parent if sys.platform == "linux" else None,
-    )
-    try:
-        assert robot.stdout is not None
-        ready, _, _ = select.select([robot.stdout], [], [], 60)
-        line = robot.stdout.readline() if ready else "no answer within 60 s"
-        if "ready at" not in line:
-            raise ValueError(f"benchmark robot: the simulated robot does not start: {line.strip()}")
-        yield robot
-    finally:
-        robot.send_signal(signal.SIGTERM)
-        robot.communicate(timeout=10)
 
 
 def _cpu_s(pid: int) -> float:

@@ -23,7 +23,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
@@ -33,6 +33,9 @@ from tactile_resonance.scan.point_file import FileContent, PointFileWriter
 from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, as_csv, to_message
 from tactile_resonance.scan.run_content import FORMAT, RECORDING, RunContent, read_run
 from tactile_resonance.scan.scan_point import ScanPoint
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 HIDDEN = ".unfinished"
 _REFERENCE = re.compile(r"[a-z0-9][a-z0-9_-]*")
@@ -189,15 +192,14 @@ class RunDirectory:
         write_whole(self.path / "results.csv", as_csv(self.content.latest).encode())
 
 
-class ReferenceRecording:
-    """Receives the messages of one reference; a context that abandons what was not finished."""
+class _FileRecording:
+    """Receives the messages of one file; a context that abandons what was not finished."""
 
     def __init__(self, run: RunDirectory, stem: str) -> None:
         self._run = run
-        recording = run.path / RECORDING
-        self._writer = PointFileWriter(run.path / HIDDEN, recording / f"{stem}.mcap")
+        self._writer = PointFileWriter(run.path / HIDDEN, run.path / RECORDING / f"{stem}.mcap")
 
-    def __enter__(self) -> ReferenceRecording:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -214,13 +216,17 @@ class ReferenceRecording:
         """Append one message; see `PointFileWriter.write`."""
         self._writer.write(topic, type_name, time_ns, cdr, latched)
 
+
+class ReferenceRecording(_FileRecording):
+    """Receives the messages of one reference."""
+
     def finish(self) -> None:
         """Keep it, durably."""
         self._run._add(self._writer.finish(), None)
 
 
-class PointRecording:
-    """Receives the messages of one attempt at a point; a context that abandons what was not finished.
+class PointRecording(_FileRecording):
+    """Receives the messages of one attempt at a point.
 
     Attributes
     ----------
@@ -228,28 +234,8 @@ class PointRecording:
     """
 
     def __init__(self, run: RunDirectory, index: int, attempt: int) -> None:
-        self.index = index
-        self.attempt = attempt
-        self._run = run
-        target = run.path / RECORDING / f"point-{index:05d}-{attempt:02d}.mcap"
-        self._writer = PointFileWriter(run.path / HIDDEN, target)
-
-    def __enter__(self) -> PointRecording:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._writer.abandon()
-
-    def write(
-        self,
-        topic: str,
-        type_name: str,
-        time_ns: int,
-        cdr: bytes | memoryview,
-        latched: bool = False,
-    ) -> None:
-        """Append one message; see `PointFileWriter.write`."""
-        self._writer.write(topic, type_name, time_ns, cdr, latched)
+        super().__init__(run, f"point-{index:05d}-{attempt:02d}")
+        self.index, self.attempt = index, attempt
 
     def finish(self, result: PointResult) -> None:
         """Keep the point with its result, durably: after this no interruption loses it.
