@@ -27,8 +27,7 @@ from tactile_resonance.nodes.publisher_watch import PublisherWatch
 from tactile_resonance.nodes.running import NEWEST, STREAM
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.record import Contact
-from tactile_resonance.scan.measurement import MeasurementDesign
-from tactile_resonance.scan.runner import (
+from tactile_resonance.scan.hands import (
     ATTEMPTS,
     Check,
     Interrupted,
@@ -38,6 +37,7 @@ from tactile_resonance.scan.runner import (
     Recording,
     ScanEnded,
 )
+from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.surface_search import Touch
@@ -71,7 +71,7 @@ class NodeRenewed(PointDisturbed):
 
 
 class NodeHands:
-    """`scan.runner.Hands` for a scan's own thread; the executor's thread spins meanwhile.
+    """`scan.hands.Hands` for a scan's own thread; the executor's thread spins meanwhile.
 
     Parameters
     ----------

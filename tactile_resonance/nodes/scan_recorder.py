@@ -17,7 +17,7 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, RESULTS, SERIES
-from tactile_resonance.scan.runner import Recording
+from tactile_resonance.scan.hands import Recording
 
 
 @dataclass(frozen=True)

@@ -1,25 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """The life of a scan: point by point contact, measure until it is enough, retract, keep the result.
 
-What moves and measures is behind `Hands`; the same loop serves nodes and tests in virtual time.
+What moves and measures is behind `hands.Hands`; the same loop serves nodes and tests in virtual time.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Protocol
 
 import numpy as np
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.record import Origin
+from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Decision, decide
-from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.hands import (
+    ATTEMPTS,
+    Hands,
+    Interrupted,
+    PointDisturbed,
+    PointFailed,
+    ScanEnded,
+)
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import Outcome
@@ -31,128 +35,12 @@ from tactile_resonance.scan.references import (
     read_reference,
     sensor_health,
 )
-from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording, RunDirectory
+from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import Hold, OnFailure, ScanScene
+from tactile_resonance.scan.scene import OnFailure, ScanScene
 
 PAUSE_POLL_S = 0.05
-ATTEMPTS = 6  # at a point or reference that is disturbed
 SKIPPED = "skipped on request"
-Recording = PointRecording | ReferenceRecording
-
-
-class PointFailed(Exception):
-    """A point gave no result; the message says why. The scan may go on with the next."""
-
-
-class PointDisturbed(PointFailed):
-    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away.
-
-    Parameters
-    ----------
-    message : str
-    kind : str
-        The same in one or two words, to be counted.
-    """
-
-    def __init__(self, message: str, kind: str = "disturbed") -> None:
-        super().__init__(message)
-        self.kind = kind
-
-
-class ScanEnded(Exception):
-    """The scan cannot or shall not go on; the message says why."""
-
-
-class Interrupted(Exception):
-    """The point was left because somebody asked for it."""
-
-
-class Request(Enum):
-    """What somebody may ask of a running scan."""
-
-    SKIP = "skip"
-    REPEAT = "repeat"
-    CANCEL = "cancel"
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What a measurement gave.
-
-    Attributes
-    ----------
-    poles : Poles
-        Of all blocks.
-    origin : Origin
-        Of the poles; its contact is that of the measurement.
-    """
-
-    poles: Poles
-    origin: Origin
-
-
-class Hands(Protocol):
-    """Robot and sensor, as a scan uses them.
-
-    All raise `PointFailed`, or `ScanEnded` where no other point would fare better; while they wait they
-    call `check`, which may raise `Interrupted`.
-    """
-
-    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
-        """Bring the tip there and press until the force is held."""
-        ...
-
-    def measure(
-        self,
-        design: MeasurementDesign,
-        label: str,
-        seed: int,
-        enough: Callable[[Poles, int], bool],
-        recording: Recording,
-        check: Check,
-    ) -> Measured:
-        """Measure; every message of it goes into the recording.
-
-        After each block `enough` is asked with the poles of all blocks so far and their number.
-        """
-        ...
-
-    def retract(self) -> None:
-        """Draw the tip back; harmless where it is free."""
-        ...
-
-
-Check = Callable[[], None]
-
-
-class Controls:
-    """What is asked of a running scan, from any thread."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._request: Request | None = None
-        self.paused = threading.Event()
-        self.cancelled = threading.Event()
-
-    def ask(self, request: Request) -> None:
-        """Skip or repeat the point under way (between two: the next, the last), or end the scan."""
-        if request is Request.CANCEL:
-            self.cancelled.set()
-        else:
-            with self._lock:
-                self._request = request
-
-    def take(self) -> Request | None:
-        """Request that waits, once."""
-        with self._lock:
-            request, self._request = self._request, None
-        return request
-
-    def check(self) -> None:
-        """Raise `Interrupted` where the point under way shall be left."""
-        if self.cancelled.is_set() or self._request is not None:
-            raise Interrupted
 
 
 @dataclass(frozen=True)

@@ -16,22 +16,15 @@ import pytest
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import BlockLimits, Precise
+from tactile_resonance.scan.hands import ATTEMPTS, Measured, PointDisturbed, PointFailed, ScanEnded
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.runner import (
-    ATTEMPTS,
-    Controls,
-    Measured,
-    PointDisturbed,
-    PointFailed,
-    Request,
-    ScanEnded,
-    ScanRunner,
-)
+from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import OnFailure, ScanScene, TimeLimits
 
 SPREAD_HZ = 0.02
@@ -294,7 +287,8 @@ SCAN = """
     import test_runner as t
     from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.run_directory import RunDirectory
-    from tactile_resonance.scan.runner import Controls, ScanRunner
+    from tactile_resonance.scan.controls import Controls
+    from tactile_resonance.scan.runner import ScanRunner
     path, made = Path(sys.argv[1]), t.scene(8)
     run = RunDirectory.open(path) if path.exists() else t.begin(path, made)[1]
     bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(3e-3))

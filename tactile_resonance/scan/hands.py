@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robot and sensor as a scan uses them, and how a point may end without a result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.record import Origin
+from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import Hold
+
+ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
+Recording = PointRecording | ReferenceRecording
+Check = Callable[[], None]
+
+
+class PointFailed(Exception):
+    """A point gave no result; the message says why. The scan may go on with the next."""
+
+
+class PointDisturbed(PointFailed):
+    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away.
+
+    Parameters
+    ----------
+    message : str
+    kind : str
+        The same in one or two words, to be counted.
+    """
+
+    def __init__(self, message: str, kind: str = "disturbed") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class ScanEnded(Exception):
+    """The scan cannot or shall not go on; the message says why."""
+
+
+class Interrupted(Exception):
+    """The point was left because somebody asked for it."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a measurement gave.
+
+    Attributes
+    ----------
+    poles : Poles
+        Of all blocks.
+    origin : Origin
+        Of the poles; its contact is that of the measurement.
+    """
+
+    poles: Poles
+    origin: Origin
+
+
+class Hands(Protocol):
+    """Robot and sensor, as a scan uses them.
+
+    All raise `PointFailed`, or `ScanEnded` where no other point would fare better; while they wait they
+    call `check`, which may raise `Interrupted`.
+    """
+
+    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+        """Bring the tip there and press until the force is held."""
+        ...
+
+    def measure(
+        self,
+        design: MeasurementDesign,
+        label: str,
+        seed: int,
+        enough: Callable[[Poles, int], bool],
+        recording: Recording,
+        check: Check,
+    ) -> Measured:
+        """Measure; every message of it goes into the recording.
+
+        After each block `enough` is asked with the poles of all blocks so far and their number.
+        """
+        ...
+
+    def retract(self) -> None:
+        """Draw the tip back; harmless where it is free."""
+        ...
