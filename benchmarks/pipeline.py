@@ -91,6 +91,7 @@ def run(output: Path, quick: bool) -> str:
     raised = _take_precedence()
     results = {name: measure(goal, measurements) for name, goal in CASES.items()}
     text = _report(results, raised)
+    output.mkdir(parents=True, exist_ok=True)
     (output / "pipeline.md").write_text(text, encoding="utf-8")
     _draw(results, output / "pipeline.png")
     return text
