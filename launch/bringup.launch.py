@@ -11,19 +11,10 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
+from tactile_resonance.simulation.plant_defaults import HOST, PATIENT, TABLE_IN_BASE
 
 PACKAGE = "tactile_resonance"
-# For the simulated robot and load cell alone; what `tactile_resonance demo` uses too.
-PATIENT = {
-    "limits.force_age_s": 0.06,
-    "limits.arm_age_s": 0.06,
-    "robot_config": "config/devices/ur5e_patient.yaml",
-    "force_config": "can_patient.yaml",
-}
 STREAM = ("excitation_node", "frf_node", "poles_node")
-# Where the simulated robot answers, and the phantom under its tip.
-MOCK_ROBOT = "127.0.1.1"
-MOCK_TABLE = [-0.49, -0.13, 0.2, 0.0, 0.0, -1.5707963267948966]
 
 
 def generate_launch_description():
@@ -127,13 +118,13 @@ def _nodes(context):
         raise ValueError("patient:=true is for use_mock_hardware:=true: never for a robot")
     if patient and given("force_config") != "can_simulated.yaml":
         raise ValueError("patient:=true brings a force_config of its own, another was given")
-    host = given("robot_ip") or (MOCK_ROBOT if mock else "")
+    host = given("robot_ip") or (HOST if mock else "")
     simulated_cell = host if mock and given("force_config") == "can_simulated.yaml" else ""
     own = {
         "fake_hardware_node": {
             "scene": given("scene"),
             "robot_host": host if robot else "",
-            "table_in_base": MOCK_TABLE,
+            "table_in_base": TABLE_IN_BASE,
         },
         "contact_node": {
             "robot_host": host,
@@ -146,7 +137,7 @@ def _nodes(context):
             "contact": "robot" if robot else "none",
             "run_folder": given("run_folder"),
             "base_frame": given("base_frame"),
-            **({"table_in_base": MOCK_TABLE} if mock and robot else {}),
+            **({"table_in_base": TABLE_IN_BASE} if mock and robot else {}),
         },
     }
     names = [
@@ -204,7 +195,7 @@ def _left_out(package):
 def _table_in_base(base_frame, table_frame):
     """Static transform of the simulated table."""
     x, y, z, roll, pitch, yaw = (
-        MOCK_TABLE  # its rotation is about z alone: rotation vector and angles agree
+        TABLE_IN_BASE  # its rotation is about z alone: rotation vector and angles agree
     )
     values = {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
     arguments = [text for name, value in values.items() for text in (f"--{name}", str(value))]

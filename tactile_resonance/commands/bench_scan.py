@@ -14,7 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import PRIORITY, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import (
+    HOST,
+    PATIENT,
+    PATIENT_S,
+    PRIORITY,
+    TABLE_IN_BASE,
+)
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
@@ -27,15 +33,6 @@ NODES = (
 # the control loop.
 COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
 NICENESS = 10
-# Data may be older here than on hardware: what stands still is a simulation that shares these cores with all
-# nodes.
-PATIENT_S = 0.06
-PATIENT = {
-    "limits.force_age_s": PATIENT_S,
-    "limits.arm_age_s": PATIENT_S,
-    "robot_config": "config/devices/ur5e_patient.yaml",
-    "force_config": "can_patient.yaml",
-}
 START_WITHIN_S = 90.0
 SCAN_WITHIN_S = 24 * 3600.0
 
@@ -70,8 +67,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of all three commands."""
     parser.add_argument(
         "--robot-host",
-        default="127.0.1.1",
-        help="127.x.y.z of the simulated robot (default: 127.0.1.1)",
+        default=HOST,
+        help=f"127.x.y.z of the simulated robot (default: {HOST})",
     )
     parser.add_argument(
         "--hardware-limits",

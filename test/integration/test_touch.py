@@ -13,11 +13,11 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 from scipy.spatial.transform import Rotation
 from tactile_resonance.action import Scan
 
-from tactile_resonance.commands.bench_scan import NODES, PATIENT
+from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses, may_take_priority
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import PATIENT, TABLE_IN_BASE
 
 SCENE = """
 name: tilted table
