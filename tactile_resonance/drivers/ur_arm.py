@@ -26,6 +26,8 @@ from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
 GRACE_S = 1.5
+# Of what ur_rtde 1.6.5 writes when it finds its connection lost.
+LIBRARY_LOST = "Robot is disconnected"
 
 
 class UrArm:
@@ -307,11 +309,13 @@ class UrArm:
             status = self._process.wait(GRACE_S)
         except subprocess.TimeoutExpired:
             return ArmError(ArmFault.CLIENT_DIED, "the client process does not answer")
-        if status == EXIT_LINK_LOST:
+        said = self._last_error()
+        # on a lost connection the library connects anew by itself, says so, and now and then crashes
+        # where a command is under way: the link is why
+        if status == EXIT_LINK_LOST or (status < 0 and LIBRARY_LOST in said):
             return ArmError(ArmFault.LINK_LOST, f"the connection to {self.config.host} is lost")
         return ArmError(
-            ArmFault.CLIENT_DIED,
-            f"the client process ended with status {status}: {self._last_error()}",
+            ArmFault.CLIENT_DIED, f"the client process ended with status {status}: {said}"
         )
 
     def _last_error(self) -> str:
