@@ -19,10 +19,11 @@ from tactile_resonance.contact.resonance_touch import ScatterTouch, lock_in
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.lines import Lines
 from tactile_resonance.simulation.response import ResponseStream
+from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 
 FloatArray = NDArray[np.float64]
 

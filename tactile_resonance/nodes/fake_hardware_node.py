@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +35,11 @@ from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
-from tactile_resonance.simulation.bimorph import CoupledBimorph
-from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
-from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.tip_contact import TipContact
 from tactile_resonance.simulation.truth import truth_of
 from tactile_resonance.srv import Play, Truth
 
@@ -79,53 +77,6 @@ PLANT_CHECK_S = 0.5
 LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
 
 
-@dataclass(frozen=True)
-class Tip:
-    """What the tip is in contact with.
-
-    Attributes
-    ----------
-    tissue : Tissue or None
-        None: air.
-    force_n : float
-    since_s : float
-        How long the force has been held [s].
-    creeping : bool
-        The contact grows on while it is measured; else it stays as it is after `since_s`.
-    """
-
-    tissue: Tissue | None
-    force_n: float
-    since_s: float
-    creeping: bool = False
-
-    def coupled(self, bench: SimulatedBench) -> CoupledBimorph:
-        """The linear sensor on it."""
-        return bench.coupled(self.tissue, force_n=self.force_n or None, hold_time_s=self.since_s)
-
-    def start(
-        self, bench: SimulatedBench, duration_s: float, seed: int, effects: BenchEffects
-    ) -> BenchRun:
-        """A run from rest, the tissue creeping meanwhile; the nonlinearity takes the contact as fixed."""
-        if self.tissue is None or not self.creeping or effects.nonlinearity:
-            return bench.start(
-                self.tissue,
-                force_n=self.force_n or None,
-                hold_time_s=self.since_s,
-                seed=seed,
-                effects=effects,
-            )
-        history = ContactHistory.under_force(
-            self.tissue,
-            bench.sensor.tip.radius_m,
-            bench.contact,
-            force_n=self.force_n,
-            since_s=self.since_s,
-            duration_s=duration_s,
-        )
-        return bench.start_varying(history, seed=seed, effects=effects)
-
-
 class FakeHardwareNode(ManagedNode):
     """Serves `bench/play`, `bench/stop` and `bench/get_truth`, hands out `bench/block`.
 
@@ -149,7 +100,7 @@ class FakeHardwareNode(ManagedNode):
         self._scene = read_scene(read_tissues(), scene_path)
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
-        self._tip = Tip(None, 0.0, 1.0)
+        self._tip = TipContact(None, 0.0, 1.0)
         self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self._truth = self.publish_on(msg.Poles, "bench/truth", LATCHED)
@@ -183,7 +134,7 @@ class FakeHardwareNode(ManagedNode):
         self._pose = message
         position = message.pose.position
         tissue = self._scene.tissue_at((position.x, position.y, position.z))
-        self._tip = Tip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
+        self._tip = TipContact(tissue, self._scene.force_n if tissue else 0.0, 1.0)
         wrench = WrenchStamped()
         wrench.header.stamp = message.header.stamp
         wrench.header.frame_id = self._frame_id
@@ -191,7 +142,7 @@ class FakeHardwareNode(ManagedNode):
         self._wrench.publish(wrench)
         self._publish_truth(message, self._tip)
 
-    def _publish_truth(self, pose: PoseStamped, tip: Tip, measurement_id: int = 0) -> None:
+    def _publish_truth(self, pose: PoseStamped, tip: TipContact, measurement_id: int = 0) -> None:
         modes = truth_of(tip.coupled(self._bench), ()).modes
         truth = Poles(
             poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
@@ -228,7 +179,7 @@ class FakeHardwareNode(ManagedNode):
         self._stalls = true.stalls
         touching = true.force_n > 0
         tissue = self._laid.tissue_at(true.tip_m) if touching else None
-        self._tip = Tip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
+        self._tip = TipContact(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
         x, y, z = true.tip_m.tolist()
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=time.time_ns())
         self._pose = pose_to_message(place)
@@ -292,7 +243,7 @@ class FakeHardwareNode(ManagedNode):
                 tip = self._tip
             else:
                 tissue = self._scene.tissue_at((place.x, place.y, place.z))
-                tip = Tip(tissue, self._scene.force_n, 1.0)
+                tip = TipContact(tissue, self._scene.force_n, 1.0)
             coupled = replace(
                 tip,
                 force_n=request.force_n or tip.force_n,
@@ -320,7 +271,7 @@ class FakeHardwareNode(ManagedNode):
         excitation: Excitation,
         stop: threading.Event,
         pose: PoseStamped,
-        tip: Tip,
+        tip: TipContact,
     ) -> None:
         """Publish block after block, each when its last sample would have been taken.
 

@@ -13,8 +13,9 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.simulation.beam import BeamModes
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, Surface, TipOnTissue
+from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters

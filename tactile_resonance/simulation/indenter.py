@@ -16,18 +16,16 @@ the profile of v_j, which tells where the edge goes, is kept, at nodes.
 
 from __future__ import annotations
 
-from math import ceil, cos, exp, expm1, pi, sin, sqrt
+from math import exp, expm1, pi, sqrt
 
 import numpy as np
 
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.free_springs import FreeSprings, Node, Values
 from tactile_resonance.simulation.tissue import Tissue
 
 NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes as its square
 MAX_NODES_PER_STEP = 64
-SUBSTEP_S = 5e-4  # of the sprung tip: a twentieth of the period of the mode on stiff gelatine
 
 
 class Indenter:
@@ -293,100 +291,6 @@ class Indenter:
                 stress = 0.0  # rounding of the profile when hardly anything touches
         self.force_n = self._scale * stress
         return self.force_n
-
-
-class SprungIndenter:
-    """An indenter at the end of the beam: static stiffness and first mode between base and tip.
-
-    One mass on a spring, ``m x'' = k (b - x) + c (b' - x') - F(x)``, x the depth of the tip, b that
-    which it would have with the beam straight. Each sub-step is the exact motion for the tangent
-    of F and a base at constant speed.
-
-    Parameters
-    ----------
-    indenter : Indenter
-    stiffness_n_per_m, mass_kg, damping_ns_per_m : float
-        k, m, c.
-
-    Attributes
-    ----------
-    indenter : Indenter
-    tip_depth_m : float
-        x [m].
-    force_n : float
-        At the base, along the outward normal [N]; the inertia of the beam beyond that of its
-        first mode is left out.
-    """
-
-    def __init__(
-        self,
-        indenter: Indenter,
-        *,
-        stiffness_n_per_m: float,
-        mass_kg: float,
-        damping_ns_per_m: float,
-    ) -> None:
-        k, m, c = stiffness_n_per_m, mass_kg, damping_ns_per_m
-        require(0 < k < np.inf, "stiffness_n_per_m", k, "a number above 0")
-        require(0 < m < np.inf, "mass_kg", m, "a number above 0")
-        good = 0 <= c < 2 * sqrt(k * m)
-        require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
-        self.indenter = indenter
-        self._stiffness, self._mass, self._damping = k, m, c
-        self.reset()
-
-    @classmethod
-    def on_beam(cls, indenter: Indenter, modes: BeamModes) -> SprungIndenter:
-        """Return the tip of a bimorph: ``k = 3 EI / L^3``, frequency and damping of mode 1."""
-        stiffness, natural = modes.static_stiffness_n_per_m, float(modes.natural_rad_s[0])
-        mass = stiffness / natural**2
-        return cls(
-            indenter,
-            stiffness_n_per_m=stiffness,
-            mass_kg=mass,
-            damping_ns_per_m=2 * modes.damping_ratio * natural * mass,
-        )
-
-    def reset(self) -> None:
-        """Return to undisturbed tissue; the next step begins at rest, with the beam straight."""
-        self.indenter.reset()
-        self.force_n = 0.0
-        self.tip_depth_m = -np.inf
-        self._speed = 0.0
-        self._base: float | None = None
-
-    def step(self, base_depth_m: float, dt_s: float) -> float:
-        """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""
-        if not dt_s > 0:
-            require(False, "dt_s", dt_s, "a number above 0")
-        base = self._base
-        if base is None:
-            base = self.tip_depth_m = base_depth_m
-        count = ceil(dt_s / SUBSTEP_S - 1e-9)
-        interval, rate = dt_s / count, (base_depth_m - base) / dt_s
-        for n in range(count):
-            self._substep(base + n * interval * rate, rate, interval)
-        self._base = base_depth_m
-        self.force_n = self._stiffness * (base_depth_m - self.tip_depth_m) + self._damping * (
-            rate - self._speed
-        )
-        return self.force_n
-
-    def _substep(self, base: float, rate: float, h: float) -> None:
-        k, c, m = self._stiffness, self._damping, self._mass
-        held, tangent = self.indenter.tangent(h)
-        whole = k + tangent
-        # motion of equilibrium: offset + drift t
-        drift = k * rate / whole
-        offset = k * base + c * (rate - drift) - held + tangent * self.tip_depth_m
-        offset /= whole
-        y, dy = self.tip_depth_m - offset, self._speed - drift
-        half = c / (2 * m)
-        omega = sqrt(whole / m - half * half)
-        fall, turn, lift = exp(-half * h), cos(omega * h), sin(omega * h) / omega
-        self.tip_depth_m = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
-        self._speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
-        self.indenter.step(self.tip_depth_m, h)
 
 
 def _segment(x0: float, x1: float, v0: Values, v1: Values) -> Values:

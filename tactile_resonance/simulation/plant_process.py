@@ -14,7 +14,7 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
@@ -23,6 +23,7 @@ from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import STALL_S, SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,8 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS, POISSON = 2.5e-3, 0.49

@@ -7,8 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.indenter import Indenter, SprungIndenter
+from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import CellMounting, Friction, Plane, Plant, RigidTip
+from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU = 2.5e-3, 0.49

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control port of the simulated robot: faults to order, and how it fares.
+"""Control port of the simulated plant: orders from outside, among them faults.
 
 One JSON object a line, ``{"command": NAME, ...}``; each is answered by one line, ``{"ok": true, ...}`` or
 ``{"ok": false, "error": TEXT}``. Commands are listed in docs/robot.md.
@@ -10,20 +10,16 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tactile_resonance.simulation.robot.reactor import Connection
 
-if TYPE_CHECKING:
-    from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
-
 PORT = 30020
 _LONGEST_LINE = 1 << 16
-_LONGEST_FREEZE_S = 600.0
 
 
 class ControlPort:
-    """Makes the service of each connection; other parts of the plant add commands of their own.
+    """Makes the service of each connection; parts of the plant add commands of their own.
 
     Attributes
     ----------
@@ -32,21 +28,8 @@ class ControlPort:
         those of the answer, raises ValueError where it refuses.
     """
 
-    def __init__(self, robot: SimulatedRobot) -> None:
-        self._robot = robot
-        controller = robot.controller
-        self.commands: dict[str, Callable[[dict], dict]] = {
-            "state": self._state,
-            "freeze": self._freeze,
-            "drop": lambda _: {"dropped": robot.rtde.drop()},
-            "protective_stop": _plain(controller.protective_stop),
-            "emergency_stop": _plain(controller.emergency_stop),
-            "release_emergency_stop": _plain(controller.release_emergency_stop),
-            "remote_control": lambda fields: self._set(controller, "remote_control", fields),
-            "script_starts": lambda fields: self._set(controller, "script_starts", fields),
-            "registers_in_use": lambda fields: self._set(robot.rtde, "registers_in_use", fields),
-            "log": lambda _: {"log": list(controller.log)},
-        }
+    def __init__(self, commands: dict[str, Callable[[dict], dict]]) -> None:
+        self.commands = commands
 
     def serve(self, connection: Connection) -> ControlService:
         """Serve a new connection."""
@@ -64,43 +47,6 @@ class ControlPort:
             return {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
             return {"ok": False, "error": str(error)}
-
-    def _state(self, _: dict) -> dict:
-        controller, pace = self._robot.controller, self._robot.pace
-        return {
-            "time_s": controller.time_s,
-            "robot_mode": controller.robot_mode.name,
-            "safety_mode": controller.safety_mode.name,
-            "runtime_state": controller.runtime_state.name,
-            "tcp_pose": controller.outputs("actual_TCP_pose"),
-            "tcp_speed": controller.outputs("actual_TCP_speed"),
-            "tcp_force": controller.outputs("actual_TCP_force"),
-            "rtde_connections": self._robot.rtde.connections,
-            "stalls": pace.stalls,
-            "stood_still_s": controller.stood_still_s,
-            "longest_delay_s": pace.longest_s,
-        }
-
-    def _freeze(self, fields: dict) -> dict:
-        seconds = fields.get("seconds")
-        if not isinstance(seconds, (int, float)) or not 0 < seconds <= _LONGEST_FREEZE_S:
-            raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
-        part = fields.get("part", "network")
-        freeze = {
-            "network": self._robot.freeze_network,
-            "controller": self._robot.freeze_controller,
-        }.get(part)
-        if freeze is None:
-            raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
-        freeze(seconds)
-        return {}
-
-    def _set(self, target: Any, name: str, fields: dict) -> dict:
-        value = fields.get("value")
-        if not isinstance(value, bool):
-            raise ValueError(f"value: {value!r}, expected true or false")
-        setattr(target, name, value)
-        return {}
 
 
 class ControlService:
@@ -144,13 +90,3 @@ def order(host: str, command: str, port: int = PORT, timeout_s: float = 5.0, **f
     if not answer.pop("ok"):
         raise ValueError(answer["error"])
     return answer
-
-
-def _plain(action: Callable[[], None]) -> Callable[[dict], dict]:
-    """A command without fields and without an answer."""
-
-    def command(_: dict) -> dict:
-        action()
-        return {}
-
-    return command

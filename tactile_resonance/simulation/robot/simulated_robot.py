@@ -7,6 +7,7 @@ import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from tactile_resonance.simulation.robot import dashboard, rtde_server, script_server
 from tactile_resonance.simulation.robot.control_port import PORT as CONTROL_PORT
@@ -17,6 +18,7 @@ from tactile_resonance.simulation.robot.target import CYCLE_S
 
 # A step that begins later than this is a stall: what ran meanwhile is not to be trusted.
 STALL_S = 0.010
+_LONGEST_FREEZE_S = 600.0
 
 
 @dataclass
@@ -81,7 +83,7 @@ class SimulatedRobot:
         self._halted_until_ns = 0
         self._stopping = False
         self.rtde = rtde_server.RtdeServer(controller)
-        self.control = ControlPort(self)
+        self.control = ControlPort(self._orders())
         self.reactor = Reactor(host)
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
@@ -148,3 +150,69 @@ class SimulatedRobot:
             self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
             self.controller.stood_still_s += late_ns * 1e-9
         return now_ns + self._cycle_ns
+
+    def _orders(self) -> dict[str, Callable[[dict], dict]]:
+        """What the control port does for the robot itself."""
+        controller, rtde = self.controller, self.rtde
+        return {
+            "state": self._state,
+            "freeze": self._freeze,
+            "drop": lambda _: {"dropped": rtde.drop()},
+            "protective_stop": _plain(controller.protective_stop),
+            "emergency_stop": _plain(controller.emergency_stop),
+            "release_emergency_stop": _plain(controller.release_emergency_stop),
+            "remote_control": _switch(controller, "remote_control"),
+            "script_starts": _switch(controller, "script_starts"),
+            "registers_in_use": _switch(rtde, "registers_in_use"),
+            "log": lambda _: {"log": list(controller.log)},
+        }
+
+    def _state(self, _: dict) -> dict:
+        controller = self.controller
+        return {
+            "time_s": controller.time_s,
+            "robot_mode": controller.robot_mode.name,
+            "safety_mode": controller.safety_mode.name,
+            "runtime_state": controller.runtime_state.name,
+            "tcp_pose": controller.outputs("actual_TCP_pose"),
+            "tcp_speed": controller.outputs("actual_TCP_speed"),
+            "tcp_force": controller.outputs("actual_TCP_force"),
+            "rtde_connections": self.rtde.connections,
+            "stalls": self.pace.stalls,
+            "stood_still_s": controller.stood_still_s,
+            "longest_delay_s": self.pace.longest_s,
+        }
+
+    def _freeze(self, fields: dict) -> dict:
+        seconds = fields.get("seconds")
+        if not isinstance(seconds, (int, float)) or not 0 < seconds <= _LONGEST_FREEZE_S:
+            raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
+        part = fields.get("part", "network")
+        freeze = {"network": self.freeze_network, "controller": self.freeze_controller}.get(part)
+        if freeze is None:
+            raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
+        freeze(seconds)
+        return {}
+
+
+def _plain(action: Callable[[], None]) -> Callable[[dict], dict]:
+    """An order without fields and without an answer."""
+
+    def order(_: dict) -> dict:
+        action()
+        return {}
+
+    return order
+
+
+def _switch(target: Any, name: str) -> Callable[[dict], dict]:
+    """An order that sets an attribute to its field ``value``."""
+
+    def order(fields: dict) -> dict:
+        value = fields.get("value")
+        if not isinstance(value, bool):
+            raise ValueError(f"value: {value!r}, expected true or false")
+        setattr(target, name, value)
+        return {}
+
+    return order
