@@ -163,10 +163,11 @@ def _report(
         "| failed |",
         "|---|---|---|---|---|---|",
     ]
-    for name, row in outcomes.items():
-        rows.append(_row(name, row))
+    shown = dict(outcomes)
     if not isinstance(drivers, str):
-        rows.append(_row("through the drivers", drivers.outcomes))
+        shown["through the drivers"] = drivers.outcomes
+    for name, row in shown.items():
+        rows.append(_row(name, row))
     rows += ["", *_drivers(drivers)]
     rows += ["", *REASONS]
     rows += ["", "| Goal | asked for | found | |", "|---|---|---|---|"]
@@ -189,7 +190,7 @@ def _report(
             verdict = "met" if value <= goal else "missed"
             rows.append(f"| {name}: {what} | {goal:g} {unit} | {value:.2f} {unit} | {verdict} |")
     causes = Counter(
-        f"{name}: {o.cause}" for name in outcomes for o in outcomes[name] if o.cause != "none"
+        f"{name}: {o.cause}" for name, row in shown.items() for o in row if o.cause != "none"
     )
     rows += ["", *(f"Failed, {cause} ({count})." for cause, count in causes.items())]
     stated = np.array([o.stated_error for name in outcomes for o in outcomes[name]])
