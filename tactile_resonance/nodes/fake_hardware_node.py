@@ -35,11 +35,11 @@ from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
+from tactile_resonance.simulation.bench_tip import BenchTip
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
-from tactile_resonance.simulation.tip_contact import TipContact
 from tactile_resonance.simulation.truth import truth_of
 from tactile_resonance.srv import Play, Truth
 
@@ -100,7 +100,7 @@ class FakeHardwareNode(ManagedNode):
         self._scene = read_scene(read_tissues(), scene_path)
         self._bench = SimulatedBench.from_configuration()
         self._pose = PoseStamped()
-        self._tip = TipContact(None, 0.0, 1.0)
+        self._tip = BenchTip(None, 0.0, 1.0)
         self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self._truth = self.publish_on(msg.Poles, "bench/truth", LATCHED)
@@ -134,7 +134,7 @@ class FakeHardwareNode(ManagedNode):
         self._pose = message
         position = message.pose.position
         tissue = self._scene.tissue_at((position.x, position.y, position.z))
-        self._tip = TipContact(tissue, self._scene.force_n if tissue else 0.0, 1.0)
+        self._tip = BenchTip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
         wrench = WrenchStamped()
         wrench.header.stamp = message.header.stamp
         wrench.header.frame_id = self._frame_id
@@ -142,7 +142,7 @@ class FakeHardwareNode(ManagedNode):
         self._wrench.publish(wrench)
         self._publish_truth(message, self._tip)
 
-    def _publish_truth(self, pose: PoseStamped, tip: TipContact, measurement_id: int = 0) -> None:
+    def _publish_truth(self, pose: PoseStamped, tip: BenchTip, measurement_id: int = 0) -> None:
         modes = truth_of(tip.coupled(self._bench), ()).modes
         truth = Poles(
             poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
@@ -179,7 +179,7 @@ class FakeHardwareNode(ManagedNode):
         self._stalls = true.stalls
         touching = true.force_n > 0
         tissue = self._laid.tissue_at(true.tip_m) if touching else None
-        self._tip = TipContact(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
+        self._tip = BenchTip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
         x, y, z = true.tip_m.tolist()
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=time.time_ns())
         self._pose = pose_to_message(place)
@@ -243,7 +243,7 @@ class FakeHardwareNode(ManagedNode):
                 tip = self._tip
             else:
                 tissue = self._scene.tissue_at((place.x, place.y, place.z))
-                tip = TipContact(tissue, self._scene.force_n, 1.0)
+                tip = BenchTip(tissue, self._scene.force_n, 1.0)
             coupled = replace(
                 tip,
                 force_n=request.force_n or tip.force_n,
@@ -271,7 +271,7 @@ class FakeHardwareNode(ManagedNode):
         excitation: Excitation,
         stop: threading.Event,
         pose: PoseStamped,
-        tip: TipContact,
+        tip: BenchTip,
     ) -> None:
         """Publish block after block, each when its last sample would have been taken.
 

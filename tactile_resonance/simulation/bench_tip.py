@@ -14,7 +14,7 @@ from tactile_resonance.simulation.tissue import Tissue
 
 
 @dataclass(frozen=True)
-class TipContact:
+class BenchTip:
     """What the tip is in contact with.
 
     Attributes
