@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,6 +41,8 @@ STAGES = (
 )
 COMPUTING = (2, 3)
 TRANSPORTS = ("record", "FRF", "poles")
+COMPUTED_FROM = {"frf_node": "record", "poles_node": "frf"}
+"""The topic whose messages a node computes from."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class Latencies:
     stages_s : (blocks, stages) array
     transports_s : (blocks, 3) array
         Until a reader beside the nodes received a message; a node may have it earlier or later.
+    computing_ms : dict of (seconds, 2) arrays
+        By node, of each second of measuring: mean and longest time that a message kept the node, from when
+        it was handed to it until the result was handed out.
     periods : (blocks,) array
         Of the record that the FRF rests on.
     record_bytes : int
@@ -60,12 +65,13 @@ class Latencies:
 
     stages_s: FloatArray
     transports_s: FloatArray
+    computing_ms: Mapping[str, FloatArray]
     periods: NDArray[np.int64]
     record_bytes: int
 
     @property
-    def computing_s(self) -> FloatArray:
-        """FRF and poles with the transport to their nodes: an upper bound of the computing alone."""
+    def nodes_s(self) -> FloatArray:
+        """FRF and poles with the transport to their nodes."""
         return self.stages_s[:, COMPUTING].sum(axis=1)
 
     @property
@@ -88,8 +94,8 @@ def run(output: Path, quick: bool) -> str:
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     measurements = 4 if quick else 20
-    raised = _take_precedence()
-    results = {name: measure(goal, measurements) for name, goal in CASES.items()}
+    raised = _may_take_precedence()
+    results = {name: measure(goal, measurements, raised) for name, goal in CASES.items()}
     text = _report(results, raised)
     output.mkdir(parents=True, exist_ok=True)
     (output / "pipeline.md").write_text(text, encoding="utf-8")
@@ -97,29 +103,42 @@ def run(output: Path, quick: bool) -> str:
     return text
 
 
-def _take_precedence() -> bool:
-    """Before other work of this machine, for this process and the nodes; whether that is permitted."""
+def _may_take_precedence() -> bool:
+    """Whether nodes may run before other work of this machine; tried, and left as it was."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+        os.setpriority(os.PRIO_PROCESS, 0, before + NICE)
+        os.setpriority(os.PRIO_PROCESS, 0, before)
     except OSError:
         return False
     return True
 
 
-def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
-    """Latencies of every block of so many measurements of `PERIODS` blocks."""
+def measure(goal: Mapping[str, float], measurements: int, raised: bool) -> Latencies:
+    """Latencies of every block of so many measurements of `PERIODS` blocks.
+
+    With `raised` what computes runs before all else: bench and listener stand for what takes no processor.
+    """
     from benchmarks.pipeline_listener import PipelineListener
 
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(Path(folder) / "log") as nodes:
-        nodes.bring_up(NODES, {"excitation_node": {"record_folder": Path(folder) / "records"}})
+        nodes.bring_up(
+            NODES,
+            {"excitation_node": {"record_folder": Path(folder) / "records"}},
+            dict.fromkeys(NODES[1:], NICE if raised else 0),
+        )
         with PipelineListener(nodes.check) as listener:
             listener.wait_for_nodes(START_WITHIN_S)
             listener.warm_up(PLACE_M, START_WITHIN_S)
+            listener.forget_times()
             keys = [
                 listener.measure_block_by_block(PLACE_M, goal, PERIODS, seed=1 + k)
                 for k in range(measurements)
             ]
             times_ns, size = listener.times_ns(keys)
+            computing = {
+                node: listener.busy_ms(node, topic) for node, topic in COMPUTED_FROM.items()
+            }
     # what each node itself has done: the reader's times would put its own delay into a node's stage
     stages_s = np.diff(times_ns[:, :6], axis=1) * 1e-9
     if not np.all(stages_s > 0):
@@ -128,13 +147,20 @@ def measure(goal: Mapping[str, float], measurements: int) -> Latencies:
         )
     transports_s = (times_ns[:, [6, 7, 5]] - times_ns[:, 2:5]) * 1e-9
     periods = np.tile(np.arange(1, PERIODS + 1), measurements)
-    return Latencies(stages_s, transports_s, periods, size)
+    return Latencies(stages_s, transports_s, computing, periods, size)
 
 
 def _report(results: Mapping[str, Latencies], raised: bool) -> str:
     def cells(values: FloatArray) -> str:
         median, high = np.quantile(values, [0.5, 0.99]) * 1e3
         return f"{median:.2f} | {high:.2f}"
+
+    def computing(nodes: Sequence[str], result: Latencies) -> FloatArray:
+        """Median of the means and 99 % of the longest of each second, added up over nodes [ms]."""
+        return sum(
+            np.array([np.median(kept[:, 0]), np.quantile(kept[:, 1], 0.99)])
+            for kept in (result.computing_ms[node] for node in nodes)
+        )
 
     each = list(results.values())
     first = each[0]
@@ -154,12 +180,12 @@ def _report(results: Mapping[str, Latencies], raised: bool) -> str:
         row = " | ".join(cells(result.stages_s[:, index]) for result in each)
         lines.append(f"| {stage} | {row} |")
     for name, values in (
-        ("**FRF and poles, transport included**", [result.computing_s for result in each]),
+        ("**FRF and poles, transport included**", [result.nodes_s for result in each]),
         ("**last sample to poles**", [result.total_s for result in each]),
     ):
         lines.append(f"| {name} | " + " | ".join(cells(value) for value in values) + " |")
     for periods in (1, PERIODS):
-        values = [result.computing_s[result.periods == periods] for result in each]
+        values = [result.nodes_s[result.periods == periods] for result in each]
         row = " | ".join(cells(value) for value in values)
         lines.append(
             f"| FRF and poles, record of {periods} period{'s' if periods > 1 else ''} | {row} |"
@@ -167,18 +193,31 @@ def _report(results: Mapping[str, Latencies], raised: bool) -> str:
     for index, name in enumerate(TRANSPORTS):
         row = " | ".join(cells(result.transports_s[:, index]) for result in each)
         lines.append(f"| transport of the {name}, to a reader beside | {row} |")
-    lines += ["", "Goal for the median of FRF and poles, transport not counted: below 10 ms."]
+    both = tuple(COMPUTED_FROM)
+    for title, nodes in (
+        *((f"computing in {node}", (node,)) for node in both),
+        ("**computing in both**", both),
+    ):
+        row = " | ".join("{:.2f} | {:.2f}".format(*computing(nodes, result)) for result in each)
+        lines.append(f"| {title} | {row} |")
+    lines += ["", f"Goal for the median of computing FRF and poles: below {GOAL_MS:g} ms."]
     for name, result in results.items():
-        median_ms = 1e3 * float(np.median(result.computing_s))
-        verdict = "met" if median_ms < GOAL_MS else "not shown to be met"
-        lines.append(f"{name[0].upper()}{name[1:]}: {median_ms:.1f} ms with transport, {verdict}.")
+        median_ms = float(computing(both, result)[0])
+        verdict = "met" if median_ms < GOAL_MS else "not met"
+        total_ms = 1e3 * float(np.median(result.nodes_s))
+        lines.append(
+            f"{name[0].upper()}{name[1:]}: {median_ms:.1f} ms, {verdict}; {total_ms:.1f} ms with transport."
+        )
     lines += [
         "",
         "A stage ends where the next begins: what waits for a processor is in the stage that waits. The bench",
         "hands a block out when its last sample would have been taken and computes the next one meanwhile; a",
         "device adds its own latency in place of the first row. The second row holds the record's way from the",
         "bench to `excitation_node` and its file, synchronised to disk, before anybody hears of it.",
-        f"All processes ran at nice {NICE}, before other work of the machine."
+        "Computing is what the nodes tell of themselves in `/diagnostics`, of every second: the median of the",
+        "means, 99 % of the longest. It is the time in which a message kept its node, publishing included;",
+        "between the nodes it is the middleware and the waking of a process that take their time.",
+        f"Nodes that compute ran at nice {NICE}, before bench, listener and other work of the machine."
         if raised
         else "All processes ran at the machine's ordinary priority.",
         "",
@@ -193,7 +232,7 @@ def _draw(results: Mapping[str, Latencies], path: Path) -> None:
     )
     names = [*STAGES, "FRF and poles, transport included", "last sample to poles"]
     for axes, (name, result) in zip(panels, results.items(), strict=True):
-        columns = [*result.stages_s.T, result.computing_s, result.total_s]
+        columns = [*result.stages_s.T, result.nodes_s, result.total_s]
         axes.boxplot(
             [column * 1e3 for column in columns],
             vert=False,

@@ -4,21 +4,25 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.conversions import record_from_message
+from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.nodes.scan_session import ScanSession
 
 TOPICS = {"bench/block": msg.Record, "record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}
 ALL_WITHIN_S = 10.0
+DIAGNOSTICS_WITHIN_S = 2 * PERIOD_S
 
 
 class PipelineListener(ScanSession):
@@ -33,6 +37,9 @@ class PipelineListener(ScanSession):
                 kind, topic, self._keeper(self._kept[topic]), RESULTS, raw=True
             )
 
+        self._busy: defaultdict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_busy, 50)
+
     @staticmethod
     def _keeper(kept: list[tuple[bytes, Mapping[str, int]]]) -> Any:
         # rclpy looks at the signature: two parameters ask for the times
@@ -40,6 +47,32 @@ class PipelineListener(ScanSession):
             kept.append((cdr, info))
 
         return keep
+
+    def forget_times(self) -> None:
+        """Forget how long nodes were kept so far: first messages take longer."""
+        end_s = time.monotonic() + DIAGNOSTICS_WITHIN_S
+        while time.monotonic() < end_s:
+            self.spin(0.05)
+        self._busy.clear()
+
+    def busy_ms(self, node: str, topic: str) -> NDArray[np.float64]:
+        """How long messages of a topic kept a node.
+
+        Returns
+        -------
+        (seconds, 2)
+            Mean and longest, of each second in which there were any.
+        """
+        return np.array(self._busy[node, topic])
+
+    def _on_busy(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            for key in values:
+                topic = key.removesuffix(MEAN)
+                if topic != key:
+                    told = float(values[key]), float(values[f"{topic}{LONGEST}"])
+                    self._busy[status.name.lstrip("/"), topic].append(told)
 
     def measure_block_by_block(
         self,

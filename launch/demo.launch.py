@@ -9,7 +9,7 @@ from launch.actions import (
 )
 from launch.event_handlers import OnProcessExit
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, ThisLaunchFileDir
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -21,11 +21,11 @@ PACKAGE = "tactile_resonance"
 
 def generate_launch_description():
     """Bring-up, and a node that asks for the scan."""
-    scenes = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "scenes"])
+    share = FindPackageShare(PACKAGE)
     arguments = [
         DeclareLaunchArgument(
             "scene",
-            default_value=PathJoinSubstitution([scenes, "demo.yaml"]),
+            default_value=PathJoinSubstitution([share, "config", "scenes", "demo.yaml"]),
             description="Scene file: what lies on the simulated bench's table, and what is wanted from it.",
         ),
         DeclareLaunchArgument(
@@ -39,41 +39,25 @@ def generate_launch_description():
             description="Of the session, as YAML: {temperature_c: 21.5, tip_wetness: wet, adhesion: none}.",
         ),
         DeclareLaunchArgument(
-            "robot_ip",
-            default_value="127.0.1.1",
-            description="Address 127.x.y.z of the simulated robot.",
-        ),
-        DeclareLaunchArgument(
             "patient",
             default_value="true",
             choices=["true", "false"],
             description="Data of the simulated robot and load cell may be 60 ms old instead of 20 and 10.",
         ),
-        DeclareLaunchArgument(
-            "rviz",
-            default_value="false",
-            choices=["true", "false"],
-            description="Start rviz2 with the view of the pole map, where it is installed.",
-        ),
-        DeclareLaunchArgument(
-            "record",
-            default_value="false",
-            choices=["true", "false"],
-            description="Record all topics with ros2 bag beside what the scan records itself.",
-        ),
     ]
-    passed = ("scene", "robot_ip", "patient", "rviz", "record")
+    # whatever else bring-up can be told goes through to it: namespace, robot_ip, rviz, record ...
     bringup = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource([ThisLaunchFileDir(), "/bringup.launch.py"]),
+        PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "bringup.launch.py"])),
         launch_arguments={
             "use_mock_hardware": "true",
-            **{name: LaunchConfiguration(name) for name in passed},
+            **{name: LaunchConfiguration(name) for name in ("scene", "patient")},
         }.items(),
     )
     goal = Node(
         package=PACKAGE,
         executable="scan_goal",
         name="scan_goal",
+        namespace=LaunchConfiguration("namespace"),  # that of bring-up
         parameters=[
             {
                 name: ParameterValue(LaunchConfiguration(name), value_type=str)

@@ -17,14 +17,11 @@ SENSORS = {"left": "127.0.1.2", "right": "127.0.1.3"}
 
 
 def generate_launch_description():
-    """Arguments of the stack, and each sensor in a group of its own: what is set there stays there."""
+    """Arguments of the stack, and each sensor in a group of its own: what is set there stays there.
+
+    Whatever else bring-up can be told holds for both: use_mock_hardware, scene, rviz ...
+    """
     arguments = [
-        DeclareLaunchArgument(
-            "use_mock_hardware",
-            default_value="true",
-            choices=["true", "false"],
-            description="Simulated robots, load cells and sensors.",
-        ),
         DeclareLaunchArgument(
             "patient",
             default_value="true",
@@ -51,7 +48,6 @@ def _sensor(name):
                 PythonLaunchDescriptionSource(bringup),
                 launch_arguments={
                     "namespace": name,
-                    "use_mock_hardware": LaunchConfiguration("use_mock_hardware"),
                     "patient": LaunchConfiguration("patient"),
                     "robot_ip": LaunchConfiguration(f"{name}_robot_ip"),
                     "table_frame": f"{name}_table",

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
@@ -96,17 +98,19 @@ def hum(x: Samples, channel: str, sample_rate_hz: float, harmonics: Lines) -> li
     """
     periods, samples = x.shape
     length = periods * samples
-    spectrum = np.abs(scipy.fft.rfft(x.ravel() - x.mean())) ** 2
-    power = 2 * spectrum / length**2  # mean square per bin
+    resolution = sample_rate_hz / length
+    highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
+    spectrum = scipy.fft.rfft(x.ravel() - x.mean())[: math.ceil(highest) + 1]
+    power = 2 * np.abs(spectrum) ** 2 / length**2  # mean square per bin
     excited = np.zeros(power.size, bool)
-    excited[np.asarray(harmonics) * periods] = True
+    lines = np.asarray(harmonics) * periods
+    excited[lines[lines < power.size]] = True
     usable = ~excited
     if periods > 1:
         usable[::periods] = False  # harmonics not excited may hold distortion
-    resolution = sample_rate_hz / length
     found: list[tuple[float, float, bool]] = []
     for mains in MAINS_HZ:
-        lines = []
+        peaks = []
         for k in range(1, MAINS_HARMONICS + 1):
             centre = round(k * mains / resolution)
             # the floor is taken where leakage of the hum has died out
@@ -124,10 +128,10 @@ def hum(x: Samples, channel: str, sample_rate_hz: float, harmonics: Lines) -> li
             limit = special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size)
             if power[peak].max() > 2 * limit * floor:
                 near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
-                lines.append((k * mains, float(power[peak].sum()), near))
+                peaks.append((k * mains, float(power[peak].sum()), near))
         # the fundamental may be hidden, a single high harmonic may be anything
-        if lines and (lines[0][0] == mains or len(lines) > 1):
-            found += lines
+        if peaks and (peaks[0][0] == mains or len(peaks) > 1):
+            found += peaks
     if not found:
         return []
     rms = float(np.sqrt(sum(line[1] for line in found)))
@@ -140,10 +144,10 @@ def lost_samples(x: Samples, channel: str, harmonics: Lines) -> list[Fault]:
     """Periods shifted against each other: samples were lost between them."""
     # the first period may hold a transient: with three others it is left out
     start = 1 if x.shape[0] > 2 else 0
+    if x.shape[0] - start < 2:
+        return []
     spectra = np.zeros((x.shape[0] - start, x.shape[1] // 2 + 1), complex)
     spectra[:, harmonics] = period_spectra(x[start:], np.asarray(harmonics))
-    if spectra.shape[0] < 2:
-        return []
     cross = spectra[1:] * spectra[0].conj()
     magnitude = np.abs(cross)
     # all lines alike, so that the peak of the correlation is sharp

@@ -13,6 +13,8 @@ from rclpy.node import Node
 PERIOD_S = 1.0
 # How long after an error a node still warns of it.
 ERROR_REMEMBERED_S = 10.0
+MEAN, LONGEST = ": mean time [ms]", ": longest time [ms]"
+"""After a topic's name: how long a message of it kept the node, since the last report."""
 
 
 @dataclass
@@ -22,6 +24,7 @@ class _Flow:
     total: int = 0
     reported: int = 0
     last_s: float = field(default=float("nan"))
+    took_s: list[float] = field(default_factory=list)
 
 
 class Health:
@@ -58,6 +61,10 @@ class Health:
         flow.total += 1
         flow.last_s = time.monotonic()
 
+    def took(self, topic: str, seconds: float) -> None:
+        """Keep how long one message of a topic kept the node busy."""
+        self._flows.setdefault(topic, _Flow()).took_s.append(seconds)
+
     def error(self, text: str) -> None:
         """Log an error and remember it."""
         self._node.get_logger().error(text)
@@ -76,6 +83,11 @@ class Health:
         for topic, flow in self._flows.items():
             rate_hz = (flow.total - flow.reported) / (now_s - self._reported_s)
             flow.reported = flow.total
+            if flow.took_s:
+                mean_s = sum(flow.took_s) / len(flow.took_s)
+                values[f"{topic}{MEAN}"] = f"{1e3 * mean_s:.3g}"
+                values[f"{topic}{LONGEST}"] = f"{1e3 * max(flow.took_s):.3g}"
+                flow.took_s.clear()
             values[f"{topic}: messages"] = str(flow.total)
             values[f"{topic}: rate [Hz]"] = f"{rate_hz:.3g}"
             values[f"{topic}: age [s]"] = f"{now_s - flow.last_s:.3g}"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -81,7 +82,9 @@ class ManagedNode(LifecycleNode):
         def heard(message: Any) -> None:
             if self.active:
                 self.health.saw(topic)
+                begun_s = time.perf_counter()
                 callback(message)
+                self.health.took(topic, time.perf_counter() - begun_s)
 
         subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)
         self.resources.callback(self.destroy_subscription, subscription)

@@ -75,7 +75,7 @@ class ScanGoal(ScanClient):
 
     def _tell(self, feedback: Scan.Feedback) -> None:
         text = f"{feedback.finished} of {feedback.points} points finished"
-        if feedback.phase in ("surface", "reference", "paused"):
+        if feedback.phase in ("surface", "reference", "paused", "waiting"):
             text = feedback.phase
         elif feedback.finished and feedback.time_left_s > 0:
             text += f", {feedback.time_left_s:.0f} s left"

@@ -69,6 +69,8 @@ def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float
     )
     if surface is None:
         unsure.set_axis_off()
+        why = "too few points for a surface between them"
+        unsure.text(0.5, 0.5, why, ha="center", transform=unsure.transAxes)
     else:
         shown = _draw_surface(unsure, surface, surface.f0_std_hz, None)
         figure.colorbar(shown, ax=unsure, label="standard deviation of f0 [Hz]", shrink=0.9)

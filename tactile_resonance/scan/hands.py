@@ -15,6 +15,9 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
+# At what lost a node: it comes again when the node is back, unless it is what ends the node.
+ATTEMPTS_WITHOUT_NODE = 24
+NODE_BACK_WITHIN_S = 120.0
 Recording = PointRecording | ReferenceRecording
 Check = Callable[[], None]
 
@@ -24,18 +27,31 @@ class PointFailed(Exception):
 
 
 class PointDisturbed(PointFailed):
-    """A point was spoiled by something that says nothing of it: a late sensor, a node that went away.
+    """A point was spoiled by something that says nothing of it, a late sensor for example.
 
     Parameters
     ----------
     message : str
     kind : str
         The same in one or two words, to be counted.
+
+    Attributes
+    ----------
+    attempts : int
+        How often it is tried in all.
     """
+
+    attempts = ATTEMPTS
 
     def __init__(self, message: str, kind: str = "disturbed") -> None:
         super().__init__(message)
         self.kind = kind
+
+
+class NodeAway(PointDisturbed):
+    """A node that the point needs went away, or was started anew and knows nothing of what was asked."""
+
+    attempts = ATTEMPTS_WITHOUT_NODE
 
 
 class ScanEnded(Exception):
@@ -67,7 +83,18 @@ class Hands(Protocol):
 
     All raise `PointFailed`, or `ScanEnded` where no other point would fare better; while they wait they
     call `check`, which may raise `Interrupted`.
+
+    Attributes
+    ----------
+    free_air : bool
+        Whether the tip is in free air between points, so that references can be taken there.
     """
+
+    free_air: bool
+
+    def missing(self) -> str | None:
+        """What points need and is not there now, for people; None: nothing. Asked with the tip free."""
+        ...
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
         """Bring the tip there and press until the force is held."""

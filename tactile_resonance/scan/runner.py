@@ -7,7 +7,7 @@ What moves and measures is behind `hands.Hands`; the same loop serves nodes and 
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,8 +16,9 @@ import numpy as np
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Decision, decide
+from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
-    ATTEMPTS,
+    NODE_BACK_WITHIN_S,
     Hands,
     Interrupted,
     PointDisturbed,
@@ -39,7 +40,7 @@ from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, ScanScene
 
-PAUSE_POLL_S = 0.05
+POLL_S = 0.05
 SKIPPED = "skipped on request"
 
 
@@ -52,7 +53,7 @@ class Progress:
     point : ScanPoint or None
         Under way; None before the first and after the last.
     phase : str
-        For people: reference, contact, measure, retract, paused.
+        For people: waiting, reference, contact, measure, retract, paused.
     finished, points : int
     blocks : int
         At this point so far.
@@ -138,7 +139,7 @@ class ScanRunner:
         self._hands, self._controls, self._tell = hands, controls, tell
         self._seed = seed
         self._durations_s: list[float] = []
-        self._disturbed: dict[int, Counter[str]] = {}
+        self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
         self._air: AirReference | None = None
 
     def run(self) -> Summary:
@@ -164,12 +165,8 @@ class ScanRunner:
         return self._summary(message)
 
     def _next(self) -> ScanPoint | None:
-        """The point to touch next; waits while the scan is paused."""
-        while self._controls.paused.is_set() and not self._controls.cancelled.is_set():
-            self._say(None, "paused")
-            time.sleep(PAUSE_POLL_S)
-        if self._controls.cancelled.is_set():
-            raise Interrupted
+        """The point to touch next; waits while the scan is paused or a node is away."""
+        self._wait()
         point = self._run.content.next_point
         request = self._controls.take()
         if request is Request.REPEAT and self._run.content.results:
@@ -190,6 +187,22 @@ class ScanRunner:
                 )
             return self._next()
         return point
+
+    def _wait(self) -> None:
+        """With the tip free, while the scan is paused and until all is there that points need."""
+        deadline = time.monotonic() + NODE_BACK_WITHIN_S
+        while not self._controls.cancelled.is_set():
+            if self._controls.paused.is_set():
+                self._say(None, "paused")
+                deadline = time.monotonic() + NODE_BACK_WITHIN_S
+            elif missing := self._hands.missing():
+                self._say(None, "waiting")
+                if time.monotonic() > deadline:
+                    raise ScanEnded(f"{missing}, for {NODE_BACK_WITHIN_S:g} s")
+            else:
+                return
+            time.sleep(POLL_S)
+        raise Interrupted
 
     def _point(self, point: ScanPoint) -> None:
         """One attempt at a point, finished with a result whatever happens, unless it shall be repeated."""
@@ -221,9 +234,7 @@ class ScanRunner:
                     check,
                 )
             except PointDisturbed as error:
-                disturbed = self._disturbed.setdefault(point.index, Counter())
-                if disturbed.total() < ATTEMPTS - 1:
-                    disturbed[error.kind] += 1
+                if self._disturbed[point.index].again(error):
                     self._hands.retract()  # nothing is kept of it, and the point comes again
                     return
                 reason = str(error)
@@ -259,8 +270,8 @@ class ScanRunner:
                     duration_s=duration_s,
                     air=self._air,
                 )
-            disturbed = self._disturbed.pop(point.index, Counter())
-            result = replace(result, repeats=disturbed.total(), disturbances=_told(disturbed))
+            disturbed = self._disturbed.pop(point.index, Disturbances())
+            result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
             recording.finish(result)
         self._durations_s.append(duration_s)
         if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
@@ -281,16 +292,20 @@ class ScanRunner:
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan."""
+        if not self._hands.free_air:
+            return
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
-        self._say(None, "reference")
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
         seed = self._seed + len(self._plan.points) + (name == AFTER)
 
         def all_blocks(poles: Poles, blocks: int) -> bool:
             return False
 
-        for _ in range(ATTEMPTS):
+        disturbed = Disturbances()
+        while True:
+            self._wait()
+            self._say(None, "reference")
             with self._run.begin_reference(name) as recording:
                 try:
                     self._hands.measure(
@@ -301,8 +316,10 @@ class ScanRunner:
                         recording,
                         self._controls.check,
                     )
-                except PointDisturbed:
-                    continue
+                except PointDisturbed as error:
+                    if disturbed.again(error):
+                        continue
+                    return
                 except PointFailed:
                     return
                 recording.finish()
@@ -322,7 +339,7 @@ class ScanRunner:
     def _repeats(self) -> int:
         """Of the points that are finished and of the one under way."""
         finished = sum(result.repeats for result in self._run.content.results)
-        return finished + sum(counts.total() for counts in self._disturbed.values())
+        return finished + sum(of_point.total for of_point in self._disturbed.values())
 
     def _summary(self, message: str) -> Summary:
         latest = self._run.content.latest
@@ -342,7 +359,3 @@ class ScanRunner:
             health=health,
             health_sentence=sentence,
         )
-
-
-def _told(disturbed: Counter[str]) -> str:
-    return ", ".join(f"{kind} {count}" for kind, count in sorted(disturbed.items()))

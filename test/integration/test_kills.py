@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-from benchmarks.kills import ALL, KilledScan
+from benchmarks.killed_scan import ALL, KilledScan
 
 VICTIMS = ("frf_node", "scan_node", ALL)
 

@@ -16,12 +16,22 @@ import pytest
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan import runner
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import BlockLimits, Precise
-from tactile_resonance.scan.hands import ATTEMPTS, Measured, PointDisturbed, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import (
+    ATTEMPTS,
+    ATTEMPTS_WITHOUT_NODE,
+    Measured,
+    NodeAway,
+    PointDisturbed,
+    PointFailed,
+    ScanEnded,
+)
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
@@ -38,6 +48,10 @@ class Bench:
     failing: tuple = ()
     on_measure: object = None
     holding: bool = False
+    free_air: bool = True
+
+    def missing(self):
+        return None
 
     def touch(self, point, force_n, hold, check):
         check()
@@ -181,6 +195,76 @@ def test_a_reference_that_is_disturbed_comes_again(tmp_path):
         assert [name[13:-5] for name in sorted(references)] == kept
 
 
+@dataclass
+class Leaving(Bench):
+    """At point 1 a node goes away so many times; after each it is missed for a while."""
+
+    left: int = ATTEMPTS + 2
+    away: int = 0
+
+    def missing(self):
+        assert not self.holding, "waits with the tip on the tissue"
+        self.away = max(0, self.away - 1)
+        return "frf: /frf_node is not active" if self.away else None
+
+    def measure(self, design, label, seed, enough, recording, check):
+        assert not self.away, "measured while the node was away"
+        if label != "air" and self.log[-1] == ("touch", 1) and self.left:
+            self.left -= 1
+            self.away = 4
+            raise NodeAway("frf: /frf_node is not active", "node away")
+        return super().measure(design, label, seed, enough, recording, check)
+
+
+def test_a_point_whose_node_is_away_comes_again_when_it_is_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "POLL_S", 0.001)
+    # the time that the point may take is not spent on waiting
+    made = scene(time_limits=TimeLimits(point_s=0.5, scan_s=3600))
+    summary, run, told = scan(tmp_path / "back", made, Leaving())
+    assert (summary.complete, summary.done, summary.failed) == (True, 4, 0)
+    assert run.latest[1].repeats == ATTEMPTS + 2
+    assert run.latest[1].disturbances == f"node away {ATTEMPTS + 2}"
+    assert "waiting" in [progress.phase for progress in told]
+    # a point that ends its node every time is given up at last
+    summary, run, _ = scan(tmp_path / "never", made, Leaving(left=10**6))
+    assert (summary.complete, summary.done, summary.failed) == (True, 3, 1)
+    assert run.latest[1].repeats == ATTEMPTS_WITHOUT_NODE - 1
+
+
+def test_a_scan_whose_node_stays_away_ends_with_its_name_and_can_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "NODE_BACK_WITHIN_S", 0.2)
+
+    def leave(bench, blocks):
+        if bench.log[-1] == ("touch", 2):
+            bench.away = 10**6
+            raise NodeAway("frf: /frf_node is not active", "node away")
+
+    summary, run, _ = scan(tmp_path / "run", scene(), Leaving(on_measure=leave, left=0))
+    assert not summary.complete
+    assert "/frf_node is not active" in summary.message
+    assert [result.outcome for result in run.latest] == [Outcome.DONE] * 2
+    assert run.next_point.index == 2
+
+
+def test_a_scan_that_waits_for_a_node_can_be_cancelled(tmp_path):
+    controls = Controls()
+    bench = Leaving(away=10**6)
+    threading.Timer(0.2, lambda: controls.ask(Request.CANCEL)).start()
+    summary, run, _ = scan(tmp_path / "run", scene(), bench, controls)
+    assert summary.message == "cancelled"
+    assert run.latest == ()
+
+
+def test_without_free_air_nothing_is_called_a_reference(tmp_path):
+    bench = Bench(free_air=False)
+    summary, run, _ = scan(tmp_path / "run", scene(), bench)
+    assert summary.complete
+    assert "air" not in [entry[1] for entry in bench.log]
+    assert not [file.name for file in run.files if file.name.startswith("reference-")]
+    assert summary.health is SensorHealth.UNKNOWN
+    assert all(np.isnan(result.f0_over_air) for result in run.latest)
+
+
 def test_a_scene_may_stop_at_a_failure(tmp_path):
     made = scene(on_failure=OnFailure.STOP)
     summary, run, _ = scan(tmp_path / "run", made, Bench(failing=(1,)))
@@ -240,8 +324,7 @@ def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     made = scene(2)
     plan, run = begin(tmp_path / "run", made)
     with run:
-        runner = ScanRunner(made, plan, run, Bench(), controls, lambda progress: None)
-        runner.run()
+        ScanRunner(made, plan, run, Bench(), controls, lambda progress: None).run()
         controls.ask(Request.REPEAT)
         ScanRunner(made, plan, run, Bench(), controls, lambda progress: None).run()
     content = read_run(tmp_path / "run")
@@ -256,8 +339,8 @@ def test_a_paused_scan_waits_with_the_tip_free(tmp_path):
     plan, run = begin(tmp_path / "run", made)
     phases = []
     with run:
-        runner = ScanRunner(made, plan, run, bench, controls, lambda p: phases.append(p.phase))
-        thread = threading.Thread(target=runner.run)
+        scanning = ScanRunner(made, plan, run, bench, controls, lambda p: phases.append(p.phase))
+        thread = threading.Thread(target=scanning.run)
         thread.start()
         while "paused" not in phases:
             time.sleep(0.01)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans whose nodes are killed: what is finished is looked at after every kill, from the files alone."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.kills_reader import Finished, finished_points
+from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.simulation.plant_defaults import PATIENT, TABLE_IN_BASE
+
+STREAM = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
+OTHERS = ("pole_map_node", "scan_node")
+MANAGER = "manager_node"
+ALL = "all at once"
+UP_WITHIN_S = 240.0  # of a machine that may have other work
+SCAN_WITHIN_S = 300.0
+LONGEST_WAIT_S = 3.0
+BLOCKS = 3
+SCENE = """
+name: to be killed
+force_n: 0.01
+regions:
+  - {{name: gelatine 10 %, gelatine_percent: 10.0, disc: {{center_m: [0.0, 0.0], radius_m: 0.025}}}}
+positions:
+  grid: {{center_m: [0.0, 0.0], size_m: [{size_x}, {size_y}], spacing_m: 0.003}}
+blocks: {{least: {blocks}, most: {blocks}}}
+"""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One kill.
+
+    Attributes
+    ----------
+    victim : str
+        Name of a node, or `ALL`.
+    finished : int
+        Points that were finished then.
+    in_the_midst : bool
+        A point or reference was being recorded.
+    phase : str
+        That the scan had told last.
+    """
+
+    victim: str
+    finished: int
+    in_the_midst: bool
+    phase: str
+
+
+class KilledScan:
+    """Scans of one scene, one after the other, whose nodes are killed; a context that ends them.
+
+    Parameters
+    ----------
+    folder : Path
+        Receives runs and logs.
+    points : (columns, rows)
+        Of the grid that is scanned.
+    robot_host : str
+        127.x.y.z of a simulated robot with load cell; empty: ideal contact, as fast as the bench computes.
+    """
+
+    def __init__(self, folder: Path, points: tuple[int, int], robot_host: str = "") -> None:
+        self._folder = folder
+        self._points = points[0] * points[1]
+        scene = folder / "scene.yaml"
+        size = [0.003 * (n - 1) for n in points]
+        scene.write_text(SCENE.format(size_x=size[0], size_y=size[1], blocks=BLOCKS))
+        self._scene = scene
+        self.nodes = (*STREAM, *(["contact_node"] if robot_host else []), *OTHERS)
+        self._parameters: dict[str, dict[str, object]] = {
+            "fake_hardware_node": {"scene": scene, "speed": 0.0},
+            "excitation_node": {"record_folder": folder / "records"},
+            "scan_node": {"contact": "none"},
+            MANAGER: {"nodes": f"[{','.join(self.nodes)}]"},
+        }
+        if robot_host:
+            table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
+            self._parameters["fake_hardware_node"] = {
+                "scene": scene,
+                "robot_host": robot_host,
+                "table_in_base": table,
+            }
+            self._parameters["contact_node"] = {
+                "robot_host": robot_host,
+                "force_host": robot_host,
+                **PATIENT,
+            }
+            self._parameters["scan_node"] = {"table_in_base": table}
+        self._known: dict[str, Finished] = {}
+        self._run = folder / "run-0"
+        self._runs = 0
+        self._phase, self._finished = "", 0
+        self.kills: list[Kill] = []
+
+    def __enter__(self) -> KilledScan:
+        from tactile_resonance.nodes.scan_client import ScanClient
+
+        self._processes = NodeProcesses(self._folder / "log")
+        self._client = ScanClient(self._processes.check)
+        self._client.__enter__()
+        self._start((*self.nodes, MANAGER))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._processes.stop()
+        self._client.__exit__()
+
+    def undisturbed(self) -> dict[int, tuple[float, ...]]:
+        """Poles by point of a scan from beginning to end."""
+        self._begin()
+        return self._to_the_end()
+
+    def disturbed(
+        self, victims: Sequence[str], random: np.random.Generator, longest_s: float = float("inf")
+    ) -> list[dict[int, tuple[float, ...]]]:
+        """Kill these one after the other, for so long at most; poles by point of every scan that it took.
+
+        Raises
+        ------
+        AssertionError
+            If a finished point is lost, changed, repeated or not readable, or a scan does not come to its end.
+        """
+        scans = []
+        over_s = time.monotonic() + longest_s
+        self._begin()
+        for victim in victims:
+            if time.monotonic() > over_s:
+                break
+            # every other time the scan may first finish a point; else it is met again while it recovers
+            wanted = self._finished + int(random.integers(2))
+            wait_s = float(random.uniform(0.0, LONGEST_WAIT_S))
+            end_s = time.monotonic() + wait_s
+            while time.monotonic() < end_s:
+                self._client.spin(0.02)
+                if self._result.done():
+                    scans.append(self._to_the_end())
+                    self._begin()
+                    wanted = 0
+                if self._finished < wanted:
+                    end_s = time.monotonic() + wait_s
+            self._kill(victim)
+        scans.append(self._to_the_end())
+        return scans
+
+    def _kill(self, victim: str) -> None:
+        killed = (*self.nodes, MANAGER) if victim == ALL else (victim,)
+        self._processes.kill(*killed)
+        found = self._look()
+        hidden = self._run / ".unfinished"
+        midst = hidden.is_dir() and any(hidden.iterdir())
+        self.kills.append(Kill(victim, len(found), midst, self._phase))
+        print(f"kill {len(self.kills)}: {self.kills[-1]}", file=sys.stderr, flush=True)
+        self._start(killed)
+        if "scan_node" in killed:
+            self._ask(resume=True)
+
+    def _start(self, nodes: Sequence[str]) -> None:
+        for _ in range(10):  # what those that were killed had told
+            self._client.spin(0.02)
+        states = self._client.states
+        states.clear()
+        for node in nodes:
+            self._processes.start(node, self._parameters.get(node))
+
+        def up() -> bool:
+            # each tells of itself: the manager may not have noticed yet that one was away
+            return all(states.get(node, "").startswith("active") for node in (*nodes, MANAGER))
+
+        self._client.wait(up, UP_WITHIN_S, "the nodes to come up")
+
+    def _begin(self) -> None:
+        self._run = self._folder / f"run-{self._runs}"
+        self._runs += 1
+        self._known, self._finished = {}, 0
+        self._ask(resume=False)
+
+    def _ask(self, *, resume: bool) -> None:
+        from tactile_resonance.action import Scan
+
+        goal = Scan.Goal(scene=str(self._scene), run_directory=str(self._run), resume=resume)
+        # a scan that was killed before it had a folder cannot be resumed
+        if resume and not (self._run / "run.json").exists():
+            goal.resume = False
+        self._result = self._client.start(goal, self._hear).get_result_async()
+
+    def _hear(self, feedback) -> None:
+        self._phase, self._finished = feedback.phase, feedback.finished
+
+    def _look(self) -> dict[str, Finished]:
+        """Every finished file, readable to its end, none of them lost, changed or repeated."""
+        found = finished_points(self._run / "recording")
+        for name, before in self._known.items():
+            assert found.get(name) == before, f"{name} was finished and is lost or changed"
+        twice = [i for i, n in Counter(point.index for point in found.values()).items() if n > 1]
+        assert not twice, f"points {twice} were finished more than once"
+        self._known = found
+        return found
+
+    def _to_the_end(self) -> dict[int, tuple[float, ...]]:
+        from tactile_resonance.action import Scan
+
+        self._client.wait(self._result.done, SCAN_WITHIN_S, "the scan")
+        result = self._result.result().result
+        assert result.outcome == Scan.Result.COMPLETE, result.message
+        assert (result.done, result.failed, result.skipped) == (self._points, 0, 0), result.message
+        found = self._look()
+        assert sorted(point.index for point in found.values()) == list(range(self._points))
+        for name, point in found.items():
+            assert point.counts == (BLOCKS, BLOCKS, BLOCKS), f"{name}: {point.counts}"
+        if "contact_node" in self.nodes:  # without a robot nobody lifts the tip into free air
+            references = sorted(path.stem[13:] for path in self._run.glob("recording/reference-*"))
+            assert references == ["air-after", "air-before"], references
+        return {point.index: point.poles for point in found.values()}

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What spoiled attempts without saying anything of the point, and how often an attempt may come again."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from tactile_resonance.scan.hands import PointDisturbed
+
+
+class Disturbances:
+    """Of one point, reference or touch."""
+
+    def __init__(self) -> None:
+        self._kinds: Counter[str] = Counter()
+        self._attempts: Counter[int] = Counter()
+
+    def again(self, error: PointDisturbed) -> bool:
+        """Count an attempt that ended so; whether another may follow. The last one is not counted."""
+        if self._attempts[error.attempts] + 1 >= error.attempts:
+            return False
+        self._attempts[error.attempts] += 1
+        self._kinds[error.kind] += 1
+        return True
+
+    @property
+    def total(self) -> int:
+        """Attempts that were begun again."""
+        return self._kinds.total()
+
+    def __str__(self) -> str:
+        return ", ".join(f"{kind} {count}" for kind, count in sorted(self._kinds.items()))

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node tells of its own health."""
+
+import os
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+
+import rclpy
+
+from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, Health
+from tactile_resonance.processes import free_domain_id
+
+
+def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatch):
+    told = []
+    with rclpy.init(domain_id=free_domain_id(os.environ)):
+        node = rclpy.create_node("health")
+        health = Health(node, lambda: "active", dict)
+        monkeypatch.setattr(health._publisher, "publish", told.append)
+        for seconds in (0.002, 0.003, 0.010):
+            health.saw("record")
+            health.took("record", seconds)
+        health._publish()
+        health._publish()  # nothing came since
+        node.destroy_node()
+    first, second = ({v.key: v.value for v in array.status[0].values} for array in told)
+    assert float(first[f"record{MEAN}"]) == pytest.approx(5.0)
+    assert float(first[f"record{LONGEST}"]) == pytest.approx(10.0)
+    assert first["record: messages"] == second["record: messages"] == "3"
+    assert f"record{MEAN}" not in second
