@@ -177,10 +177,10 @@ def _round_trip_s(host: str) -> float:
         start = time.perf_counter()
         try:
             socket.create_connection((host, RTDE_PORT), timeout=2.0).close()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: what no name or address can be
+            reason = getattr(error, "strerror", None) or error
             raise ArmError(
-                ArmFault.LINK_LOST,
-                f"no robot answers at {host}, port {RTDE_PORT}: {error.strerror or error}",
+                ArmFault.LINK_LOST, f"no robot answers at {host}, port {RTDE_PORT}: {reason}"
             ) from error
         times.append(time.perf_counter() - start)
     return min(times)
