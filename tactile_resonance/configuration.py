@@ -45,6 +45,22 @@ def share_path(relative: str | Path) -> Path:
     raise FileNotFoundError(f"shared file {str(relative)!r} not found; looked at:\n  {places}")
 
 
+def shared_file(path: Path, folder: str) -> Path:
+    """Return a path as it is, or, for a bare name that is no file here, that of a shared folder.
+
+    Raises
+    ------
+    ValueError
+        If it is in neither place.
+    """
+    if len(path.parts) != 1 or path.is_file():
+        return path
+    try:
+        return share_path(Path(folder) / path)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: neither a file here nor one of {folder}") from None
+
+
 def _share_roots() -> Iterator[Path]:
     yield Path(__file__).resolve().parent.parent
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -52,7 +52,12 @@ def known_keys(mapping: Mapping[str, Any], keys: set[str], where: str) -> None:
 
 def number(value: object, field: str) -> float:
     """Return `value` as a finite float; ``ValueError`` if it is none."""
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    # an integer may be beyond all floats, which math.isfinite does not take
+    good = (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
     require(good, field, value, "a finite number (write exponents as 1.0e-3)")
     return float(value)  # type: ignore[arg-type]
 

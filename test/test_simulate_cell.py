@@ -43,14 +43,16 @@ def test_lines_that_mean_nothing_are_said():
         text=True,
     )
     process.stdout.readline()
-    process.stdin.write("melted 1\nforce\nsilent nan\n")
+    process.stdin.write("melted 1\nforce\nsilent nan\nforce inf\nlose_second_every 0.5\n")
     process.stdin.flush()
-    said = [process.stderr.readline() for _ in range(3)]
+    said = [process.stderr.readline() for _ in range(5)]
     process.terminate()
     process.communicate(timeout=PATIENCE_S)
     assert "fault: got 'melted'; accepted is silent, stuck" in said[0]
-    assert "'force'" in said[1]
+    assert "'force': expected a name and a number" in said[1]
     assert "silent: got nan" in said[2]
+    assert "force: got inf" in said[3]
+    assert "lose_second_every: got 0.5" in said[4]
 
 
 @pytest.mark.parametrize(
@@ -66,6 +68,11 @@ def test_what_is_wrong_is_said_in_one_line(capsys, options, reason):
     said = capsys.readouterr().err
     assert reason in said
     assert said.count("\n") == 1
+
+
+def test_others_than_this_machine_are_not_served(capsys):
+    assert main(["simulate-cell", "--host", "0.0.0.0"]) == 1
+    assert "host: '0.0.0.0', expected an address 127.x.y.z" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_said(capsys):

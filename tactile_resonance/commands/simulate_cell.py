@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_resonance.commands.simulate_ur import require_loopback
+from tactile_resonance.fields import number
 from tactile_resonance.simulation.cell_loop import CellLoop
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.slcan import SlcanServer
@@ -35,9 +37,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "its z axis; 'silent 1', 'stuck 1', 'lose_second_every 2', 'invalid 1', 'saturated 1', 'flipped 1', "
         "'bias_step_n 0.02' make it faulty, and 0 ends the fault.",
     )
-    parser.add_argument(
-        "--host", default="127.0.1.1", help="address to listen on (default: 127.0.1.1)"
-    )
+    parser.add_argument("--host", default="127.0.1.1", help="any 127.x.y.z (default: 127.0.1.1)")
     parser.add_argument("--port", type=int, default=29536, help="0: a free one (default: 29536)")
     parser.add_argument(
         "--bus",
@@ -58,6 +58,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Serve until interrupted or told to end."""
+    require_loopback(options.host)
     if not 0 <= options.port <= 65535:
         raise ValueError(f"--port: {options.port}, expected 0 to 65535")
     if options.seed < 0:
@@ -68,8 +69,8 @@ def run(options: argparse.Namespace) -> int:
     except OSError as error:
         raise ValueError(f"{options.host}:{options.port}: {error.strerror or error}") from error
     ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    for which in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(which, lambda *_: ended.set())
     wrench = np.zeros(6)
     threading.Thread(target=_listen, args=(cell, wrench), daemon=True).start()
     loop = CellLoop(cell, bus, lambda _: wrench)
@@ -86,11 +87,14 @@ def run(options: argparse.Namespace) -> int:
 def _listen(cell: LoadCell, wrench: np.ndarray) -> None:
     """Do what the lines on standard input say."""
     for line in sys.stdin:
+        words = line.split()
         try:
-            name, text = line.split()
-            if name == "force":
-                wrench[2] = float(text)
+            if len(words) != 2:
+                raise ValueError("expected a name and a number, such as 'force 0.01'")
+            value = float(words[1])
+            if words[0] == "force":
+                wrench[2] = number(value, "force")
             else:
-                cell.faults.inject(name, float(text))
+                cell.faults.inject(words[0], value)
         except ValueError as error:
             print(f"load cell: {line.strip()!r}: {error}", file=sys.stderr, flush=True)

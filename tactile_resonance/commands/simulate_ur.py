@@ -17,6 +17,18 @@ if TYPE_CHECKING:
     from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 
 
+BENCH_DEFAULTS = {
+    "table": TABLE_IN_BASE,
+    "surface_height": 0.2,
+    "tilt": 0.0,
+    "rigid_tip": False,
+    "cell": None,
+    "mount": "table",
+    "can_port": 29536,
+}
+"""Of the options that say what the tool touches."""
+
+
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
     parser = commands.add_parser(
@@ -53,31 +65,25 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--table",
         type=float,
         nargs=6,
-        default=TABLE_IN_BASE,
         metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
         help="frame of the scene in the robot's base: metres and rotation vector",
     )
     bench.add_argument(
         "--surface-height",
         type=float,
-        default=0.2,
         metavar="M",
         help="of the tissue above the robot's base (default: 0.2)",
     )
-    bench.add_argument("--tilt", type=float, default=0.0, metavar="DEG", help="(default: 0)")
+    bench.add_argument("--tilt", type=float, metavar="DEG", help="(default: 0)")
     bench.add_argument(
         "--rigid-tip", action="store_true", help="the ball without the sensor's beam"
     )
     bench.add_argument(
         "--cell", type=Path, metavar="FILE", help="load cell (default: config/load_cells/fine.yaml)"
     )
-    bench.add_argument(
-        "--mount", choices=("table", "tool"), default="table", help="of the cell (default: table)"
-    )
-    bench.add_argument(
-        "--can-port", type=int, default=29536, help="its socketcand port (default: 29536)"
-    )
-    parser.set_defaults(run=run)
+    bench.add_argument("--mount", choices=("table", "tool"), help="of the cell (default: table)")
+    bench.add_argument("--can-port", type=int, help="its socketcand port (default: 29536)")
+    parser.set_defaults(run=run, **BENCH_DEFAULTS)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -161,18 +167,42 @@ class _Bench:
         attach(robot, self.tabletop, CellOnBus(self.tabletop.plant, cell, bus))
 
 
-def _check(options: argparse.Namespace) -> None:
+def require_loopback(host: str) -> None:
+    """Raise ``ValueError`` unless an address is of this machine alone: nobody else may move anything."""
     try:
-        loopback = ipaddress.IPv4Address(options.host).is_loopback
+        loopback = ipaddress.IPv4Address(host).is_loopback
     except ValueError:
         loopback = False
     if not loopback:
-        raise ValueError(f"host: {options.host!r}, expected an address 127.x.y.z")
-    if not 1024 <= options.control_port <= 65535:
-        raise ValueError(f"control-port: {options.control_port}, expected 1024 to 65535")
+        raise ValueError(f"host: {host!r}, expected an address 127.x.y.z")
+
+
+def _check(options: argparse.Namespace) -> None:
+    require_loopback(options.host)
+    for name in ("control_port", "can_port"):
+        port = getattr(options, name)
+        if not 1024 <= port <= 65535:
+            raise ValueError(f"{name.replace('_', '-')}: {port}, expected 1024 to 65535")
+    if not all(abs(value) <= 10.0 for value in options.table):
+        raise ValueError(f"table: {options.table}, expected numbers within +-10")
     if not 0 <= options.priority <= 99:
         raise ValueError(f"priority: {options.priority}, expected 0 to 99")
     if options.tissue is not None and options.scene is not None:
         raise ValueError("tissue, scene: both given, expected one of them")
     if options.seed < 0:
         raise ValueError(f"seed: {options.seed}, expected at least 0")
+    _check_used(options)
+
+
+def _check_used(options: argparse.Namespace) -> None:
+    """Refuse what would be passed over in silence."""
+    needed = {
+        **dict.fromkeys(("rigid_tip", "cell", "mount", "can_port"), ("tissue", "scene")),
+        **dict.fromkeys(("surface_height", "tilt"), ("tissue",)),
+        "table": ("scene",),
+    }
+    for name, others in needed.items():
+        given = getattr(options, name) != BENCH_DEFAULTS[name]
+        if given and all(getattr(options, other) is None for other in others):
+            wanted = " or ".join(f"--{other}" for other in others)
+            raise ValueError(f"{name.replace('_', '-')}: serves only with {wanted}")

@@ -40,7 +40,7 @@ def open_bus(settings: dict[str, Any], where: str) -> can.BusABC:
         address = (settings.get("host"), settings.get("port"))
         try:
             socket.create_connection(address, OPEN_WITHIN_S).close()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: what no name or address can be
             text = f"{where}: {one_line(error)}"
             raise ForceError(ForceFault.LINK_LOST, text) from error
     opened: list[can.BusABC] = []

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import shared_file
 from tactile_resonance.fields import known_keys, read_yaml, require, section
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -172,8 +172,7 @@ def read_can_description(path: Path) -> CanDescription:
     ValueError
         Names the field, its value, and what is accepted.
     """
-    if len(path.parts) == 1 and not path.is_file():
-        path = share_path(Path("config/force/frames") / path)
+    path = shared_file(path, "config/force/frames")
     content = read_yaml(path)
     try:
         return _description(content)

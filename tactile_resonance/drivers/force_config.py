@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import shared_file
 from tactile_resonance.contact.cell_checks import CellLimits
 from tactile_resonance.contact.interfaces import ForceInfo, Mount
 from tactile_resonance.contact.mounting import Mounting
@@ -28,6 +28,8 @@ from tactile_resonance.fields import (
 
 KINDS = ("can", "rtde", "topic")
 STAMPS = ("adapter", "arrival")
+LONGEST_S = 1.0
+"""Of delays and filters: with more, no contact is controlled."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,7 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
         Names the field, its value, and what is accepted; or says with which figures the source cannot
         control this force.
     """
-    if len(path.parts) == 1 and not path.is_file():
-        path = share_path(Path("config/force") / path)
+    path = shared_file(path, "config/force")
     content = read_yaml(path)
     try:
         config = _config(content, path.parent)
@@ -171,8 +172,8 @@ def _config(content: dict[str, Any], folder: Path) -> ForceConfig:
         info=info,
         range_nm=_positive(content, "range_nm"),
         mounting=_mounting(content, Mount(mount)),
-        inertia_window_s=_not_negative(content, "inertia_window_s"),
-        latency_s=_not_negative(content, "latency_s"),
+        inertia_window_s=_short(content, "inertia_window_s"),
+        latency_s=_short(content, "latency_s"),
         limits=limits,
         can=can,
         topic=topic,
@@ -185,6 +186,10 @@ def _can(content: dict[str, Any], folder: Path) -> CanConfig:
     if bus["interface"] == "socketcand":
         # without it the kernel holds small packets back for tens of milliseconds
         bus.setdefault("tcp_tune", True)
+        host, port = bus.get("host"), bus.get("port")
+        require(isinstance(host, str) and bool(host), "bus.host", host, "a name or an address")
+        good = type(port) is int and 0 < port < 1 << 16
+        require(good, "bus.port", port, "an integer from 1 to 65535")
     frames = content.get("frames")
     require(isinstance(frames, str) and bool(frames), "frames", frames, "a file")
     beside = folder / str(frames)
@@ -208,8 +213,8 @@ def _can(content: dict[str, Any], folder: Path) -> CanConfig:
         description=description,
         scale=scale,
         stamps=stamps,
-        shortest_delay_s=_not_negative(content, "shortest_delay_s"),
-        delay_std_s=_not_negative(content, "delay_std_s"),
+        shortest_delay_s=_short(content, "shortest_delay_s"),
+        delay_std_s=_short(content, "delay_std_s"),
     )
 
 
@@ -235,7 +240,7 @@ def _positive(content: dict[str, Any], name: str) -> float:
     return value
 
 
-def _not_negative(content: dict[str, Any], name: str) -> float:
+def _short(content: dict[str, Any], name: str) -> float:
     value = number(content.get(name, 0.0), name)
-    require(value >= 0, name, value, "a number, 0 or above")
+    require(0 <= value <= LONGEST_S, name, value, f"0 to {LONGEST_S:g} s")
     return value

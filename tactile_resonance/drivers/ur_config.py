@@ -97,9 +97,11 @@ class UrArmConfig:
             ("payload_cog_m", self.payload_cog_m),
             ("tip_in_flange", self.tip_in_flange.vector),
         ):
-            if not all(math.isfinite(value) and abs(value) < 10 for value in values):
+            if not all(abs(value) < 10 for value in values):
                 raise ValueError(f"{name}: {list(values)}, expected numbers within +-10")
-        if not isinstance(self.realtime_priority, int) or not 0 <= self.realtime_priority <= 99:
+        if type(self.check_dashboard) is not bool:
+            raise ValueError(f"check_dashboard: {self.check_dashboard!r}, expected true or false")
+        if type(self.realtime_priority) is not int or not 0 <= self.realtime_priority <= 99:
             raise ValueError(f"realtime_priority: {self.realtime_priority!r}, expected 0 to 99")
 
     def to_dict(self) -> dict[str, Any]:
@@ -159,7 +161,7 @@ def _numbers(name: str, values: Any, length: int) -> tuple[float, ...]:
     if (
         not isinstance(values, (list, tuple))
         or len(values) != length
-        or not all(isinstance(value, (int, float)) for value in values)
+        or not all(type(value) in (int, float) for value in values)
     ):
         raise ValueError(f"{name}: {values!r}, expected {length} numbers")
     return tuple(float(value) for value in values)

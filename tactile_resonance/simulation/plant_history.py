@@ -6,9 +6,9 @@ No instrument shows it: tests and benchmarks judge by it how deep, how hard and 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 
+from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant import Plant
 
 KEEP_STEPS = 30_000
@@ -40,11 +40,7 @@ class PlantHistory:
 
         Answers ``time_s`` (n,), ``tip_m`` (n, 3) in the base and ``normal_force_n`` (n,).
         """
-        after_s = fields.get("after_s", 0.0)
-        if isinstance(after_s, bool) or not isinstance(after_s, (int, float)):
-            raise ValueError(f"after_s: {after_s!r}, expected a number")
-        if not math.isfinite(after_s):
-            raise ValueError(f"after_s: {after_s!r}, expected a finite number")
+        after_s = number(fields.get("after_s", 0.0), "after_s")
         found: list[tuple[float, list[float], float]] = []
         for step in reversed(self._steps):
             if step[0] <= after_s:

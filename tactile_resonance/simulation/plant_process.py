@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import require
+from tactile_resonance.fields import number, require
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
@@ -138,9 +138,9 @@ class Tabletop:
     def place_surface(self, fields: dict) -> dict:
         """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
         setup = BenchSetup(
-            surface_height_m=_number(fields, "height_m"),
-            tilt_rad=_number(fields, "tilt_rad", 0.0),
-            azimuth_rad=_number(fields, "azimuth_rad", 0.0),
+            surface_height_m=number(fields.get("height_m"), "height_m"),
+            tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
+            azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
         )
         self.plant.surface = Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
         return {}
@@ -203,7 +203,7 @@ class CellOnBus:
         if fault == "server_gone":
             self._bus.drop_clients()
         else:
-            self._cell.faults.inject(str(fault), _number(fields, "value"))
+            self._cell.faults.inject(str(fault), number(fields.get("value"), "value"))
         return {}
 
 
@@ -219,10 +219,3 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     if cell is not None:
         commands["cell_fault"] = cell.inject
         robot.after_step.append(cell.step)
-
-
-def _number(fields: dict, name: str, default: float | None = None) -> float:
-    value = fields.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{name}: {value!r}, expected a number")
-    return float(value)

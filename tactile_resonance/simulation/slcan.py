@@ -7,12 +7,14 @@ ends with CR and is answered with CR, or BELL where it fails.
 
 from __future__ import annotations
 
+import re
 import time
 
 from tactile_resonance.simulation.load_cell import CanFrame
 from tactile_resonance.simulation.tcp_bus import Client, TcpBus
 
 OK, FAILED = b"\r", b"\a"
+_FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
 class SlcanServer(TcpBus):
@@ -29,7 +31,7 @@ class SlcanServer(TcpBus):
         """Frames in what a client has sent; answers to the rest."""
         frames = []
         while (end := client.received.find(b"\r")) >= 0:
-            line = client.received[:end].decode("ascii")
+            line = client.received[:end].decode("ascii", "replace")
             client.received = client.received[end + 1 :]
             command = line[:1]
             if command in ("S", "s"):  # while it listens the speed stays as it is
@@ -41,12 +43,11 @@ class SlcanServer(TcpBus):
                 client.listens_from_s = None
                 client.queue += OK
             elif command == "t":
-                length = int(line[4])
-                data = bytes.fromhex(line[5:])
-                if len(data) != length or length > 8 or client.listens_from_s is None:
+                frame = _frame(line)
+                if frame is None or client.listens_from_s is None:
                     client.queue += FAILED
                 else:
-                    frames.append((int(line[1:4], 16), data))
+                    frames.append(frame)
                     client.queue += b"z" + OK
             elif command in ("V", "N"):
                 client.queue += command.encode() + b"0000" + OK
@@ -57,3 +58,12 @@ class SlcanServer(TcpBus):
     def text_of(self, frame: CanFrame) -> bytes:
         """A frame of the bus as clients read it."""
         return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
+
+
+def _frame(line: str) -> tuple[int, bytes] | None:
+    """Identifier and data of a line ``tiiildd..``; None where it is none."""
+    found = _FRAME.fullmatch(line)
+    if found is None:
+        return None
+    data = bytes.fromhex(found[3])
+    return (int(found[1], 16), data) if len(data) == int(found[2]) else None

@@ -7,11 +7,15 @@ Protocol: https://github.com/linux-can/socketcand, doc/protocol.md. Only what cl
 
 from __future__ import annotations
 
+import re
 import time
 
 from tactile_resonance.simulation.load_cell import CanFrame
 from tactile_resonance.simulation.tcp_bus import Client, TcpBus
 
+MOST_EXTENDED = 0x1FFFFFFF
+"""Largest identifier of 29 bits."""
+_HEXADECIMAL = re.compile("[0-9A-Fa-f]{1,8}")
 QUIET_S = 0.05
 """Clients read their last `ok` in one piece: no frame follows it for this long, or until they speak."""
 
@@ -31,16 +35,16 @@ class SocketcandServer(TcpBus):
         """Frames in what a client has sent; answers to the rest."""
         frames = []
         while (end := client.received.find(b">")) >= 0:
-            words = client.received[:end].strip(b"< \r\n").decode("ascii").split()
+            words = client.received[:end].strip(b"< \r\n").decode("ascii", "replace").split()
             client.received = client.received[end + 1 :]
             if not words:
                 continue
-            if words[0] == "send":
-                length = int(words[2], 16)
-                data = bytes(int(word, 16) for word in words[3:])
-                if len(data) != length or length > 8:
-                    raise ValueError("send: length and data disagree")
-                frames.append((int(words[1], 16), data))
+            if words[0] == "send" and client.listens_from_s is not None:
+                frame = _frame(words[1:])
+                if frame is None:
+                    client.queue += b"< error syntax of send >"
+                    continue
+                frames.append(frame)
                 client.listens_from_s = time.monotonic()
             elif words[0] == "open" and words[1:] != [self._channel]:
                 client.queue += b"< error could not open bus >"
@@ -58,3 +62,13 @@ class SocketcandServer(TcpBus):
         """A frame of the bus as clients read it."""
         stamp = self.epoch_s + frame.time_s
         return b"< frame %03X %.6f %s >" % (frame.can_id, stamp, frame.data.hex().upper().encode())
+
+
+def _frame(words: list[str]) -> tuple[int, bytes] | None:
+    """Identifier and data of ``send``: identifier, length, bytes, all hexadecimal; None where they disagree."""
+    if len(words) < 2 or not all(_HEXADECIMAL.fullmatch(word) for word in words):
+        return None
+    can_id, length, *data = (int(word, 16) for word in words)
+    if can_id > MOST_EXTENDED or len(data) != length or length > 8 or any(b > 255 for b in data):
+        return None
+    return can_id, bytes(data)

@@ -13,6 +13,9 @@ from tactile_resonance.simulation.load_cell import CanFrame
 
 LONGEST_QUEUE = 1 << 20
 """Bytes that a client may leave unread before it is dropped."""
+MOST_AT_ONCE = 1 << 14
+"""Bytes of a client that are looked at before others have their turn; a message is much shorter."""
+MOST_CLIENTS = 32
 
 
 class Client:
@@ -71,7 +74,7 @@ class TcpBus(ABC):
 
     @abstractmethod
     def understand(self, client: Client) -> list[tuple[int, bytes]]:
-        """Frames in what a client has sent; answers to the rest. ``ValueError`` drops the client."""
+        """Frames in what a client has sent; answers to the rest."""
 
     @abstractmethod
     def text_of(self, frame: CanFrame) -> bytes:
@@ -79,24 +82,34 @@ class TcpBus(ABC):
 
     def poll(self) -> list[tuple[int, bytes]]:
         """Take new clients and what all have sent: identifier and data of each frame for the bus."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
+        # nobody there, or no descriptor left for a client: the bus goes on with those it has
+        with contextlib.suppress(OSError):
+            while len(self._clients) < MOST_CLIENTS:
                 client = Client(self._listener.accept()[0])
                 client.queue = self.greeting()
                 self._clients.append(client)
         frames: list[tuple[int, bytes]] = []
         for client in list(self._clients):
             try:
-                with contextlib.suppress(BlockingIOError):
-                    while received := client.connection.recv(4096):
-                        client.received += received
+                if not self._read(client):
                     self._drop(client)
                     continue
                 frames += self.understand(client)
                 self._flush(client)
-            except (OSError, ValueError, IndexError):
+            except OSError:
                 self._drop(client)
         return frames
+
+    def _read(self, client: Client) -> bool:
+        """Take what a client has sent, as far as it is its turn; whether it is to be kept."""
+        if len(client.received) >= MOST_AT_ONCE:
+            return False  # a message without end
+        try:
+            received = client.connection.recv(MOST_AT_ONCE - len(client.received))
+        except BlockingIOError:
+            return True
+        client.received += received
+        return bool(received)
 
     def send(self, frames: Iterable[CanFrame]) -> None:
         """Hand frames of the bus to every client that listens."""

@@ -116,6 +116,8 @@ class CellFaults:
         kinds = {f.name: type(getattr(self, f.name)) for f in fields(self)}
         require(name in kinds, "fault", name, ", ".join(kinds))
         require(math.isfinite(value), name, value, "a finite number")
+        if kinds[name] is not float:
+            require(value >= 0 and value == int(value), name, value, "a whole number, 0 or above")
         setattr(self, name, kinds[name](value))
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The buses over TCP, byte by byte and through python-can."""
 
+import contextlib
 import re
+import resource
 import socket
+import threading
 import time
 
 import pytest
@@ -10,6 +13,7 @@ import pytest
 from tactile_resonance.simulation.load_cell import CanFrame
 from tactile_resonance.simulation.slcan import SlcanServer
 from tactile_resonance.simulation.socketcand import QUIET_S, SocketcandServer
+from tactile_resonance.simulation.tcp_bus import MOST_AT_ONCE
 
 HOST = "127.0.6.3"
 FRAME = CanFrame(1.25, 0x001, bytes.fromhex("0B01F4FC18138803"))
@@ -101,16 +105,71 @@ def test_every_client_hears_the_bus(bus):
 
 
 @pytest.mark.parametrize(
-    "nonsense", [b"< send 64 3 1 >", b"< send zz 1 1 >", b"< send >", b"\xff>"]
+    ("nonsense", "answer"),
+    [
+        (b"< send 64 3 1 >", b"< error syntax of send >"),
+        (b"< send zz 1 1 >", b"< error syntax of send >"),
+        (b"< send 64 1 -1 >", b"< error syntax of send >"),
+        (b"< send 64 1 1ff >", b"< error syntax of send >"),
+        (b"< send >", b"< error syntax of send >"),
+        (b"\xff>", b"< error unknown command >"),
+    ],
 )
-def test_who_speaks_nonsense_is_dropped_and_the_others_are_served(bus, nonsense):
+def test_who_speaks_nonsense_is_told_so_and_the_others_are_served(bus, nonsense, answer):
     with Talk(bus) as good, Talk(bus) as bad:
         good.say(b"< open can0 >< rawmode >")
         bad.say(b"< open can0 >< rawmode >")
-        assert bad.say(nonsense) == b""
+        assert bad.say(nonsense) == answer
+        assert not bad.frames
         time.sleep(QUIET_S)
         bus.send([FRAME])
         assert b"0B01F4" in good.hear()
+
+
+def test_nobody_sends_before_the_bus_is_raw(bus):
+    with Talk(bus) as client:
+        client.hear()
+        assert client.say(b"< send 64 1 b >") == b"< error unknown command >"
+        assert not client.frames
+
+
+def test_a_message_without_end_costs_its_sender_the_link_and_nobody_time(bus):
+    """A client that sends faster than it is read must not keep the bus, and what steps it, to itself."""
+    with Talk(bus) as good, Talk(bus) as bad:
+        good.say(b"< open can0 >< rawmode >")
+        bad.hear()
+        ended = threading.Event()
+
+        def flood():
+            with contextlib.suppress(OSError):
+                while not ended.is_set():
+                    bad.socket.sendall(b"x" * 65536)
+
+        sender = threading.Thread(target=flood)
+        sender.start()
+        try:
+            while len(bus._clients) > 1:
+                bus.poll()
+                assert all(len(client.received) <= MOST_AT_ONCE for client in bus._clients)
+        finally:
+            ended.set()
+            sender.join()
+        assert good.say(b"< echo >") == b"< echo >"
+
+
+def test_without_a_descriptor_for_a_client_the_others_are_served(bus):
+    with Talk(bus) as good:
+        good.say(b"< open can0 >< rawmode >")
+        late = socket.socket()
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        late.connect((HOST, bus.port))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+        try:
+            assert bus.poll() == []
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert good.say(b"< echo >") == b"< echo >"
+        late.close()
 
 
 def test_another_bus_is_refused(bus):
@@ -146,6 +205,8 @@ def test_a_serial_adapter_answers_as_lawicels(slcan):
         assert client.say(b"t06420F08\r") == b"z\r"
         assert client.say(b"t0643FF\r") == b"\a"
         assert client.say(b"q\r") == b"\a"
+        for nonsense in (b"t\r", b"tXYZ1AA\r", b"t064GAA\r", b"t0641G1\r", b"t06\xff1AA\r", b"\r"):
+            assert client.say(nonsense) == b"\a"
         assert client.frames == [(0x64, b"\x0f\x08")]
         slcan.send([FRAME])
         assert client.hear() == b"t00180B01F4FC18138803\r"

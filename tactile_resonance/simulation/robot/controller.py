@@ -19,7 +19,7 @@ from tactile_resonance.simulation.robot.ports import (
     write_registers,
 )
 from tactile_resonance.simulation.robot.program import Program, register_offset
-from tactile_resonance.simulation.robot.registers import Registers
+from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.safety import RefusedError, RobotMode, Safety, SafetyMode
 from tactile_resonance.simulation.robot.target import CYCLE_S, ProtectiveStop, ScriptError
 
@@ -172,7 +172,11 @@ class UrController:
         write_registers(self.registers, values)
         self.ports.write(values)
         if "external_force_torque" in values:
-            self.machine.external_wrench = np.array(values["external_force_torque"], dtype=float)
+            wrench = np.array(values["external_force_torque"], dtype=float)
+            if np.all(np.abs(wrench) <= LARGEST_FIGURE):
+                self.machine.external_wrench = wrench
+            elif self.machine.external is not None:
+                self.protective_stop(f"external_force_torque {wrench.tolist()}")
 
     def outputs(self, name: str) -> OutputValue:
         """Return an RTDE output: an int or a float, for vectors a list of them.

@@ -25,6 +25,9 @@ Motion = Generator[None, None, None]
 _SPEED_CHECKS = 33
 _SPEED_MARGIN = 0.98
 
+# Least speed or acceleration of a motion, in SI units: below, its duration is beyond all numbers.
+_SLOWEST = 1e-9
+
 # Acceleration of joints under servoj (assumed; the manual gives none).
 SERVO_ACCELERATION_RAD_S2 = 40.0
 
@@ -205,5 +208,7 @@ def _step_joints(target: Target, goal: FloatArray, acceleration: float) -> bool:
 
 def _require_positive(motion: str, **values: float) -> None:
     for name, value in values.items():
-        if not 0.0 < value < float("inf"):
-            raise ScriptError(f"{motion}: {name} {value:g}; accepted is above 0")
+        if not _SLOWEST <= value < float("inf"):
+            raise ScriptError(
+                f"{motion}: {name} {value:g}; accepted is above 0 ({_SLOWEST:g} or more)"
+            )

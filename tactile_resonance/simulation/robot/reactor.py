@@ -12,6 +12,10 @@ from typing import Protocol
 
 # What a client may leave unread before data for it are dropped: about 0.2 s of all RTDE variables.
 MOST_UNSENT = 64 * 1024
+# Of a port at a time; select takes descriptors below 1024 only.
+MOST_CONNECTIONS = 100
+# Bytes that are read and answered before others, and the next step, have their turn.
+MOST_AT_ONCE = 4096
 
 
 class Service(Protocol):
@@ -31,12 +35,17 @@ class Connection:
 
     Attributes
     ----------
+    port : int
+        To which it came.
     frozen : bool
         Nothing is read or written meanwhile, as if no packet passed the network.
     """
 
-    def __init__(self, reactor: Reactor, channel: socket.socket, freezable: bool) -> None:
+    def __init__(
+        self, reactor: Reactor, channel: socket.socket, port: int, freezable: bool
+    ) -> None:
         self._reactor = reactor
+        self.port = port
         self._socket = channel
         self._unsent = bytearray()
         self.freezable = freezable
@@ -76,7 +85,7 @@ class Connection:
     def read(self) -> None:
         """Hand what came to the service."""
         try:
-            data = self._socket.recv(65536)
+            data = self._socket.recv(MOST_AT_ONCE)
         except BlockingIOError:
             return
         except OSError:
@@ -147,9 +156,12 @@ class Reactor:
                 channel, _ = listener.accept()
             except OSError:
                 return
+            if sum(other.port == port for other in self._connections) >= MOST_CONNECTIONS:
+                channel.close()
+                return
             channel.setblocking(False)
             channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = Connection(self, channel, freezable)
+            connection = Connection(self, channel, port, freezable)
             self._connections.add(connection)
             self._selector.register(connection, selectors.EVENT_READ, connection.read)
             connection.service = serve(connection)

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.simulation.robot.registers import Registers
+from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.target import ScriptError
 
 FloatArray = NDArray[np.float64]
@@ -77,12 +76,15 @@ class Script:
         Raises
         ------
         ScriptError
-            Where one of them is no finite number.
+            Where one of them is no number within +-1e6.
         """
         first = number + self.offset
         values = self._registers.input_double[first : first + count]
-        if not all(map(isfinite, values)):
-            raise ScriptError(f"input_double_register_{first}...: {values}; accepted are numbers")
+        if not all(abs(value) <= LARGEST_FIGURE for value in values):
+            raise ScriptError(
+                f"input_double_register_{first}...: {values}; accepted are numbers within "
+                f"+-{LARGEST_FIGURE:g}"
+            )
         return np.array(values, dtype=float)
 
     def status(self, value: int) -> None:

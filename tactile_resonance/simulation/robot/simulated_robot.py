@@ -185,13 +185,16 @@ class SimulatedRobot:
 
     def _freeze(self, fields: dict) -> dict:
         seconds = fields.get("seconds")
-        if not isinstance(seconds, (int, float)) or not 0 < seconds <= _LONGEST_FREEZE_S:
+        good = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
+        if not good or not 0 < seconds <= _LONGEST_FREEZE_S:
             raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
         part = fields.get("part", "network")
-        freeze = {"network": self.freeze_network, "controller": self.freeze_controller}.get(part)
-        if freeze is None:
+        if part == "network":
+            self.freeze_network(seconds)
+        elif part == "controller":
+            self.freeze_controller(seconds)
+        else:
             raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
-        freeze(seconds)
         return {}
 
 

@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ports of the simulated robot byte by byte, without ur_rtde: the protocol as its guide tells it."""
 
-import json
+import contextlib
 import signal
 import socket
 import struct
-import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
-from tactile_resonance.simulation.robot.control_port import PORT
 from tactile_resonance.simulation.robot.rtde_packets import Kind, Layout, PacketReader, packet
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -186,58 +182,6 @@ def test_programs_that_are_not_the_clients_are_logged_and_not_run(robot):
     assert any("rtde_control" in line for line in robot.order("log")["log"])
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"command": "explode"}, "command: expected one of state"),
-        ({"command": "freeze"}, "seconds: None"),
-        ({"command": "freeze", "seconds": 1, "part": "cable"}, "part: 'cable'"),
-        ({"command": "script_starts", "value": 1}, "value: 1"),
-        ({"command": "place_surface", "height_m": 7}, "surface_height_m"),
-        ({"command": "place_tissue", "name": "granite"}, "tissue: .*'granite'"),
-        ({"command": "cell_fault", "fault": "hungry", "value": 1}, "hungry"),
-    ],
-)
-def test_control_port_says_what_it_accepts(robot, fields, message):
-    command = fields.pop("command")
-    with pytest.raises(ValueError, match=message):
-        robot.order(command, **fields)
-
-
-def test_control_port_survives_what_is_no_json(robot):
-    with socket.create_connection((robot.host, PORT), 5) as channel:
-        channel.sendall(b"{\n[1]\n")
-        lines = channel.makefile()
-        assert [json.loads(lines.readline())["ok"] for _ in range(2)] == [False, False]
-
-
-def test_controller_that_stands_still_stops_its_clock(robot):
-    robot.order("freeze", seconds=0.5, part="controller")
-    first = robot.order("state")["time_s"]
-    assert robot.order("state")["time_s"] == first
-    robot.until(robot_mode="RUNNING")
-    start = robot.order("state")["time_s"]
-    while robot.order("state")["time_s"] < start + 0.1:
-        pass
-
-
-def test_table_and_truth(robot):
-    flange_z = robot.order("state")["tcp_pose"][
-        2
-    ]  # no client has set a TCP, and the flange points down
-    lowest_z = flange_z - TIP_IN_FLANGE.position_m[2] - read_sensor().tip.radius_m
-    assert robot.order("truth")["in_contact"] is False
-    robot.order("place_surface", height_m=lowest_z + 0.0005)
-    end = time.monotonic() + 5
-    while not (truth := robot.order("truth"))["in_contact"]:
-        assert time.monotonic() < end
-    assert truth["force_n"][2] > 0
-    assert truth["depth_m"] > 0
-    robot.order("place_surface", height_m=0.2)
-    while robot.order("truth")["in_contact"]:
-        assert time.monotonic() < end
-
-
 def test_second_robot_on_an_address_says_why_it_ends(robot, capsys):
     from tactile_resonance.cli import main
 
@@ -263,6 +207,11 @@ def test_ends_in_order(start_robots, number):
         (["--speed", "0"], "speed: 0"),
         (["--tissue", "granite"], "tissue"),
         (["--priority", "100"], "priority: 100"),
+        (["--tissue", "gel12", "--can-port", "99999"], "can-port: 99999"),
+        (["--tissue", "gel12", "--table", *"00000", "nan"], "table: "),
+        (["--tilt", "nan"], "tilt: serves only with --tissue"),
+        (["--can-port", "29537"], "can-port: serves only with --tissue or --scene"),
+        (["--tissue", "gel12", "--table", *"000000"], "table: serves only with --scene"),
     ],
 )
 def test_wrong_options_are_one_line(options, message, capsys):
@@ -285,9 +234,16 @@ def test_requests_that_no_packet_can_answer_close_their_connection_only(robot, c
     assert robot.order("state")["robot_mode"] == "RUNNING"
 
 
-@pytest.mark.parametrize("line", [b'{"command": []}', b"[" * 20000, b'{"command": {"a": 1}}'])
-def test_control_port_answers_whatever_comes(robot, line):
-    with socket.create_connection((robot.host, PORT), 5) as channel:
-        channel.sendall(line + b"\n")
-        assert not json.loads(channel.makefile().readline())["ok"]
-    assert robot.order("state")["robot_mode"] == "RUNNING"
+def test_a_crowd_leaves_the_other_ports_and_the_robot_alone(robot, connect):
+    """More clients than a port serves, and some that vanish while they speak."""
+    crowd = [socket.create_connection((robot.host, 30004), 5) for _ in range(150)]
+    try:
+        assert robot.order("state")["rtde_connections"] <= 100
+        assert robot.dashboard("robotmode") == "Robotmode: RUNNING"
+    finally:
+        for k, client in enumerate(crowd):
+            with contextlib.suppress(OSError):
+                client.sendall(b"\0\x05V"[: 1 + k % 3])
+            client.close()
+    robot.until(rtde_connections=0)
+    assert connect().ask(Kind.PROTOCOL_VERSION, struct.pack(">H", 2)) == b"\1"
