@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The life of a contact, one cycle at a time: travel, tare, approach, contact, settle, hold, retract.
 
-Pure: data in, a command out. What talks to devices is in `loop`.
+Pure: data in, a command out. What talks to devices is in `loop`; what each state does is in
+`free_motion` and `pressing`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,29 +15,20 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.envelope import Envelope, Place
 from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
-from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
+from tactile_resonance.contact.move import REST, Move
 from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.outcome import Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.pressing import Pressing
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
+from tactile_resonance.contact.tip_path import TipPath
 
 FloatArray = NDArray[np.float64]
-
-STILL_M_S, STILL_NS = 5e-4, 50_000_000
-"""Below this speed for so long the arm is at rest [m/s], [ns]."""
-
-TOUCH_IN_TRAVEL_N = 0.01
-"""Change of the untared force while coming down to the standoff that is a touch [N]."""
-
-LOST_GRACE_S = 0.02
-"""Forces from before the touch do not count for a lost contact, nor those of the first moments."""
-
-MOST_TAKEN_BACK = 3
-"""So often in one contact a touch may turn out to have been noise."""
 
 RETRACT_AFTER_S = 0.1
 """A fault's stop lasts so long before the tip is drawn back [s]; where too much force is why, none."""
@@ -81,28 +71,15 @@ class ContactController:
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
         self._envelope = Envelope(limits)
-        self._clear()
-
-    def _clear(self) -> None:
-        """Forget the last contact."""
-        self._result: ContactResult | None = None
-        self._observer = Observer(self.parameters, self.limits.stuck_samples)
-        self._start_ns = self._state_ns = self._contact_ns = self._tare_ns = 0
-        self._still_ns = self._within_ns = -1
-        self._travel_force: FloatArray | None = None
-        self._hold_height_m = 0.0
-        self._told_m: float | None = None
-        self._looked_again = False
-        self._taken_back = 0
-        self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
+        self._observer = Observer(parameters, limits.stuck_samples)
+        self._outcome = Outcome(self._observer, 0)
+        self._height_m = 0.0
+        self._wish_retract = False
 
     @property
     def result(self) -> ContactResult | None:
         """Of the last goal, once it was reached or failed; while held its force is the mean so far."""
-        result, mean = self._result, self._observer.mean_force()
-        if result is not None and self.state is State.HOLD and mean is not None:
-            return replace(result, force_n=mean[0], force_std_n=mean[1])
-        return result
+        return self._outcome.result(self.state is State.HOLD)
 
     @property
     def estimate(self) -> ContactEstimate | None:
@@ -143,10 +120,15 @@ class ContactController:
         if self.state is not State.IDLE:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
         check_goal(goal, self.parameters, self.limits, self._tip)
-        self._clear()
+        p, limits = self.parameters, self.limits
         self.goal = goal
-        self._path = TipPath(goal, self._tip)
         self._start_ns = now_ns
+        self._observer = Observer(p, limits.stuck_samples)
+        self._outcome = Outcome(self._observer, now_ns)
+        self._path = TipPath(goal, self._tip)
+        self._free = FreeMotion(self._path, self._observer, p, limits)
+        self._pressing = Pressing(goal, self._path, self._observer, p, limits)
+        self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
@@ -160,9 +142,9 @@ class ContactController:
         What counts as contact for the law and its limits is still the force. Returns whether it is new
         and of use: only in an approach.
         """
-        if self.state is not State.APPROACH or self._told_m is not None:
+        if self.state is not State.APPROACH or self._free.told_m is not None:
             return False
-        self._told_m = self._height_m
+        self._free.told_m = self._height_m
         return True
 
     # one cycle
@@ -200,10 +182,11 @@ class ContactController:
             self._enter(State.RETRACT, now_ns)
         if arm is None or place is None:
             return self._stop()
-        twist = self._act(now_ns, arm, place)
-        if twist is None:
+        move = self._act(now_ns, arm, place)
+        self._follow(move, now_ns)
+        if move.twist is None:
             return self._stop()
-        twist = self._envelope.bound(twist, arm.tip.position_m, place)
+        twist = self._envelope.bound(move.twist, arm.tip.position_m, place)
         speed, arm_model = float(self._path.normal @ twist[:3]), self._observer.arm_model
         limit = self.parameters.acceleration_m_s2
         if self.state in (*TOUCHING, State.RETRACT) and speed > arm_model.set_speed_m_s:
@@ -258,166 +241,39 @@ class ContactController:
             return Breach(Cause.HOLD_ENDED, f"held for {most:g} s, as long as is allowed")
         return Breach(Cause.TIME, f"{self.state.value} took longer than {most:g} s")
 
-    # what each state does: the wished twist, None to stop
-
-    def _act(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
+    def _act(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
+        """What the present state wishes."""
         if self.state is State.TRAVEL:
-            return self._travel(now_ns, arm, place)
+            return self._free.travel(now_ns, arm, place)
         if self.state is State.TARE:
-            return self._taring(now_ns, arm)
+            return self._free.tare(now_ns, arm)
         if self.state is State.APPROACH:
-            return self._approach(now_ns, arm, place)
-        if self.state in TOUCHING:
-            return self._press(now_ns, arm, place)
-        if self.state is State.RETRACT:
-            return self._draw_back(now_ns, arm, place)
-        self._after_fault(now_ns)
-        return None
-
-    def _travel(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
-        p = self.parameters
-        near = place.height_m < self.limits.near_m
-        if self._path.must_lift(arm, p.standoff_m):
-            # it may still press, where something ended while it did: up before it goes along
-            return self._path.lift(arm, p)
-        if near and math.isfinite(self._observer.watch.age_s(now_ns)):
-            # not tared yet, so only a change counts
-            if self._travel_force is None:
-                self._travel_force = self._observer.watch.force_n.copy()
-            change = float(np.linalg.norm(self._observer.watch.force_n - self._travel_force))
-            if change > TOUCH_IN_TRAVEL_N:
-                text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
-                self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
-                return None
-        if self._path.arrived(arm, p.standoff_m):
-            self._enter(State.TARE, now_ns)
-            return None
-        return self._path.travel(arm, p, self.limits)
-
-    def _taring(self, now_ns: int, arm: ArmSample) -> FloatArray | None:
-        speed = float(np.linalg.norm(arm.tip_velocity[:3]))
-        observer = self._observer
-        if not observer.taring:
-            if speed > STILL_M_S:
-                self._still_ns = -1
-            elif self._still_ns < 0:
-                self._still_ns = now_ns
-            elif now_ns - self._still_ns > STILL_NS:
-                observer.begin_tare()
-                self._tare_ns = now_ns
-        elif now_ns - self._tare_ns >= 1e9 * self.parameters.tare_s:
-            breach = observer.end_tare()
-            if breach is None:
-                self._enter(State.APPROACH, now_ns)
-            else:
-                self._fail(breach, now_ns)
-        return None
-
-    def _approach(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
-        p = self.parameters
-        model = self._observer.model
-        if model is not None:
-            self._contact_ns, self._looked_again = now_ns, False
+            move = self._free.approach(arm, place)
+            if move.to is not State.CONTACT:
+                return move
+            self._pressing.begin(now_ns)
             self._enter(State.CONTACT, now_ns)
-            return self._press(now_ns, arm, self._place(arm))
-        if place.height_m < -p.search_m:
-            text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
-            self._fail(Breach(Cause.SURFACE_MISSING, text), now_ns)
-            return None
-        told = self._told_m is not None
-        speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
-        return self._path.along_normal(arm, -speed)
-
-    def _press(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
-        p, goal, model = self.parameters, self.goal, self._observer.model
-        assert goal is not None
-        assert model is not None
-        if self._lost(now_ns):
-            return None
-        estimate = model.estimate(place.height_m)
-        sure = now_ns - self._contact_ns > 1e9 * (self.limits.lost_s + LOST_GRACE_S)
-        early = self.state is not State.HOLD and sure and estimate.surface_m > p.early_m
-        if early and self._was_noise(self.limits.lost_force_n, now_ns):
-            return None
-        if early and not self._looked_again:
-            self._looked_again = True
-            self._observer.look_again()
-            return self._path.along_normal(arm, 0.0)
-        if early:
-            text = f"touched {1e3 * estimate.surface_m:.2f} mm above the expected surface"
-            text += f", accepted are {1e3 * p.early_m:g} mm"
-            self._fail(Breach(Cause.SURFACE_EARLY, text), now_ns)
-            return None
-        off = abs(estimate.force_n - goal.aim.force_n) / goal.aim.force_n
-        if self.state is State.CONTACT and off < 4 * p.tolerance:
-            self._enter(State.SETTLE, now_ns)
-        if self.state is State.SETTLE:
-            if off > p.tolerance:
-                self._within_ns = -1
-            elif self._within_ns < 0:
-                self._within_ns = now_ns
-            elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
-                self._hold_height_m = place.height_m
-                self._observer.begin_mean()
-                self._result = self._new_result(Breach(Cause.NONE, ""), now_ns, estimate)
-                self._enter(State.HOLD, now_ns)
-        pending = self._observer.arm_model.pending_m
-        if self.state is State.HOLD and goal.aim.hold is HoldMode.INDENTATION:
-            speed = place_speed(self._hold_height_m, place.height_m, pending, p)
-        else:
-            speed = force_speed(
-                model,
-                place.height_m,
-                pending,
-                goal.aim.force_n,
-                p,
-                holding=self.state is State.HOLD,
-            )
-        most = p.press_speed_m_s
-        return self._path.along_normal(arm, min(most, max(-most, speed)))
-
-    def _lost(self, now_ns: int) -> bool:
-        """Whether the tissue has gone; a touch that was noise is taken back."""
-        observer, limits = self._observer, self.limits
-        mean = observer.watch.mean_n(limits.lost_s)
-        if mean is None or now_ns - self._contact_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
-            return False
-        if self.state is State.CONTACT and self._was_noise(observer.noise_n / 4, now_ns):
-            return True
-        if self.state is State.SETTLE and self._was_noise(limits.lost_force_n, now_ns):
-            return True
-        if self.state in (State.SETTLE, State.HOLD) and mean < limits.lost_force_n:
-            text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
-            self._fail(Breach(Cause.CONTACT_LOST, text), now_ns)
-            return True
-        return False
-
-    def _was_noise(self, least_n: float, now_ns: int) -> bool:
-        """Whether what told the touch was noise: no such force is there; then it is sought anew."""
-        mean = self._observer.watch.mean_n(self.limits.lost_s)
-        if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
-            return False
-        self._taken_back += 1
-        self._observer.seek_touch()
-        self._enter(State.APPROACH, now_ns)
-        return True
-
-    def _draw_back(self, now_ns: int, arm: ArmSample, place: Place) -> FloatArray | None:
-        if now_ns - self._state_ns > 1e9 * self.limits.retract_s:
-            self._fail(Breach(Cause.TIME, "retraction took too long"), now_ns)
-            return None
-        if self.parameters.standoff_m - place.height_m < ARRIVED_M:
-            if self._result is not None:
-                self._result = replace(self._result, retracted=True)
-            self._enter(State.IDLE, now_ns)
-            return None
-        return self._path.lift(arm, self.parameters)
-
-    def _after_fault(self, now_ns: int) -> None:
-        """Stand still; then draw back, unless the arm itself was the fault."""
+            place = self._place(arm)
+        if self.state in TOUCHING:
+            return self._pressing.step(now_ns, self.state, arm, place)
+        since_s = (now_ns - self._state_ns) * 1e-9
+        if self.state is State.RETRACT:
+            return self._free.draw_back(since_s, arm, place)
+        # in a fault it stands still, and is then drawn back, unless the arm itself was the fault
         after_s = 0.0 if self._pressed_too_hard else RETRACT_AFTER_S
-        if not self._arm_was_bad and now_ns - self._state_ns >= 1e9 * after_s:
-            self._enter(State.RETRACT, now_ns)
+        return REST if self._arm_was_bad or since_s < after_s else Move(None, State.RETRACT)
+
+    def _follow(self, move: Move, now_ns: int) -> None:
+        """Go over to the state that follows."""
+        if move.breach is not None:
+            self._fail(move.breach, now_ns)
+        elif move.to is not None:
+            if move.estimate is not None:
+                told_m = self._free.told_m
+                self._outcome.reached(now_ns, self._pressing.touched_ns, move.estimate, told_m)
+            if move.to is State.IDLE:
+                self._outcome.drawn_back()
+            self._enter(move.to, now_ns)
 
     # pieces
 
@@ -437,7 +293,6 @@ class ContactController:
 
     def _enter(self, state: State, now_ns: int) -> None:
         self.state, self._state_ns = state, now_ns
-        self._within_ns = self._still_ns = -1
         if state in (State.RETRACT, State.IDLE):
             self._wish_retract = False
 
@@ -449,36 +304,5 @@ class ContactController:
         self._enter(State.FAULT, now_ns)
 
     def _end(self, breach: Breach, now_ns: int) -> None:
-        """Note why the contact was not reached, or ended; the first cause stays."""
-        result = self.result
-        if result is None:
-            self._result = self._new_result(breach, now_ns, None)
-        elif result.cause is Cause.NONE:
-            peak = self._observer.watch.peak_n
-            self._result = replace(
-                result, cause=breach.cause, message=breach.message, peak_force_n=peak
-            )
-
-    def _new_result(
-        self, breach: Breach, now_ns: int, estimate: ContactEstimate | None
-    ) -> ContactResult:
-        return ContactResult(
-            reached=estimate is not None,
-            cause=breach.cause,
-            message=breach.message,
-            force_n=estimate.force_n if estimate is not None else None,
-            force_std_n=(
-                math.hypot(estimate.force_std_n, self._observer.bias_std_n)
-                if estimate is not None
-                else None
-            ),
-            depth_m=estimate.depth_m if estimate is not None else None,
-            stiffness_n_per_m=estimate.stiffness_n_per_m if estimate is not None else None,
-            surface_m=estimate.surface_m if estimate is not None else None,
-            told_m=self._told_m,
-            surface_std_m=estimate.depth_std_m if estimate is not None else None,
-            contact_s=(now_ns - self._contact_ns) * 1e-9 if estimate is not None else None,
-            total_s=(now_ns - self._start_ns) * 1e-9,
-            peak_force_n=self._observer.watch.peak_n,
-            retracted=False,
-        )
+        """Note why the contact was not reached, or ended."""
+        self._outcome.ended(breach, now_ns, self._free.told_m, self.state is State.HOLD)

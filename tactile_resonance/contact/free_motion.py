@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states out of contact: travel to the standoff, tare, approach, and the way back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.envelope import Place
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.move import REST, Move, failed
+from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
+
+STILL_M_S, STILL_NS = 5e-4, 50_000_000
+"""Below this speed for so long the arm is at rest [m/s], [ns]."""
+
+TOUCH_IN_TRAVEL_N = 0.01
+"""Change of the untared force while coming down to the standoff that is a touch [N]."""
+
+
+class FreeMotion:
+    """Leads the tip to where the tissue should begin, and back; of one contact.
+
+    Parameters
+    ----------
+    path : TipPath
+    observer : Observer
+    parameters : ContactParameters
+    limits : Limits
+
+    Attributes
+    ----------
+    told_m : float or None
+        Height at which another sensor told the touch [m].
+    """
+
+    def __init__(
+        self, path: TipPath, observer: Observer, parameters: ContactParameters, limits: Limits
+    ) -> None:
+        self._path, self._observer = path, observer
+        self._parameters, self._limits = parameters, limits
+        self._travel_force: NDArray[np.float64] | None = None
+        self._still_ns = -1
+        self._tare_ns = 0
+        self.told_m: float | None = None
+
+    def travel(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
+        """To the standoff; up first where the tip may still press on something."""
+        p = self._parameters
+        near = place.height_m < self._limits.near_m
+        if self._path.must_lift(arm, p.standoff_m):
+            # it may still press, where something ended while it did: up before it goes along
+            return Move(self._path.lift(arm, p))
+        if near and math.isfinite(self._observer.watch.age_s(now_ns)):
+            # not tared yet, so only a change counts
+            if self._travel_force is None:
+                self._travel_force = self._observer.watch.force_n.copy()
+            change = float(np.linalg.norm(self._observer.watch.force_n - self._travel_force))
+            if change > TOUCH_IN_TRAVEL_N:
+                text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
+                return failed(Cause.SURFACE_EARLY, text)
+        if self._path.arrived(arm, p.standoff_m):
+            self._still_ns = -1
+            return Move(None, State.TARE)
+        return Move(self._path.travel(arm, p, self._limits))
+
+    def tare(self, now_ns: int, arm: ArmSample) -> Move:
+        """At rest for the zero of the force."""
+        speed = float(np.linalg.norm(arm.tip_velocity[:3]))
+        observer = self._observer
+        if not observer.taring:
+            if speed > STILL_M_S:
+                self._still_ns = -1
+            elif self._still_ns < 0:
+                self._still_ns = now_ns
+            elif now_ns - self._still_ns > STILL_NS:
+                observer.begin_tare()
+                self._tare_ns = now_ns
+        elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
+            breach = observer.end_tare()
+            if breach is None:
+                return Move(None, State.APPROACH)
+            return Move(None, State.FAULT, breach)
+        return REST
+
+    def approach(self, arm: ArmSample, place: Place) -> Move:
+        """Down along the normal until the force tells a touch."""
+        p = self._parameters
+        if self._observer.model is not None:
+            return Move(None, State.CONTACT)
+        if place.height_m < -p.search_m:
+            text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
+            return failed(Cause.SURFACE_MISSING, text)
+        told = self.told_m is not None
+        speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
+        return Move(self._path.along_normal(arm, -speed))
+
+    def draw_back(self, since_s: float, arm: ArmSample, place: Place) -> Move:
+        """Up along the normal to the standoff; `since_s` has gone by in this state."""
+        if since_s > self._limits.retract_s:
+            return failed(Cause.TIME, "retraction took too long")
+        if self._parameters.standoff_m - place.height_m < ARRIVED_M:
+            return Move(None, State.IDLE)
+        return Move(self._path.lift(arm, self._parameters))

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The story of one contact, told as its result: reached, refined while held, ended and why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.result import Breach, Cause, ContactResult
+
+
+class Outcome:
+    """What has become of a contact so far.
+
+    Parameters
+    ----------
+    observer : Observer
+    start_ns : int
+        When the contact was asked for.
+    """
+
+    def __init__(self, observer: Observer, start_ns: int) -> None:
+        self._observer, self._start_ns = observer, start_ns
+        self._result: ContactResult | None = None
+
+    def result(self, holding: bool) -> ContactResult | None:
+        """Once it was reached or failed; the force is the mean so far while it is held."""
+        result, mean = self._result, self._observer.mean_force()
+        if result is not None and holding and mean is not None:
+            return replace(result, force_n=mean[0], force_std_n=mean[1])
+        return result
+
+    def reached(
+        self, now_ns: int, touched_ns: int, estimate: ContactEstimate, told_m: float | None
+    ) -> None:
+        """Note that the force is there."""
+        self._observer.begin_mean()
+        self._result = ContactResult(
+            reached=True,
+            cause=Cause.NONE,
+            message="",
+            force_n=estimate.force_n,
+            force_std_n=math.hypot(estimate.force_std_n, self._observer.bias_std_n),
+            depth_m=estimate.depth_m,
+            stiffness_n_per_m=estimate.stiffness_n_per_m,
+            surface_m=estimate.surface_m,
+            told_m=told_m,
+            surface_std_m=estimate.depth_std_m,
+            contact_s=(now_ns - touched_ns) * 1e-9,
+            total_s=(now_ns - self._start_ns) * 1e-9,
+            peak_force_n=self._observer.watch.peak_n,
+            retracted=False,
+        )
+
+    def ended(self, breach: Breach, now_ns: int, told_m: float | None, holding: bool) -> None:
+        """Note why it was not reached, or ended; the first cause stays."""
+        result = self.result(holding)
+        if result is None:
+            self._result = self._not_reached(breach, now_ns, told_m)
+        elif result.cause is Cause.NONE:
+            self._result = replace(
+                result,
+                cause=breach.cause,
+                message=breach.message,
+                peak_force_n=self._observer.watch.peak_n,
+            )
+
+    def drawn_back(self) -> None:
+        """Note that the tip is back at the standoff."""
+        if self._result is not None:
+            self._result = replace(self._result, retracted=True)
+
+    def _not_reached(self, breach: Breach, now_ns: int, told_m: float | None) -> ContactResult:
+        return ContactResult(
+            reached=False,
+            cause=breach.cause,
+            message=breach.message,
+            force_n=None,
+            force_std_n=None,
+            depth_m=None,
+            stiffness_n_per_m=None,
+            surface_m=None,
+            told_m=told_m,
+            surface_std_m=None,
+            contact_s=None,
+            total_s=(now_ns - self._start_ns) * 1e-9,
+            peak_force_n=self._observer.watch.peak_n,
+            retracted=False,
+        )

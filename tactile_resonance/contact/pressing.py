@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states in contact: contact found, settle, hold; and a touch that turns out to have been noise."""
+
+from __future__ import annotations
+
+from tactile_resonance.contact.envelope import Place
+from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
+from tactile_resonance.contact.move import Move, failed
+from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.tip_path import TipPath
+
+LOST_GRACE_S = 0.02
+"""Forces from before the touch do not count for a lost contact, nor those of the first moments."""
+
+MOST_TAKEN_BACK = 3
+"""So often in one contact a touch may turn out to have been noise."""
+
+
+class Pressing:
+    """Brings the force to what is asked for and keeps it; of one contact.
+
+    Parameters
+    ----------
+    goal : ContactGoal
+    path : TipPath
+    observer : Observer
+    parameters : ContactParameters
+    limits : Limits
+
+    Attributes
+    ----------
+    touched_ns : int
+        When contact was found.
+    """
+
+    def __init__(
+        self,
+        goal: ContactGoal,
+        path: TipPath,
+        observer: Observer,
+        parameters: ContactParameters,
+        limits: Limits,
+    ) -> None:
+        self._aim, self._path, self._observer = goal.aim, path, observer
+        self._parameters, self._limits = parameters, limits
+        self.touched_ns = 0
+        self._within_ns = -1
+        self._hold_height_m = 0.0
+        self._looked_again = False
+        self._taken_back = 0
+
+    def begin(self, now_ns: int) -> None:
+        """Contact has been found."""
+        self.touched_ns, self._looked_again = now_ns, False
+
+    def step(self, now_ns: int, state: State, arm: ArmSample, place: Place) -> Move:
+        """Towards the force, or keep it; judges whether what was touched is the tissue."""
+        p, model = self._parameters, self._observer.model
+        assert model is not None
+        gone = self._lost(now_ns, state)
+        if gone is not None:
+            return gone
+        estimate = model.estimate(place.height_m)
+        sure = now_ns - self.touched_ns > 1e9 * (self._limits.lost_s + LOST_GRACE_S)
+        if state is not State.HOLD and sure and estimate.surface_m > p.early_m:
+            return self._early(now_ns, arm, estimate.surface_m)
+        off = abs(estimate.force_n - self._aim.force_n) / self._aim.force_n
+        to: State | None = None
+        if state is State.CONTACT and off < 4 * p.tolerance:
+            to, self._within_ns = State.SETTLE, -1
+        if State.SETTLE in (state, to):
+            if off > p.tolerance:
+                self._within_ns = -1
+            elif self._within_ns < 0:
+                self._within_ns = now_ns
+            elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
+                self._hold_height_m = place.height_m
+                to = State.HOLD
+        holding = State.HOLD in (state, to)
+        pending = self._observer.arm_model.pending_m
+        if holding and self._aim.hold is HoldMode.INDENTATION:
+            speed = place_speed(self._hold_height_m, place.height_m, pending, p)
+        else:
+            speed = force_speed(
+                model, place.height_m, pending, self._aim.force_n, p, holding=holding
+            )
+        most = p.press_speed_m_s
+        twist = self._path.along_normal(arm, min(most, max(-most, speed)))
+        return Move(twist, to, estimate=estimate if to is State.HOLD else None)
+
+    def _early(self, now_ns: int, arm: ArmSample, surface_m: float) -> Move:
+        """The surface seems to lie higher than accepted: noise, a first guess, or so it is."""
+        if self._was_noise(self._limits.lost_force_n, now_ns):
+            return Move(None, State.APPROACH)
+        if not self._looked_again:
+            self._looked_again = True
+            self._observer.look_again()
+            return Move(self._path.along_normal(arm, 0.0))
+        text = f"touched {1e3 * surface_m:.2f} mm above the expected surface"
+        text += f", accepted are {1e3 * self._parameters.early_m:g} mm"
+        return failed(Cause.SURFACE_EARLY, text)
+
+    def _lost(self, now_ns: int, state: State) -> Move | None:
+        """What follows where the tissue has gone; a touch that was noise is taken back."""
+        observer, limits = self._observer, self._limits
+        mean = observer.watch.mean_n(limits.lost_s)
+        if mean is None or now_ns - self.touched_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
+            return None
+        if state is State.CONTACT and self._was_noise(observer.noise_n / 4, now_ns):
+            return Move(None, State.APPROACH)
+        if state is State.SETTLE and self._was_noise(limits.lost_force_n, now_ns):
+            return Move(None, State.APPROACH)
+        if state in (State.SETTLE, State.HOLD) and mean < limits.lost_force_n:
+            text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
+            return failed(Cause.CONTACT_LOST, text)
+        return None
+
+    def _was_noise(self, least_n: float, now_ns: int) -> bool:
+        """Whether what told the touch was noise: no such force is there; then it is sought anew."""
+        mean = self._observer.watch.mean_n(self._limits.lost_s)
+        if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
+            return False
+        self._taken_back += 1
+        self._observer.seek_touch()
+        return True
