@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from tactile_resonance.fields import number
 from tactile_resonance.simulation.robot import dashboard, rtde_server, script_server
 from tactile_resonance.simulation.robot.control_port import PORT as CONTROL_PORT
 from tactile_resonance.simulation.robot.control_port import ControlPort
@@ -184,9 +185,8 @@ class SimulatedRobot:
         }
 
     def _freeze(self, fields: dict) -> dict:
-        seconds = fields.get("seconds")
-        good = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
-        if not good or not 0 < seconds <= _LONGEST_FREEZE_S:
+        seconds = number(fields.get("seconds"), "seconds")
+        if not 0 < seconds <= _LONGEST_FREEZE_S:
             raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
         part = fields.get("part", "network")
         if part == "network":
