@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a surgery stack takes in two sensors: bring-up twice, in two namespaces, a topic remapped.
 
-Copy it into the stack. Here both sensors are simulated, each with a robot of its own.
+Copy it into the stack. Here both sensors are simulated, each with a robot of its own, which takes 1.2 processor
+cores with its control loop: on a machine with fewer than four add robot:=false.
 """
 
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription

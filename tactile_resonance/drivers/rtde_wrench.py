@@ -49,8 +49,11 @@ class RtdeWrench:
 
     @property
     def info(self) -> ForceInfo:
-        """What the sensor can do."""
-        std_s = 0.0 if self._clock_std_s is None else self._clock_std_s()
+        """What the sensor can do; the uncertainty of its clock is NaN while the arm is not connected."""
+        try:
+            std_s = 0.0 if self._clock_std_s is None else self._clock_std_s()
+        except ArmError:
+            std_s = float("nan")
         return replace(self._config.info, clock_uncertainty_s=std_s)
 
     def start(self) -> None:

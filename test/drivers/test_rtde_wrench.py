@@ -11,6 +11,7 @@ import pytest
 from tactile_resonance.contact.interfaces import ArmError, ArmFault, ForceError, ForceFault
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.drivers.force_config import read_force_config
+from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.rtde_wrench import RtdeWrench
 
 CONFIG = read_force_config(Path("rtde_ur.yaml"))
@@ -44,6 +45,20 @@ def test_the_wrench_is_turned_into_the_frame_of_the_tip():
     np.testing.assert_allclose(sample.wrench, [1, 3, -2, 0.1, 0.3, -0.2], atol=1e-12)
     assert sample.time_ns == 1_002_000_000
     assert source.read() == []  # one state, one wrench
+
+
+def test_it_can_be_made_before_the_arm_is_connected():
+    connected = []
+
+    def clock_std_s():
+        if not connected:
+            raise ArmError(ArmFault.LINK_LOST, "not connected")
+        return 2e-4
+
+    source = force_source(CONFIG, States(), arm_clock_std_s=clock_std_s)
+    assert np.isnan(source.info.clock_uncertainty_s)
+    connected.append(True)
+    assert source.info.clock_uncertainty_s == 2e-4
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ from tactile_resonance.processes import free_domain_id
 BRINGUP = Path(__file__).resolve().parents[2] / "launch" / "bringup.launch.py"
 DOMAIN_ID = free_domain_id({})
 NAMESPACE = "left"
+HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
 
 
 @pytest.mark.launch_test
@@ -40,7 +41,7 @@ def generate_test_description():
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     bringup = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(BRINGUP)),
-        launch_arguments={"namespace": NAMESPACE, "use_mock_hardware": "true"}.items(),
+        launch_arguments={"namespace": NAMESPACE, "robot_ip": HOST}.items(),
     )
     return LaunchDescription(
         [
