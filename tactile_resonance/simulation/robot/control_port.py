@@ -82,9 +82,8 @@ class ControlPort:
         }
 
     def _freeze(self, fields: dict) -> dict:
-        seconds = fields.get("seconds")
-        good = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
-        if not good or not 0 < seconds <= _LONGEST_FREEZE_S:
+        seconds: Any = fields.get("seconds")
+        if type(seconds) not in (int, float) or not 0 < seconds <= _LONGEST_FREEZE_S:
             raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
         part = fields.get("part", "network")
         if part == "network":
