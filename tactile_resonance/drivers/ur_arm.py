@@ -21,7 +21,7 @@ from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, ClientState, Exchange
-from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
+from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, motion_fault, stop_fault
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
@@ -288,11 +288,9 @@ class UrArm:
         except OSError:
             data = b""
         if data is None:
+            late = self._late()
             self._kill()
-            raise ArmError(
-                ArmFault.LINK_LOST,
-                f"{self.config.host} is not ready after {self.config.connect_timeout_s:g} s",
-            )
+            raise late
         if not data:
             death = self._death()
             self._kill()
@@ -301,6 +299,19 @@ class UrArm:
         if not answer["ok"]:
             self._end()
             raise ArmError(ArmFault(answer["fault"]), answer["message"])
+
+    def _late(self) -> ArmError:
+        """Why a request has no answer in time."""
+        assert self._exchange is not None
+        text = f"{self.config.host} is not ready after {self.config.connect_timeout_s:g} s"
+        client = self._exchange.read()
+        if client is not None and client.runtime_state == PROGRAM_PLAYING:
+            # the library asks it to end in a register that the program may not read, and waits for ever
+            return ArmError(
+                ArmFault.PROGRAM_NOT_STARTED,
+                f"{text}: another program runs there and does not end; stop it at the robot",
+            )
+        return ArmError(ArmFault.LINK_LOST, text)
 
     def _death(self) -> ArmError:
         """Why the client process is gone."""

@@ -74,7 +74,9 @@ def identify(host: str) -> RobotIdentity:
             remote_control=client.isInRemoteControl(),
         )
     except RuntimeError as error:
-        raise ArmError(ArmFault.LINK_LOST, f"dashboard of {host}: {error}") from error
+        raise ArmError(
+            ArmFault.LINK_LOST, f"dashboard of {host} does not answer: {error}"
+        ) from error
     finally:
         with contextlib.suppress(RuntimeError):
             client.disconnect()

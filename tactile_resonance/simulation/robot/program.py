@@ -37,7 +37,7 @@ def register_offset(text: str) -> int:
             f"program: got {text[:40]!r}...; accepted is a complete program 'def rtde_control():' ... "
             "'end', as RTDE clients of ur_rtde upload it"
         )
-    found = re.search(r"reg_offset_int\s*=\s*(?:#[^\n]*\n\s*)?(\d+)", text)
+    found = re.search(r"reg_offset_int\s*=\s*(?:#[^\n]*\n\s*)?(\d{1,9})", text)
     if found is None or int(found[1]) not in (0, 24):
         raise ValueError("program: reg_offset_int not found; accepted are offsets of 0 and 24")
     return int(found[1])

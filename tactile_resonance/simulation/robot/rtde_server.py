@@ -7,6 +7,7 @@ import struct
 from dataclasses import dataclass
 
 from tactile_resonance.simulation.robot.controller import UrController
+from tactile_resonance.simulation.robot.outputs import OutputValue
 from tactile_resonance.simulation.robot.reactor import Connection
 from tactile_resonance.simulation.robot.rtde_packets import (
     PROTOCOL_VERSION,
@@ -53,8 +54,9 @@ class RtdeServer:
 
     def publish(self, cycle: int) -> None:
         """Send this cycle's outputs to whom they are due."""
+        known: dict[str, OutputValue] = {}  # what several clients ask for is computed once
         for service in list(self._services):
-            service.publish(cycle)
+            service.publish(cycle, known)
 
     def drop(self) -> int:
         """Abort all connections; returns how many there were."""
@@ -110,13 +112,19 @@ class _Service:
         """Free the inputs."""
         self._server.forget(self)
 
-    def publish(self, cycle: int) -> None:
-        """Send the outputs where they are due; a client that does not read misses them."""
+    def publish(self, cycle: int, known: dict[str, OutputValue]) -> None:
+        """Send the outputs where they are due; a client that does not read misses them.
+
+        `known` holds outputs of this cycle by name and is added to.
+        """
         recipe = self._outputs
         if not self._started or recipe is None or cycle % self._period:
             return
         outputs = self._server.controller.outputs
-        values = [outputs(name) for name in recipe.names]
+        for name in recipe.names:
+            if name not in known:
+                known[name] = outputs(name)
+        values = [known[name] for name in recipe.names]
         self.connection.send(recipe.layout.pack(1, values), droppable=True)
 
     def _protocol_version(self, payload: bytes) -> bytes:

@@ -13,7 +13,8 @@ from tactile_resonance.simulation.robot.reactor import Connection
 from tactile_resonance.simulation.robot.safety import RefusedError
 
 PORT = 30003
-_LONGEST_PROGRAM = 1 << 20
+# The client's own has 42 kB; what has no end is searched anew with each piece that comes.
+_LONGEST_PROGRAM = 1 << 18
 # A program ends with a line `end` that is not indented.
 _END = re.compile(rb"^end[ \t]*\r?\n", re.MULTILINE)
 
@@ -40,7 +41,7 @@ class ScriptService:
         """Start each program that is complete; what is refused goes to the controller's log."""
         self._buffer += data
         if len(self._buffer) > _LONGEST_PROGRAM:
-            raise ValueError("script: program too long")
+            raise ValueError(f"script: longer than {_LONGEST_PROGRAM} bytes")
         while (end := _END.search(self._buffer)) is not None:
             text, self._buffer = self._buffer[: end.end()], self._buffer[end.end() :]
             try:
@@ -49,4 +50,7 @@ class ScriptService:
                 self._controller.log.append(str(error))
 
     def closed(self) -> None:
-        """An unfinished program is forgotten."""
+        """An unfinished program is forgotten, and that is logged."""
+        if self._buffer.strip():
+            begin = self._buffer[:40].decode("utf-8", "replace")
+            self._controller.log.append(f"program: got {begin!r}... and no line 'end': ignored")

@@ -16,6 +16,8 @@ import rtde_receive
 
 from tactile_resonance.simulation.robot.control_port import order
 
+FLAGS = rtde_control.RTDEControlInterface
+UPLOAD = FLAGS.FLAG_UPLOAD_SCRIPT
 FREE_ROOM = np.array([0.0, 0.0, -0.05, 0, 0, 0])
 
 
@@ -82,11 +84,16 @@ def connect(host):
     io = rtde_io.RTDEIOInterface(host)
     assert io.setStandardDigitalOut(3, True)
     assert io.setToolDigitalOut(1, True)
+    assert io.setConfigurableDigitalOut(2, True)
+    assert io.setAnalogOutputCurrent(0, 0.5)
+    assert io.setInputIntRegister(18, 42)
+    assert io.setInputDoubleRegister(19, 1.5)
     assert io.setAnalogOutputVoltage(1, 0.25)
     assert io.setSpeedSlider(0.5)
     clients.wait(0.05)
     bits = clients.receive.getActualDigitalOutputBits()
-    assert bits == 1 << 3 | 1 << 17, hex(bits)
+    assert bits == 1 << 3 | 1 << 10 | 1 << 17, hex(bits)
+    near(clients.receive.getStandardAnalogOutput0(), 0.5, 1e-9)
     near(clients.receive.getStandardAnalogOutput1(), 0.25, 1e-9)
     near(clients.receive.getTargetSpeedFraction(), 0.5, 1e-9)
     assert io.setSpeedSlider(1.0)
@@ -106,6 +113,42 @@ def connect(host):
     assert clients.control.reuploadScript()
     clients.wait(0.05)
     assert clients.control.isProgramRunning()
+
+
+def leave_upper(host):
+    """Leave a program behind that reads the upper registers."""
+    rtde_control.RTDEControlInterface(host, -1.0, FLAGS.FLAG_UPPER_RANGE_REGISTERS | UPLOAD)
+
+
+def flags(host):
+    for flag in (FLAGS.FLAG_NO_EXT_FT, FLAGS.FLAG_VERBOSE, FLAGS.FLAG_UPPER_RANGE_REGISTERS):
+        c = Clients(host, control=False)
+        control = rtde_control.RTDEControlInterface(host, -1.0, flag | UPLOAD)
+        above = c.pose() + [0, 0, 0.002, 0, 0, 0]
+        assert control.moveL(above.tolist(), 0.1, 1.0)
+        near(control.getTCPOffset(), [0.0] * 6, 1e-9)
+        c.wait(0.1)
+        same_pose(c.pose(), above, 1e-4)
+        control.stopScript()
+        control.disconnect()
+
+
+def refused(host):
+    """What the model does not know is told in its log, and the arm stands still."""
+    for call, number in (
+        (lambda c: c.control.teachMode(), 18),
+        (lambda c: c.control.moveL([[*c.pose(), 0.1, 0.5, 0.0]]), 45),
+        (lambda c: c.control.directTorque([0.0] * 6), 66),
+    ):
+        c = Clients(host)
+        before = c.pose()
+        call(c)
+        c.wait(0.1)
+        assert not c.control.isProgramRunning()
+        assert f"command {number}: not modelled" in order(host, "log")["log"][-1]
+        near(c.pose(), before, 5e-5)
+        c.control.disconnect()
+        c.receive.disconnect()
 
 
 def moves(host):

@@ -5,6 +5,7 @@ import contextlib
 import signal
 import socket
 import struct
+import time
 
 import pytest
 from hypothesis import given
@@ -180,6 +181,11 @@ def test_programs_that_are_not_the_clients_are_logged_and_not_run(robot):
         script.sendall(b"def other():\n  movej([0,0,0,0,0,0])\nend\n")
     robot.until(runtime_state="STOPPED")
     assert any("rtde_control" in line for line in robot.order("log")["log"])
+    with socket.create_connection((robot.host, 30003), 5) as script:
+        script.sendall(b"movej([0,0,0,0,0,0])\n")  # a robot does a single line, the model does not
+    end = time.monotonic() + 5
+    while "no line 'end'" not in robot.order("log")["log"][-1]:
+        assert time.monotonic() < end
 
 
 def test_second_robot_on_an_address_says_why_it_ends(robot, capsys):

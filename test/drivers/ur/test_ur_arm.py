@@ -278,51 +278,6 @@ def test_no_client_outlives_a_killed_owner(robot, module_arm):
     assert standing(robot)
 
 
-def test_not_in_remote_control(robot, module_arm):
-    arm = module_arm
-    arm.close()
-    robot.order("remote_control", value=False)
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.NOT_REMOTE
-    robot.order("remote_control", value=True)
-    arm.connect()
-
-
-def test_registers_in_use(robot, module_arm):
-    arm = module_arm
-    arm.close()
-    robot.order("registers_in_use", value=True)
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.REGISTERS_IN_USE
-    robot.order("registers_in_use", value=False)
-    arm.connect()
-
-
-def test_script_that_never_starts(robot, module_arm):
-    arm = module_arm
-    arm.close()
-    robot.order("script_starts", value=False)
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.PROGRAM_NOT_STARTED
-    robot.order("script_starts", value=True)
-    arm.connect()
-
-
-def test_nobody_there_and_not_connected(start_arm):
-    arm = start_arm("127.254.254.1")
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.LINK_LOST
-    with pytest.raises(ArmError) as error:
-        arm.state()
-    assert error.value.fault is ArmFault.LINK_LOST
-    arm.close()
-    arm.close()
-
-
 def test_python_of_the_page(robot, module_arm, tmp_path, capsys):
     module_arm.close()
     page = Path(__file__).resolve().parents[3] / "docs" / "robot.md"

@@ -4,7 +4,9 @@
 import pytest
 
 
-@pytest.mark.parametrize("name", ["connect", "moves", "streams", "settings", "watchdog", "stops"])
+@pytest.mark.parametrize(
+    "name", ["connect", "moves", "streams", "settings", "watchdog", "stops", "flags", "refused"]
+)
 def test_calls(robot, run_calls, name):
     run_calls(name, robot.host)
 
