@@ -43,8 +43,11 @@ CHUNK = 1000
 MARGIN_HZ = 30.0
 
 
-def run(output: Path, quick: bool) -> str:
-    """Write the figure and the table.
+PARTS = ("methods", "bias", "grid")
+
+
+def run(output: Path, quick: bool, part: str | None = None) -> str:
+    """Write the figure and the tables.
 
     Parameters
     ----------
@@ -52,21 +55,48 @@ def run(output: Path, quick: bool) -> str:
         Folder, made if need be.
     quick : bool
         A thinned Monte Carlo: 500 runs a cell instead of 20 000.
+    part : {"methods", "bias", "grid"}, optional
+        Renew this table alone, the others stay as they are in `output`. All when absent.
     """
     output.mkdir(parents=True, exist_ok=True)
+    page = output / "poles.md"
+    sections = [_heading(quick), [], [], []]
+    if part is not None:
+        sections[1:] = _sections(page.read_text(encoding="utf-8"))[1:]
+    for k, name in enumerate(PARTS, 1):
+        if part in (None, name):
+            sections[k] = _measured(name, output, quick)
+    text = "\n".join(line for section in sections for line in section) + "\n"
+    page.write_text(text, encoding="utf-8")
+    return text
+
+
+def _measured(part: str, output: Path, quick: bool) -> list[str]:
+    """A part's lines."""
+    if part == "methods":
+        methods = compare_methods(quick)
+        _figure(methods, output / "poles.png")
+        return _method_table(methods)
+    if part == "bias":
+        return _bias_table()
     runs = 500 if quick else 20000
-    methods = compare_methods(quick)
     cells = [
         measure_cell(Plant(zeta, snr, periods), runs)
         for periods in PERIODS
         for zeta in DAMPING
         for snr in SNR_DB
     ]
-    parts = [_heading(quick), _method_table(methods), _bias_table(), _grid_table(cells, runs)]
-    text = "\n".join(line for part in parts for line in part) + "\n"
-    (output / "poles.md").write_text(text, encoding="utf-8")
-    _figure(methods, output / "poles.png")
-    return text
+    return _grid_table(cells, runs)
+
+
+def _sections(text: str) -> list[list[str]]:
+    """Lines of a page by its headings of second order."""
+    sections: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.startswith("## "):
+            sections.append([])
+        sections[-1].append(line)
+    return sections
 
 
 @dataclasses.dataclass(frozen=True)

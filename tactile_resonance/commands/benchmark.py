@@ -14,6 +14,8 @@ NAMES = (
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""
+PARTS = ("methods", "bias", "grid")
+"""Tables of `poles`, each of which can be renewed alone."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -28,6 +30,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
     parser.add_argument(
         "--full", action="store_true", help=f"the whole grid ({', '.join(WITH_FULL)})"
+    )
+    parser.add_argument(
+        "--part", choices=PARTS, help="renew this table of poles alone; default: all"
     )
     parser.add_argument(
         "--output",
@@ -45,8 +50,12 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(
             "benchmark: no benchmarks found, run it from the source tree: tools/run.sh"
         )
+    if options.part is not None and options.name != "poles":
+        raise ValueError(f"--part: {options.part} is a table of `benchmark poles`")
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
         extra = {"full": True} if options.full and name in WITH_FULL else {}
+        if options.part is not None:
+            extra["part"] = options.part
         print(import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra))
     return 0

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.model import RationalModel
+from tactile_resonance.identification.normal_equations import MANY, solve_positive
 from tactile_resonance.identification.result import (
     ComplexArray,
     FloatArray,
@@ -36,26 +37,38 @@ def invert_normal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     diagonal = normal.diagonal(axis1=-2, axis2=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.asarray(1 / np.sqrt(diagonal), float)
-        scaled = normal * scale[..., :, None] * scale[..., None, :]
+        both = scale[..., :, None] * scale[..., None, :]
+        scaled = normal * both
     # finite as a whole only where every entry is, and every diagonal one above 0
     bad = ~np.isfinite(scaled.sum(axis=(-2, -1)))
     if bad.any():
         scaled[bad] = np.eye(n)
-    try:
-        inverse = np.linalg.inv(scaled)
-    except np.linalg.LinAlgError:
-        singular = np.linalg.matrix_rank(scaled, hermitian=True) < n
-        scaled[singular] = np.eye(n)
-        inverse = np.linalg.inv(scaled)
-        bad |= singular
+    inverse, singular = _inverse(scaled)
+    bad |= singular
     # rounding can leave a negative variance where the matrix is singular to working precision
     bad |= ~(inverse.diagonal(axis1=-2, axis2=-1) > 0).all(axis=-1)
     condition = (_squares(scaled) * _squares(inverse)) ** 0.25
     with np.errstate(invalid="ignore"):
-        inverse *= scale[..., :, None] * scale[..., None, :]
+        inverse *= both
     if bad.any():
         inverse[bad], condition[bad] = np.nan, np.inf
     return inverse, condition
+
+
+def _inverse(matrices: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Inverses of symmetric matrices, and (batch,) which of them have none."""
+    batch, n = matrices.shape[:2]
+    singular = np.zeros(batch, bool)
+    if batch >= MANY:
+        inverse, good = solve_positive(matrices, np.broadcast_to(np.eye(n), matrices.shape))
+        if good.all():
+            return inverse, singular
+    try:
+        return np.linalg.inv(matrices), singular
+    except np.linalg.LinAlgError:
+        singular = np.linalg.matrix_rank(matrices, hermitian=True) < n
+        matrices[singular] = np.eye(n)
+        return np.linalg.inv(matrices), singular
 
 
 def _squares(matrices: FloatArray) -> FloatArray:

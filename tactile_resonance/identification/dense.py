@@ -119,7 +119,7 @@ def refit_failed(problem: Problem, solution: Solution, data: Sequence[BinData]) 
         return solution
     theta, normal = solution.theta.copy(), solution.normal.copy()
     cost, group_cost = solution.cost.copy(), solution.group_cost.copy()
-    converged = solution.converged.copy()
+    converged, residual = solution.converged.copy(), solution.residual.copy()
     edges = np.cumsum([0] + [group.size for group in problem.groups])
     for k in failed:
         row = [values.rows(slice(k, k + 1)) for values in data]
@@ -128,13 +128,14 @@ def refit_failed(problem: Problem, solution: Solution, data: Sequence[BinData]) 
             continue
         converged[k], theta[k] = True, dense.theta
         group_cost[k], cost[k] = dense.group_cost, dense.group_cost.sum()
+        residual[k] = dense.residual[edges[-2] :]
         half = dense.jacobian.shape[0] // 2
         for j, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=False)):
             part = np.concatenate(
                 [dense.jacobian[first:last], dense.jacobian[half + first : half + last]]
             )
             normal[k, j] = part.T @ part
-    return Solution(theta, normal, cost, group_cost, converged, solution.iterations)
+    return Solution(theta, normal, cost, group_cost, residual, converged, solution.iterations)
 
 
 def jacobian_covariance(jacobian: FloatArray) -> tuple[FloatArray, float]:

@@ -28,7 +28,7 @@ from tactile_resonance.identification.result import (
 )
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
+from tactile_resonance.identification.whiteness import are_smooth
 
 # Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
 FEWEST_BINS = 16
@@ -283,7 +283,7 @@ def _identify(
     expected = known.expected_cost(parameters)
     with np.errstate(invalid="ignore"):
         suspect = fit.cost > known.cost_quantile(parameters, 1 - MODEL_ERROR_PROBABILITY)
-        suspect |= whiteness(fit.residual, parameters) > SMOOTH_RESIDUAL
+        suspect |= are_smooth(fit.residual, parameters)
     total = weighted if total_known else np.full_like(weighted, np.nan)
     evidence = Evidence(
         fit, lines, enough, fit.cost, expected, suspect, covariance, total,

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance.identification.bins import BinGroup
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
@@ -24,14 +26,13 @@ from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
-from tactile_resonance.identification.problem import START_ITERATIONS
 from tactile_resonance.identification.result import (
     STATUS_CODE,
     PolesBatch,
     PolesStatus,
 )
 from tactile_resonance.identification.solver import MAX_ITERATIONS, ROUNDING, STEP_TOLERANCE
-from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
+from tactile_resonance.identification.whiteness import are_smooth
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -70,8 +71,9 @@ class CompiledJointPlan(JointPlan):
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records; see `JointPlan.from_bins`."""
-        if u.shape[-1:] != self.bins.shape or y.shape[-1:] != self.bins.shape:
-            return super().from_bins(u, y)  # which says what is wrong
+        fits = u.shape[-1:] == self.bins.shape and y.shape[-1:] == self.bins.shape
+        if not fits or self.problem.driven is self.problem:
+            return super().from_bins(u, y)  # which says what is wrong, or takes few lines
         if u.shape != y.shape:
             u, y = np.broadcast_arrays(u, y)
         kernel = _kernel()
@@ -85,11 +87,11 @@ class CompiledJointPlan(JointPlan):
         theta = np.empty((batch, n))
         covariance = np.empty((batch, n, n))
         residual = np.zeros((batch, self.excited_bins.size), complex)
-        figures = np.empty((batch, kernel.FIGURES))
+        figures = np.empty((batch, kernel.kernel_judgement.FIGURES))
         out = (ordinary, theta, covariance, residual, figures)
         kernel.fit_points(flat_u, flat_y, *self._constants, out)
-        result = self._ordinary(kernel, theta, covariance, residual, figures)
-        ordinary &= result.whiteness <= SMOOTH_RESIDUAL
+        result = self._ordinary(kernel.kernel_judgement, theta, covariance, residual, figures)
+        ordinary &= ~are_smooth(residual, self.structure.parameters)
         if not ordinary.all():
             rows = np.flatnonzero(~ordinary)
             result = _replaced(result, rows, super().from_bins(flat_u[rows], flat_y[rows]))
@@ -97,7 +99,7 @@ class CompiledJointPlan(JointPlan):
 
     def _ordinary(
         self,
-        kernel: Any,
+        judgement: Any,
         theta: FloatArray,
         covariance: FloatArray,
         residual: ComplexArray,
@@ -107,24 +109,24 @@ class CompiledJointPlan(JointPlan):
         a, b, _ = self.problem.sizes
         denominator = np.ones((batch, a + 1))
         denominator[:, :a] = theta[:, :a]
-        pole, of_pole, of_f0 = kernel.POLE, kernel.POLE_COVARIANCE, kernel.COVARIANCE
+        pole, of_pole, of_f0 = judgement.POLE, judgement.POLE_COVARIANCE, judgement.COVARIANCE
         places = figures[:, pole : pole + 4].copy().view(complex)
         return PolesBatch(
             poles_rad_s=places[:, :1],
-            f0_hz=figures[:, kernel.F0_HZ, None],
-            damping_ratio=figures[:, kernel.DAMPING, None],
+            f0_hz=figures[:, judgement.F0_HZ, None],
+            damping_ratio=figures[:, judgement.DAMPING, None],
             residues=places[:, 1:],
             covariance=figures[:, of_f0 : of_f0 + 4].reshape(batch, 1, 2, 2),
             total_covariance=np.full((batch, 1, 2, 2), np.nan),
             pole_covariance=figures[:, of_pole : of_pole + 4].reshape(batch, 1, 2, 2),
             coefficient_covariance=covariance,
-            cost=figures[:, kernel.COST],
-            expected_cost=figures[:, kernel.EXPECTED],
-            condition_number=figures[:, kernel.CONDITION],
+            cost=figures[:, judgement.COST],
+            expected_cost=figures[:, judgement.EXPECTED],
+            condition_number=figures[:, judgement.CONDITION],
             residual=residual,
             lines=np.full(batch, self.excited_bins.size),
             status_code=np.full(batch, STATUS_CODE[PolesStatus.OK], np.uint8),
-            noise_variance=figures[:, kernel.NOISE_Y : kernel.NOISE_Y + 2],
+            noise_variance=figures[:, judgement.NOISE_Y : judgement.NOISE_Y + 2],
             fit=RationalModel(
                 denominator,
                 theta[:, a : a + b],
@@ -143,16 +145,6 @@ class CompiledJointPlan(JointPlan):
     def _constants(self) -> tuple:
         """Arguments of `joint_kernel.fit_points` between the bins and the results."""
         a, b, c = self.problem.sizes
-        groups, places = [], []
-        for group in self.problem.groups:
-            size = group.size
-            parts = []
-            for basis in (group.denominator, group.numerator, group.transient):
-                rows = np.empty((0, size), complex) if basis is None else basis.T
-                parts += [np.ascontiguousarray(rows.real), np.ascontiguousarray(rows.imag)]
-            groups.append(tuple(parts))
-            inputs = np.arange(a, a + b) if group.numerator is not None else np.empty(0, int)
-            places.append(np.concatenate([np.arange(a), inputs, np.arange(a + b, a + b + c)]))
         bands = self.noise_bands
         others = self.other_bins.size
         margin = BAND_MARGIN * (self.band_hz[1] - self.band_hz[0])
@@ -174,13 +166,35 @@ class CompiledJointPlan(JointPlan):
         )
         return (
             (self.others_at, self.excited_at),
-            tuple(groups),
-            tuple(places),
-            (a, b, START_ITERATIONS),
+            tuple(_constants_of(group) for group in self.problem.groups),
             (bands.starts, bands.counts),
             (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),
             limits,
         )
+
+
+def _constants_of(group: BinGroup) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+    """Bases of a group and their products, as `kernel_model` takes them."""
+    empty = np.empty((group.size, 0), complex)
+    numerator, transient = (
+        empty if basis is None else basis for basis in (group.numerator, group.transient)
+    )
+    blocks = (group.denominator[:, :-1], numerator, transient)
+    bases = [part for basis in (group.denominator, *blocks[1:]) for part in _parts(basis)]
+    products: list[FloatArray] = []
+    for i, j in combinations_with_replacement(range(3), 2):
+        product = blocks[i].conj()[:, :, None] * blocks[j][:, None, :]  # (K, n_i, n_j)
+        if i == j:
+            row, column = np.triu_indices(blocks[i].shape[1])
+            products.append(_parts(product[:, row, column])[0])
+        else:
+            products += _parts(product.reshape(group.size, -1))
+    return tuple(bases), tuple(products)
+
+
+def _parts(columns: ComplexArray) -> list[FloatArray]:
+    """Real and imaginary parts, (n, K), of (K, n)."""
+    return [np.ascontiguousarray(part.T) for part in (columns.real, columns.imag)]
 
 
 def _kernel() -> Any:

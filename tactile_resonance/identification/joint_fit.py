@@ -13,15 +13,22 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
-from tactile_resonance.identification.joint_noise import BINS_PER_BAND, noise_between_harmonics
+from tactile_resonance.identification.joint_noise import (
+    BINS_PER_BAND,
+    JointNoise,
+    noise_between_harmonics,
+    rough_noise,
+)
+from tactile_resonance.identification.many_points import ManyPoints, ManyValues
 from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
     difference_of_halves,
     difference_of_models,
 )
 from tactile_resonance.identification.noise_level import f_quantile
-from tactile_resonance.identification.solver import Solution, minimise
-from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
+from tactile_resonance.identification.one_point import OnePoint, OneValue
+from tactile_resonance.identification.solver import Solution, minimise, refine
+from tactile_resonance.identification.whiteness import are_smooth
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -119,17 +126,25 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     else:
         u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
         data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
-        rough = problem.rough(data)
-        data, noise, kind = _with_noise(layout, data, u_o, rough)
-        solution = minimise(problem, data, rough)
+        points = problem.points(data)
+        theta = _near(layout, points, data, u_o)
+        value = points.evaluate(theta)
+        theta = theta.reshape(batch, -1)
+        noise = _noise(layout, value, theta, u_o)
+        kind, data = noise.kind, _weighted(layout, data, noise)
+        if noise.through_input is None:
+            points.weigh(data)
+            solution = refine(points, theta, value)
+        else:
+            solution = minimise(problem, data, theta)
     solution = refit_failed(problem, solution, data)
     inverse, condition = invert_normal(solution.normal.sum(axis=1))
     if layout.other_bins.size == 0:
         level = _level_from_residuals(layout, solution)
     else:
-        level = _level_from_others(layout, solution, inverse, noise, kind)
-    residual = _residual(layout, data[-1], solution.theta) / np.sqrt(level.scale)[:, None]
-    suspect = whiteness(residual, layout.structure.parameters) > SMOOTH_RESIDUAL
+        level = _level_from_others(layout, solution, inverse, noise)
+    residual = data[-1].turned(solution.residual) / np.sqrt(level.scale)[:, None]
+    suspect = are_smooth(residual, layout.structure.parameters)
     if suspect.any():  # what rounding leaves of exact data says nothing
         suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
     suspect |= level.suspect
@@ -174,8 +189,7 @@ def _level_from_others(
     layout: JointLayout,
     solution: Solution,
     inverse: FloatArray,
-    noise: FloatArray,
-    kind: npt.NDArray[np.str_],
+    noise: JointNoise,
 ) -> _Level:
     """The bins between harmonics tell the level, the excited ones whether the model holds."""
     n = solution.theta.shape[-1]
@@ -187,7 +201,7 @@ def _level_from_others(
     cost = solution.group_cost[:, 1] / level
     expected = dof_e * dof_o / (dof_o - 1)
     limit = dof_e * f_quantile(1 - MODEL_ERROR_PROBABILITY, 2 * dof_e, 2 * dof_o)
-    pieces = kind == "per line"
+    pieces = noise.kind == "per line"
     if pieces.any():
         # weights from few bins: moments of F(2, 2 nu), as in `VarianceModel.cost_quantile`
         mean = BINS_PER_BAND / (BINS_PER_BAND - 1)
@@ -203,7 +217,7 @@ def _level_from_others(
         cost,
         expected,
         suspect,
-        noise * level[:, None],
+        noise.mean_variances * level[:, None],
         _student_variance(dof),
     )
 
@@ -213,29 +227,60 @@ def _student_variance(dof):
     return np.where(dof > 1, dof / (dof - 1), np.nan)
 
 
-def _with_noise(
-    layout: JointLayout, data: list[BinData], u_o: ComplexArray, rough: FloatArray
-) -> tuple[list[BinData], FloatArray, npt.NDArray]:
-    """Data with the noise that the bins between harmonics show, its variances, its kind."""
-    problem, others = layout.problem, data[0]
-    inverse_a, _, model, _ = problem.model(problem.groups[0], others, rough)
+def _near(
+    layout: JointLayout, points: OnePoint | ManyPoints, data: list[BinData], u_o: ComplexArray
+) -> FloatArray:
+    """(n,) or (batch, n) one undamped step from start values: residuals are then all but noise.
+
+    With weights as the errors show them at the start.
+    """
+    theta = layout.problem.start(points, data)
+    value = points.evaluate(theta)
+    variance_y, variance_u = rough_noise(value.error_of(0), u_o)
+    others, excited = data
+    points.weigh(
+        [
+            BinData(others.y, None, variance_y),
+            BinData(excited.y, excited.u, variance_y, variance_u),
+        ]
+    )
+    gradient, normal = points.normals(points.weight(value))
+    moved = theta - points.step(normal, gradient)[0]
+    return np.where(np.isfinite(moved).all(axis=-1, keepdims=True), moved, theta)
+
+
+def _noise(
+    layout: JointLayout, value: OneValue | ManyValues, theta: FloatArray, u_o: ComplexArray
+) -> JointNoise:
+    """The noise that the bins between harmonics show."""
+    error = value.error_of(0)
 
     def response() -> ComplexArray:
-        return np.asarray(problem.split(rough)[1] @ layout.numerator_on_others.T * inverse_a)
+        alpha, beta, _ = layout.problem.split(theta)
+        return np.asarray(
+            (beta @ layout.numerator_on_others.T) / (alpha @ layout.problem.groups[0].denominator.T)
+        )
 
-    noise = noise_between_harmonics(
-        others.y - model, u_o, response, layout.noise_bands, problem.sizes[2]
+    return noise_between_harmonics(
+        error, u_o, response, layout.noise_bands, layout.problem.sizes[2]
     )
-    excited = BinData(
-        data[1].y,
-        data[1].u,
-        noise.on(layout.noise_bands.of_excited, noise.variance_y),
-        noise.on(layout.noise_bands.of_excited, noise.variance_u),
-        noise.covariance_yu,
-    )
+
+
+def _weighted(layout: JointLayout, data: list[BinData], noise: JointNoise) -> list[BinData]:
+    """Data with the variances of their noise, and without what came through the input."""
+    others, excited = data
+    bands = layout.noise_bands
     y_o = others.y if noise.through_input is None else others.y - noise.through_input
-    other = BinData(y_o, None, noise.on(layout.noise_bands.of_others, noise.variance_rest))
-    return [other, excited], noise.mean_variances, noise.kind
+    return [
+        BinData(y_o, None, noise.on(bands.of_others, noise.variance_rest)),
+        BinData(
+            excited.y,
+            excited.u,
+            noise.on(bands.of_excited, noise.variance_y),
+            noise.on(bands.of_excited, noise.variance_u),
+            noise.covariance_yu,
+        ),
+    ]
 
 
 def _systematic(
@@ -261,9 +306,3 @@ def _systematic(
 def _power(values: ComplexArray) -> FloatArray:
     """(batch,) mean square."""
     return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1))
-
-
-def _residual(layout: JointLayout, excited: BinData, theta: FloatArray) -> ComplexArray:
-    """(batch, K_e) weighted residuals on the excited bins, turned by the phase of the input."""
-    _, _, y, g = layout.problem.model(layout.problem.groups[-1], excited, theta)
-    return excited.turned(excited.y - y) / np.sqrt(excited.residual_variance(g))

@@ -115,17 +115,17 @@ def noise_between_harmonics(
     size = error.shape[1]
     dof = max(size - terms / 2, 1.0)
     through = covariance = None
-    power_u, power_error = _mean_power(u), _mean_power(error)
-    cross = (error[:, None] @ u.conj()[..., None])[..., 0] / size  # (batch, 1)
-    squared = np.abs(cross) ** 2 / np.maximum(power_error * power_u, TINY)
-    # a squared correlation of n complex samples exceeds x by chance with (1 - x)^(n - 1)
-    correlated = squared > 1 - FALSE_ALARM ** (1 / max(size - 1, 1))
+    power_error, power_u, cross, correlated = _powers(error, u)
     if not correlated.any():
-        total_power, kind_y = _pieces(error, power_error, bands, size / dof)
-        input_power, kind_u = _pieces(u, power_u, bands, 1.0)
+        if _are_flat(np.concatenate([error, u]), bands):
+            total_power, input_power = power_error * (size / dof), power_u
+            kind = np.full(error.shape[0], KINDS[0], NAMES.dtype)
+        else:
+            total_power, kind_y = _pieces(error, power_error, bands, size / dof)
+            input_power, kind_u = _pieces(u, power_u, bands, 1.0)
+            kind = NAMES[np.maximum(kind_y, kind_u)]
         variance_y = np.where(total_power > TINY, total_power, 1.0)  # no noise: any weights do
         means = [power_error * (size / dof), input_power.mean(-1, keepdims=True)]
-        kind = NAMES[np.maximum(kind_y, kind_u)]
         return JointNoise(
             variance_y, input_power, variance_y, None, None, np.concatenate(means, -1), kind
         )
@@ -161,6 +161,27 @@ def noise_between_harmonics(
     )
 
 
+def rough_noise(error: ComplexArray, u: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """(batch, 1) flat variances of Y and of U from the same; none of U where it shows in `error`."""
+    power_error, power_u, _, correlated = _powers(error, u)
+    return (
+        np.where(power_error > TINY, power_error, 1.0),
+        np.where(correlated, 0.0, power_u),
+    )
+
+
+def _powers(
+    error: ComplexArray, u: ComplexArray
+) -> tuple[FloatArray, FloatArray, ComplexArray, npt.NDArray[np.bool_]]:
+    """(batch, 1) mean powers of both, their mean product, and whether that is beyond chance."""
+    size = error.shape[1]
+    power_error, power_u = _mean_power(error), _mean_power(u)
+    cross = np.einsum("bk,bk->b", error, u.conj())[:, None] / size
+    squared = (cross.real**2 + cross.imag**2) / np.maximum(power_error * power_u, TINY)
+    # a squared correlation of n complex samples exceeds x by chance with (1 - x)^(n - 1)
+    return power_error, power_u, cross, squared > 1 - FALSE_ALARM ** (1 / max(size - 1, 1))
+
+
 def _pieces(
     values: ComplexArray, mean_power: FloatArray, bands: NoiseBands, factor: float
 ) -> tuple[FloatArray, IntArray]:
@@ -169,14 +190,22 @@ def _pieces(
     Flat unless a test says otherwise.
     """
     mean = mean_power * factor
-    if bands.starts.size < FEWEST_PIECES:
+    if _are_flat(values, bands):
         return mean, np.zeros(values.shape[0], np.int64)
-    power = values.real**2 + values.imag**2
-    sample = np.add.reduceat(power, bands.starts, axis=-1) / bands.counts
-    if is_flat(sample, BINS_PER_BAND):
-        return mean, np.zeros(values.shape[0], np.int64)
-    model = model_variance(sample * factor, BINS_PER_BAND)
+    model = model_variance(_samples(values, bands) * factor, BINS_PER_BAND)
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
+
+
+def _are_flat(values: ComplexArray, bands: NoiseBands) -> bool:
+    """Whether all of a batch have a flat variance, or too few pieces to tell."""
+    return bands.starts.size < FEWEST_PIECES or is_flat(_samples(values, bands), BINS_PER_BAND)
+
+
+def _samples(values: ComplexArray, bands: NoiseBands) -> FloatArray:
+    """(batch, pieces) mean powers."""
+    power = values.real**2
+    power += values.imag**2
+    return np.asarray(np.add.reduceat(power, bands.starts, axis=-1) / bands.counts)
 
 
 def _mean_power(values: ComplexArray) -> FloatArray:

@@ -23,7 +23,7 @@ from tactile_resonance.identification.dense import (
     minimise_dense,
 )
 from tactile_resonance.identification.model import RationalModel, Variable
-from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.problem import START_ITERATIONS, Problem
 from tactile_resonance.identification.solver import minimise
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -99,7 +99,7 @@ class LinesPlan:
         solution = minimise(self.problem, [data])
         inverse, condition = invert_normal(solution.normal[:, 0])
         converged = solution.converged.copy()
-        theta, cost = solution.theta, solution.cost
+        theta, cost, residual = solution.theta, solution.cost, solution.residual
         parameters = 0.5 * inverse
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
         if batch == 1 and doubtful.size:
@@ -109,15 +109,12 @@ class LinesPlan:
             dense = minimise_dense(self.problem, [row])
             if dense.group_cost[0] <= cost[k] * (1 + 1e-9) or not converged[k]:
                 theta[k], cost[k], converged[k] = dense.theta, dense.group_cost[0], dense.converged
+                residual[k] = dense.residual
                 half, condition[k] = jacobian_covariance(dense.jacobian)
                 parameters[k] = 0.5 * half
-        model = self._model(theta)
-        residual = np.zeros((batch, self.frequency_hz.size), complex)
-        chunk = self.problem.chunk
-        for first in range(0, batch, chunk):
-            rows = slice(first, first + chunk)
-            residual[rows] = self.residual(data.rows(rows), theta[rows])
-        return LinesFit(model, cost, parameters, condition, converged, residual)
+        return LinesFit(
+            self._model(theta), cost, parameters, condition, converged, data.turned(residual)
+        )
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
@@ -162,17 +159,11 @@ class LinesPlan:
                 break
         return plan
 
-    def residual(self, data: BinData, theta: FloatArray) -> ComplexArray:
-        """(batch, F) weighted residuals, those of spectra turned by the phase of the input."""
-        with np.errstate(all="ignore"):
-            _, _, y, g = self.problem.model(self.problem.groups[0], data, theta)
-            variance = data.residual_variance(g)
-            return data.turned(data.y - y) / np.sqrt(variance)
-
     def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
         """(batch, n, n) ``Re J^H J`` for the weights of `data`."""
         with np.errstate(all="ignore"):
-            return self.problem.linearise([data], theta)[2][:, 0]
+            points = self.problem.many_points([data])
+            return points.normals(points.weight(points.evaluate(theta)))[1][:, 0]
 
     def theta(self, model: RationalModel) -> FloatArray:
         """(batch, n) free coefficients of a model of this plan."""
@@ -251,10 +242,11 @@ def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[Floa
         turned = BinData(
             row.y * np.exp(1j * phase * delay), row.u, row.variance_y, row.variance_u, None
         )
-        theta = problem.start([turned])[0]
+        point = problem.one_point([turned])
+        theta = point.start(START_ITERATIONS)
         if not np.isfinite(theta).all():
             continue
-        cost = float(problem.linearise([turned], theta[None])[0][0, 0])
+        cost = point.weight(point.evaluate(theta)).cost
         candidates.append((cost, np.append(theta, delay)))
     candidates.sort(key=lambda c: c[0])
     return [theta for _, theta in candidates[:3]] or [None]

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The linearised cost of a single point, with the least calls.
 
-A batch takes its normal matrices from products with constants (`bins`); for one point the time is in
-the number of calls, not of operations: here all groups are stacked and the Jacobian is written out.
+A batch takes its normal matrices from products with constants (`many_points`); for one point the time
+is in the number of calls, not of operations: here all groups are stacked and the Jacobian is written
+out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData, BinGroup
-from tactile_resonance.identification.normal_equations import solve_one
+from tactile_resonance.identification.normal_equations import solve_one, step_and_decrement
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -23,44 +24,94 @@ ComplexArray = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class StackedBasis:
-    """Basis functions of all groups on their bins, one after the other.
+    """Basis functions of all groups on their bins, one after the other; inputs are on the last group.
 
     Attributes
     ----------
-    rows : (n, K) complex
-        Of the free coefficients of A, then B, then C; 0 where a group has none.
+    denominator : (a, K) complex
+        Of the free coefficients of A.
     last : (K,) complex
-        Of the fixed coefficient of A.
-    real, conjugate : (n, 2 K) float
-        The rows, and their conjugates, as real and imaginary parts in turn.
-    kinds : tuple of slice
-        Rows of A, of B, of C.
+        Of the fixed one.
+    numerator : (b, K_last) complex
+    transient : (c, K) complex
+    values : tuple of (terms, 2 K or 2 K_last) float
+        Real and imaginary parts of the three in turn.
     parts : tuple of slice
         Bins of each group.
     """
 
-    rows: ComplexArray
+    denominator: ComplexArray
     last: ComplexArray
-    real: FloatArray
-    conjugate: FloatArray
-    kinds: tuple[slice, slice, slice]
+    numerator: ComplexArray
+    transient: ComplexArray
     parts: tuple[slice, ...]
+    values: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        values = tuple(b.view(float) for b in (self.denominator, self.numerator, self.transient))
+        object.__setattr__(self, "values", values)
 
     @classmethod
-    def of(cls, groups: Sequence[BinGroup], sizes: tuple[int, int, int]) -> StackedBasis:
-        """Stack of groups with these numbers of free coefficients."""
+    def of(cls, groups: Sequence[BinGroup]) -> StackedBasis:
+        """Stack of groups of which only the last one has an input."""
         edges = np.cumsum([0] + [group.size for group in groups])
-        parts = tuple(slice(int(a), int(b)) for a, b in pairwise(edges))
-        offset = np.cumsum([0, *sizes])
-        rows = np.zeros((offset[3], edges[-1]), complex)
-        for group, part in zip(groups, parts, strict=True):
-            blocks = (group.denominator[:, :-1], group.numerator, group.transient)
-            for block, first, end in zip(blocks, offset[:-1], offset[1:], strict=True):
-                if block is not None:
-                    rows[first:end, part] = block.T
-        last = np.concatenate([group.denominator[:, -1] for group in groups])
-        a, b, c = (slice(int(i), int(j)) for i, j in pairwise(offset))
-        return cls(rows, last, rows.view(float), rows.conj().view(float), (a, b, c), parts)
+        whole = np.ascontiguousarray(np.concatenate([g.denominator for g in groups]).T)
+        transient = np.empty((0, edges[-1]), complex)
+        if groups[-1].transient is not None:
+            transient = np.concatenate([np.asarray(g.transient) for g in groups]).T
+        numerator = groups[-1].numerator
+        assert numerator is not None
+        return cls(
+            whole[:-1],
+            whole[-1],
+            np.ascontiguousarray(numerator.T),
+            np.ascontiguousarray(transient),
+            tuple(slice(int(a), int(b)) for a, b in pairwise(edges)),
+        )
+
+    @property
+    def kinds(self) -> tuple[slice, slice, slice]:
+        """Places of the coefficients of A, of B, of C."""
+        a, b, c = (basis.shape[0] for basis in self.values)
+        return slice(0, a), slice(a, a + b), slice(a + b, a + b + c)
+
+
+@dataclass(eq=False)
+class OneValue:
+    """The model of a point at some coefficients.
+
+    Attributes
+    ----------
+    inverse, model, error : (K,) complex
+        1 / A, Y of the model, and what Y of the data exceeds it by.
+    g : (K_last,) complex
+        B / A.
+    root : (K,) float
+        One over the standard deviation of the error, by the weights of the point.
+    weighted : (K,) complex
+        Error times root.
+    group_cost : (groups,) float
+    parts : tuple of slice
+        Bins of each group.
+    """
+
+    inverse: ComplexArray
+    model: ComplexArray
+    error: ComplexArray
+    g: ComplexArray
+    root: FloatArray
+    weighted: ComplexArray
+    group_cost: FloatArray
+    parts: tuple[slice, ...]
+
+    @property
+    def cost(self) -> float:
+        """Of all groups."""
+        return float(self.group_cost.sum())
+
+    def error_of(self, part: int) -> ComplexArray:
+        """(1, K_g) error on the bins of a group."""
+        return self.error[None, self.parts[part]]
 
 
 class OnePoint:
@@ -75,94 +126,143 @@ class OnePoint:
 
     def __init__(self, basis: StackedBasis, data: Sequence[BinData]) -> None:
         self._basis = basis
-        size = basis.last.size
-        self._y = np.empty(size, complex)
-        self._u = np.ones(size, complex)
-        self._variance_y = np.empty(size)
-        self._variance_u: FloatArray | None = None
-        self._covariance: ComplexArray | None = None
-        for values, part in zip(data, basis.parts, strict=True):
-            self._y[part] = values.y[0]
-            self._variance_y[part] = values.variance_y[0]
-            if values.u is not None:
-                self._u[part] = values.u[0]
-            if values.variance_u is not None:
-                if self._variance_u is None:
-                    self._variance_u = np.zeros(size)
-                self._variance_u[part] = values.variance_u[0]
-            if values.covariance_yu is not None:
-                if self._covariance is None:
-                    self._covariance = np.zeros(size, complex)
-                self._covariance[part] = values.covariance_yu[0]
-        self._jacobian = np.empty(basis.rows.shape, complex)
+        *others, last = data
+        y = last.y[0]
+        self._y = np.concatenate([*(values.y[0] for values in others), y]) if others else y
+        self._u = None if last.u is None else last.u[0]
+        a, b, c = self._kinds = basis.kinds
+        self._jacobian = np.zeros((c.stop, basis.last.size), complex)
+        self.weigh(data)
+
+    def weigh(self, data: Sequence[BinData]) -> None:
+        """Weights by the variances of `data`; y and u stay."""
+        self._variances = [values.variance_y[0] for values in data]
+        last = data[-1]
+        self._variance_u = None if last.variance_u is None else last.variance_u[0]
+        self._covariance = None if last.covariance_yu is None else last.covariance_yu[0]
+
+    @property
+    def free(self) -> int:
+        """Real equations beyond the coefficients."""
+        return int(max(2 * self._y.size - self._jacobian.shape[0], 1))
 
     @property
     def weighted_power(self) -> float:
         """``sum |y|^2 / s_Y^2``."""
-        y = self._y
-        return float((y.real**2 + y.imag**2) @ (1 / self._variance_y))
+        power = self._y.real**2 + self._y.imag**2
+        parts = zip(self._basis.parts, self._variances, strict=True)
+        return float(sum((power[part] / variance).sum() for part, variance in parts))
 
-    def linearise(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (groups,), half its gradient (n,), normals (groups, n, n) at theta (n,)."""
+    def evaluate(self, theta: FloatArray) -> OneValue:
+        """The model at theta (n,), unweighted: see `weight`."""
         basis = self._basis
-        a, b, c = (self._value(which, theta) for which in range(3))
+        for_a, for_b, for_c = self._kinds
+        of_a, of_b, of_c = basis.values
+        a = (theta[for_a] @ of_a).view(complex)
+        a += basis.last
         inverse = 1 / a
-        g = b * inverse
-        model = g * self._u
-        model += c * inverse
-        variance = self._variance_y
+        g = (theta[for_b] @ of_b).view(complex)
+        last = basis.parts[-1]
+        g *= inverse[last]
+        driven = g if self._u is None else g * self._u
+        if of_c.size:
+            model = (theta[for_c] @ of_c).view(complex)
+            model *= inverse
+            model[last] += driven
+        else:
+            model = driven
+        empty = np.empty(0)
+        return OneValue(inverse, model, self._y - model, g, empty, empty, empty, basis.parts)
+
+    def weight(self, value: OneValue) -> OneValue:
+        """The same with weighted errors and their cost."""
+        basis = self._basis
+        root = value.root = np.empty(self._y.size)
+        for part, variance in zip(basis.parts, self._variances, strict=True):
+            root[part] = variance
         if self._variance_u is not None:
-            variance = variance + self._variance_u * (g.real**2 + g.imag**2)
+            g = value.g
+            more = self._variance_u * (g.real**2 + g.imag**2)
             if self._covariance is not None:
-                variance -= 2 * np.real(self._covariance * g.conj())
-        root = 1 / np.sqrt(variance)
-        error = self._y - model
-        error *= root
-        real = self._weighted_jacobian(model, inverse * root)
-        flat = error.view(float)
+                more -= 2 * np.real(self._covariance * g.conj())
+            root[basis.parts[-1]] += more
+        np.sqrt(root, out=root)
+        np.divide(1, root, out=root)
+        value.weighted = value.error * root
+        flat = value.weighted.view(float)
+        parts = [flat[2 * part.start : 2 * part.stop] for part in basis.parts]
+        value.group_cost = np.array([part @ part for part in parts])
+        return value
+
+    def normals(self, value: OneValue) -> tuple[FloatArray, FloatArray]:
+        """Half the gradient (n,) of the cost, normals (groups, n, n), of a weighted value."""
+        basis = self._basis
+        scaled = value.inverse * value.root
+        real = self._weighted_jacobian(value.model, scaled)
+        flat = value.weighted.view(float)
         gradient = real @ flat
         if self._variance_u is not None:
+            last = basis.parts[-1]
+            error, g, root = value.weighted[last], value.g, value.root[last]
             slope = self._variance_u * g.conj()
             if self._covariance is not None:
                 slope -= self._covariance.conj()
-            h = (error.real**2 + error.imag**2) / variance * slope * inverse
-            for_a, for_b, _ = basis.kinds
-            gradient[for_a] += basis.conjugate[for_a] @ (h * g).view(float)
-            gradient[for_b] -= basis.conjugate[for_b] @ h.view(float)
+            slope *= (error.real**2 + error.imag**2) * root**2
+            slope *= value.inverse[last]
+            for_a, for_b, _ = self._kinds
+            gradient[for_b] -= basis.values[1] @ slope.conj().view(float)
+            slope *= g
+            here = slice(2 * last.start, 2 * last.stop)
+            gradient[for_a] += basis.values[0][:, here] @ slope.conj().view(float)
         n = gradient.size
         normal = np.empty((len(basis.parts), n, n))
-        cost = np.empty(len(basis.parts))
-        for k, part in enumerate(basis.parts):
-            here = slice(2 * part.start, 2 * part.stop)
-            np.matmul(real[:, here], real[:, here].T, out=normal[k])
-            cost[k] = flat[here] @ flat[here]
-        return cost, gradient, normal
+        for part, out in zip(basis.parts, normal, strict=True):
+            rows = real[:, 2 * part.start : 2 * part.stop]
+            np.matmul(rows, rows.T, out=out)
+        return gradient, normal
 
-    def start(self, iterations: int) -> FloatArray:
-        """(n,) coefficients by Sanathanan-Koerner iterations."""
+    def step(
+        self, normal: FloatArray, gradient: FloatArray, damping: float = 0.0
+    ) -> tuple[FloatArray, float]:
+        """Levenberg-Marquardt step to be subtracted (n,), and what it lowers the cost by."""
+        total = normal[0] if len(normal) == 1 else normal[0] + normal[1]
+        return step_and_decrement(total, gradient, damping)
+
+    def residual_after(self, value: OneValue, step: FloatArray) -> ComplexArray:
+        """(K_last,) weighted errors of the last group, a small step on from the latest `normals`."""
+        last = self._basis.parts[-1]
+        change = step @ self._jacobian.view(float)[:, 2 * last.start :]
+        return np.asarray(value.weighted[last] - change.view(complex))
+
+    def start(self, iterations: int, theta: FloatArray | None = None) -> FloatArray:
+        """(n,) coefficients by Sanathanan-Koerner iterations, from weights 1 or those of theta (n,)."""
         basis = self._basis
-        root = 1 / np.sqrt(self._variance_y)
+        root = np.empty(self._y.size)
+        for part, variance in zip(basis.parts, self._variances, strict=True):
+            root[part] = variance
+        np.sqrt(root, out=root)
         right = -self._y * basis.last
-        theta = np.empty(0)
-        for iteration in range(iterations):
-            scale = root if iteration == 0 else root / np.abs(self._value(0, theta))
+        for _ in range(iterations):
+            size = root
+            if theta is not None:
+                a = (theta[self._kinds[0]] @ basis.values[0]).view(complex)
+                a += basis.last
+                size = root * np.abs(a)
+            scale = 1 / size
             real = self._weighted_jacobian(self._y, scale)
             theta = solve_one(real @ real.T, real @ (right * scale).view(float))
+        assert theta is not None
         return theta
 
     def _weighted_jacobian(self, y: ComplexArray, weight: npt.NDArray) -> FloatArray:
         """(n, 2 K) real and imaginary parts of ``weight (y p, -u q, -t)``; valid until the next call."""
-        rows, jacobian = self._basis.rows, self._jacobian
-        for_a, for_b, for_c = self._basis.kinds
-        np.multiply(rows[for_a], y * weight, out=jacobian[for_a])
-        np.multiply(rows[for_b], -self._u * weight, out=jacobian[for_b])
-        np.multiply(rows[for_c], -weight, out=jacobian[for_c])
+        basis, jacobian = self._basis, self._jacobian
+        for_a, for_b, for_c = self._kinds
+        last = basis.parts[-1]
+        minus = -weight
+        np.multiply(basis.denominator, y * weight, out=jacobian[for_a])
+        driven = minus[last] if self._u is None else self._u * minus[last]
+        np.multiply(basis.numerator, driven, out=jacobian[for_b, last])
+        if basis.values[2].size:
+            np.multiply(basis.transient, minus, out=jacobian[for_c])
         return jacobian.view(float)
-
-    def _value(self, which: int, theta: FloatArray) -> ComplexArray:
-        """(K,) of A (0), B (1) or C (2)."""
-        kind = self._basis.kinds[which]
-        value = (theta[kind] @ self._basis.real[kind]).view(complex)
-        if which == 0:
-            value += self._basis.last
-        return value

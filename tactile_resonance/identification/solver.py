@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.normal_equations import solve_scaled, step_and_decrement
-from tactile_resonance.identification.one_point import OnePoint
+from tactile_resonance.identification.many_points import ManyPoints, ManyValues
+from tactile_resonance.identification.one_point import OnePoint, OneValue
 from tactile_resonance.identification.problem import Problem
 
 FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
 
 MAX_ITERATIONS = 60
@@ -36,6 +37,8 @@ class Solution:
         ``Re J^H J`` of each group at the solution.
     cost : (batch,) float
     group_cost : (batch, groups) float
+    residual : (batch, K) complex
+        Weighted, of the last group.
     converged : (batch,) bool
     iterations : (batch,) int
     """
@@ -44,6 +47,7 @@ class Solution:
     normal: FloatArray
     cost: FloatArray
     group_cost: FloatArray
+    residual: ComplexArray
     converged: BoolArray
     iterations: npt.NDArray[np.int64]
 
@@ -73,79 +77,100 @@ def minimise(
         for first in range(0, max(batch, 1), chunk):
             rows = slice(first, first + chunk)
             part = [values.rows(rows) for values in data] if batch > chunk else list(data)
-            begin = problem.first(part) if start is None else start[rows]
-            solver = _minimise_one if batch == 1 else _minimise_chunk
-            parts.append(solver(problem, part, begin, max_iterations))
+            points = problem.points(part)
+            begin = problem.start(points, part) if start is None else start[rows]
+            parts.append(refine(points, np.atleast_2d(begin), None, max_iterations))
     if len(parts) == 1:
         return parts[0]
-    fields = ("theta", "normal", "cost", "group_cost", "converged", "iterations")
+    fields = ("theta", "normal", "cost", "group_cost", "residual", "converged", "iterations")
     return Solution(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
 
 
-def _minimise_one(
-    problem: Problem, data: list[BinData], start: FloatArray, max_iterations: int
+def refine(
+    points: OnePoint | ManyPoints,
+    start: FloatArray,
+    value: OneValue | ManyValues | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Solution:
-    """As `_minimise_chunk`, for a batch of one: no masks."""
-    point = OnePoint(problem.stacked, data)
-    theta = start[0]
-    free = max(2 * sum(group.size for group in problem.groups) - theta.size, 1)
-    floor = ROUNDING**2 * point.weighted_power
-    group_cost, gradient, normal = point.linearise(theta)
-    cost = float(group_cost.sum())
+    """Minimise the cost of points that are computed together.
+
+    Parameters
+    ----------
+    points : OnePoint or ManyPoints
+    start : (batch, n) float
+    value : OneValue or ManyValues, optional
+        The model there, where it is known already.
+    max_iterations : int
+        Evaluations of the model after the first one.
+    """
+    if isinstance(points, OnePoint):
+        assert value is None or isinstance(value, OneValue)
+        return _refine_one(points, start[0], value, max_iterations)
+    assert value is None or isinstance(value, ManyValues)
+    return _refine_many(points, start, value, max_iterations)
+
+
+def _refine_one(
+    point: OnePoint, theta: FloatArray, value: OneValue | None, max_iterations: int
+) -> Solution:
+    """As `_refine_many`, for a batch of one: no masks."""
+    value = point.weight(point.evaluate(theta) if value is None else value)
+    cost = value.cost
+    limit, floor = STEP_TOLERANCE**2 / point.free, ROUNDING**2 * point.weighted_power
+    gradient, normal = point.normals(value)
     damping = 0.0
     converged = False
     iterations = 0
+    residual = None
     for _ in range(max_iterations):
-        step, decrement = step_and_decrement(normal.sum(axis=0), gradient, damping)
-        if damping == 0 and decrement <= max(STEP_TOLERANCE**2 * cost / free, floor):
+        step, decrement = point.step(normal, gradient, damping)
+        if damping == 0 and decrement <= max(limit * cost, floor):
             theta = theta - step
             cost -= decrement
+            residual = point.residual_after(value, step)
             converged = True
             break
         if not np.isfinite(decrement) or damping > 1e10:
             break
-        trial = theta - step
-        trial_cost, trial_gradient, trial_normal = point.linearise(trial)
-        total = float(trial_cost.sum())
+        trial = point.weight(point.evaluate(theta - step))
         iterations += 1
-        if total <= cost * (1 + 1e-12) + floor:
-            theta, cost, group_cost = trial, total, trial_cost
-            gradient, normal = trial_gradient, trial_normal
+        if trial.cost <= cost * (1 + 1e-12) + floor:
+            theta, value, cost = theta - step, trial, trial.cost
+            gradient, normal = point.normals(value)
             damping = 0.0 if damping < 1e-4 else damping / 10
         else:
             damping = max(10 * damping, 1e-3)
+    if residual is None:
+        residual = point.residual_after(value, np.zeros_like(theta))
     return Solution(
         theta[None],
         normal[None],
         np.array([cost]),
-        group_cost[None],
+        value.group_cost[None],
+        residual[None],
         np.array([converged]),
         np.array([iterations]),
     )
 
 
-def _minimise_chunk(
-    problem: Problem, data: list[BinData], theta: FloatArray, max_iterations: int
+def _refine_many(
+    points: ManyPoints, theta: FloatArray, value: ManyValues | None, max_iterations: int
 ) -> Solution:
     batch = theta.shape[0]
-    bins = sum(group.size for group in problem.groups)
-    free = max(2 * bins - theta.shape[1], 1)
-    floor = ROUNDING**2 * sum(
-        np.sum((v.y.real**2 + v.y.imag**2) / v.variance_y, axis=-1) for v in data
-    )
-    group_cost, gradient, normal = problem.linearise(data, theta)
+    value = points.weight(points.evaluate(theta) if value is None else value)
+    limit, floor = STEP_TOLERANCE**2 / points.free, ROUNDING**2 * points.weighted_power
+    cost, group_cost = value.cost, value.group_cost
+    gradient, normal = points.normals(value)
     theta = theta.copy()
-    cost = group_cost.sum(axis=-1)
     damping = np.zeros(batch)
     converged = np.zeros(batch, bool)
     iterations = np.zeros(batch, np.int64)
     active = np.arange(batch)
-    work = data
+    work = points
     for _ in range(max_iterations):
-        whole = active.size == batch
-        now = slice(None) if whole else active
-        step, decrement = solve_scaled(normal[now].sum(axis=1), gradient[now], damping[now])
-        tolerance = np.maximum(STEP_TOLERANCE**2 * cost[now] / free, floor[now])
+        now = slice(None) if active.size == batch else active
+        step, decrement = points.step(normal[now], gradient[now], damping[now])
+        tolerance = np.maximum(limit * cost[now], floor[now])
         done = (decrement <= tolerance) & (damping[now] == 0)
         theta[active[done]] -= step[done]
         cost[active[done]] -= decrement[done]
@@ -157,22 +182,20 @@ def _minimise_chunk(
             break
         if not keep.all():
             active, step = active[keep], step[keep]
-            work = [values.rows(active) for values in data]
+            work = points.rows(active)
         trial = theta[active] - step
-        trial_cost, trial_gradient, trial_normal = problem.linearise(work, trial)
-        total = trial_cost.sum(axis=-1)
+        found = work.weight(work.evaluate(trial))
+        trial_gradient, trial_normal = work.normals(found)
+        total = found.cost
         iterations[active] += 1
         # rounding of the cost itself must not count as an increase
         better = total <= cost[active] * (1 + 1e-12) + floor[active]
-        if better.all() and active.size == batch:
-            theta, cost, group_cost = trial, total, trial_cost
-            gradient, normal = trial_gradient, trial_normal
-            damping[:] = np.where(damping < 1e-4, 0.0, damping / 10)
-            continue
         good = active[better]
-        theta[good], cost[good], group_cost[good] = trial[better], total[better], trial_cost[better]
+        theta[good], cost[good] = trial[better], total[better]
+        group_cost[good] = found.group_cost[better]
         gradient[good], normal[good] = trial_gradient[better], trial_normal[better]
         damping[good] = np.where(damping[good] < 1e-4, 0.0, damping[good] / 10)
         worse = active[~better]
         damping[worse] = np.maximum(10 * damping[worse], 1e-3)
-    return Solution(theta, normal, cost, group_cost, converged, iterations)
+    residual = points.last_residual(theta)
+    return Solution(theta, normal, cost, group_cost, residual, converged, iterations)

@@ -68,9 +68,30 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     ones makes the test conservative. F to normal by Paulson's cube roots, see
     `noise_level.f_quantile`.
     """
+    score, levels = _best_level(residual, parameters)
+    with np.errstate(invalid="ignore"):
+        among = -np.expm1(levels * np.log1p(-special.ndtr(-score)))
+    return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
+
+
+def are_smooth(residual: ComplexArray, parameters: int) -> npt.NDArray[np.bool_]:
+    """(...) whether the `whiteness` of residuals (..., F) is beyond `SMOOTH_RESIDUAL`."""
+    score, levels = _best_level(residual, parameters)
+    return np.asarray(score > _limit(levels))
+
+
+@lru_cache(maxsize=64)
+def _limit(levels: int) -> float:
+    """Score of the most significant of so many levels that `SMOOTH_RESIDUAL` stands for."""
+    each = -np.expm1(np.log1p(-special.ndtr(-SMOOTH_RESIDUAL)) / levels)
+    return float(-special.ndtri(each))
+
+
+def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, int]:
+    """(...) normal score of the most significant level, and how many levels there are."""
     lines = residual.shape[-1]
     if lines < 3:
-        return np.full(residual.shape[:-1], np.nan)
+        return np.full(residual.shape[:-1], np.nan), 1
     counts, cosines = components(lines, parameters)
     parts = np.stack([residual.real, residual.imag])  # (2, ..., F)
     power = _squared(parts @ cosines).cumsum(axis=-1)
@@ -82,8 +103,7 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
         root = np.cbrt(smooth / (total - smooth) * (others / counts))
         a, b = 1 / (9 * counts), 1 / (9 * others)
         score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
-        among = -np.expm1(counts.size * np.log1p(-special.ndtr(-score)))
-    return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
+    return score, counts.size
 
 
 def _squared(parts: FloatArray) -> FloatArray:

@@ -6,8 +6,8 @@ import pytest
 
 from tactile_resonance.identification.basis import PolynomialBasis
 from tactile_resonance.identification.bins import BinData, BinGroup
-from tactile_resonance.identification.normal_equations import solve_one, solve_scaled
-from tactile_resonance.identification.one_point import OnePoint
+from tactile_resonance.identification.covariance import invert_normal
+from tactile_resonance.identification.normal_equations import MANY, solve_one, solve_scaled
 from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.solver import minimise
 
@@ -45,38 +45,59 @@ def problem_and_data(batch, errors_in_variables, transient):
 @pytest.mark.parametrize("errors_in_variables", [True, False])
 def test_equal_the_batch(errors_in_variables, transient):
     problem, data = problem_and_data(5, errors_in_variables, transient)
-    start = problem.start(data, 2)
-    whole = problem.linearise(data, start)
+    many = problem.many_points(data)
+    start = many.start(2)
+    whole = many.weight(many.evaluate(start))
+    gradients, squares = many.normals(whole)
     fitted = minimise(problem, data)
     for k in range(5):
         row = [values.rows(slice(k, k + 1)) for values in data]
-        point = OnePoint(problem.stacked, row)
+        point = problem.one_point(row)
         assert point.start(2) == pytest.approx(start[k], rel=1e-9)
-        cost, gradient, square = (values[k] for values in whole)
-        mine = point.linearise(start[k])
-        assert mine[0] == pytest.approx(cost, rel=1e-10)
+        value = point.weight(point.evaluate(start[k]))
+        gradient, square = point.normals(value)
+        assert value.group_cost == pytest.approx(whole.group_cost[k], rel=1e-10)
         # near the minimum the gradient is a small difference of products this large
-        size = np.sqrt(cost.sum() * np.diag(square.sum(axis=0)).max())
-        assert np.abs(mine[1] - gradient).max() < 1e-12 * size
-        assert np.abs(mine[2] - square).max() < 1e-12 * np.abs(square).max()
+        size = np.sqrt(value.cost * np.diag(squares[k].sum(axis=0)).max())
+        assert np.abs(gradient - gradients[k]).max() < 1e-12 * size
+        assert np.abs(square - squares[k]).max() < 1e-12 * np.abs(square).max()
         alone = minimise(problem, row)
         assert alone.converged[0]
         assert fitted.converged[k]
         assert alone.theta[0] == pytest.approx(fitted.theta[k], rel=1e-7, abs=1e-9)
         assert alone.cost[0] == pytest.approx(fitted.cost[k], rel=1e-10)
+        assert np.abs(alone.residual[0] - fitted.residual[k]).max() < 1e-4
 
 
 def test_gradient_is_that_of_the_cost():
     problem, data = problem_and_data(1, True, True)
-    point = OnePoint(problem.stacked, data)
+    point = problem.one_point(data)
     theta = point.start(2)
-    gradient = point.linearise(theta)[1]
+
+    def cost(at):
+        return point.weight(point.evaluate(at)).cost
+
+    gradient = point.normals(point.weight(point.evaluate(theta)))[0]
     for k in range(theta.size):
         step = np.zeros_like(theta)
         step[k] = 1e-6 * max(abs(theta[k]), 0.1)
-        up, down = (point.linearise(theta + sign * step)[0].sum() for sign in (1, -1))
-        slope = (up - down) / (2 * step[k])
+        slope = (cost(theta + step) - cost(theta - step)) / (2 * step[k])
         assert 2 * gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)
+
+
+def test_start_values_from_weights_of_the_bins_with_an_input():
+    """The first iteration on few bins, the second on all: as near as two on all."""
+    problem, data = problem_and_data(5, False, True)
+    many = problem.many_points(data)
+    assert problem.driven is not problem
+    twice, mixed = many.start(2), problem.start(many, data)
+    _, square = many.normals(many.weight(many.evaluate(twice)))
+    deviation = np.sqrt(np.einsum("bi,bij,bj->b", mixed - twice, square.sum(axis=1), mixed - twice))
+    assert deviation.max() < 1
+    one = problem.start(
+        problem.one_point([v.rows(slice(2, 3)) for v in data]), [v.rows(slice(2, 3)) for v in data]
+    )
+    assert one == pytest.approx(mixed[2], rel=1e-8)
 
 
 def test_solution_of_one_system():
@@ -92,3 +113,35 @@ def test_solution_of_one_system():
     # the general solver takes over then
     step, _ = solve_scaled(indefinite[None], np.ones((1, 2)))
     assert step[0] == pytest.approx([1 / 3, 1 / 3])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 16])
+def test_elimination_of_many_systems_at_once(n):
+    """Scales of 24 decades, damping, a matrix without inverse, an indefinite one and one of NaN."""
+    batch = 2 * MANY
+    matrix = RNG.standard_normal((batch, n + 4, n))
+    square, right = np.swapaxes(matrix, 1, 2) @ matrix, RNG.standard_normal((batch, n))
+    scale = 10.0 ** RNG.uniform(-6, 6, (batch, n))
+    wide = square * scale[:, :, None] * scale[:, None, :]
+    for damping in (0.0, np.linspace(0, 3, batch)):
+        damped = square + square * np.eye(n) * np.reshape(damping, (-1, 1, 1))
+        expected = np.linalg.solve(damped, right[..., None])[..., 0] / scale
+        step, decrement = solve_scaled(wide, right * scale, damping)
+        assert step == pytest.approx(expected, rel=1e-7)
+        assert decrement == pytest.approx(np.sum(expected * right * scale, axis=-1), rel=1e-9)
+    inverse, condition = invert_normal(wide)
+    eye = inverse * scale[:, :, None] * scale[:, None, :] @ square
+    assert eye == pytest.approx(np.broadcast_to(np.eye(n), eye.shape), abs=1e-9)
+    wide[3] = np.nan
+    wide[5] = 0.0
+    wide[7] *= -1
+    step, _ = solve_scaled(wide, right * scale)
+    assert np.isnan(step[3]).all()
+    assert np.isfinite(step[[4, 5, 6]]).all()
+    assert step[[4, 6]] == pytest.approx(
+        np.linalg.solve(square[[4, 6]], right[[4, 6], :, None])[..., 0] / scale[[4, 6]], rel=1e-7
+    )
+    inverse, condition = invert_normal(wide)
+    assert np.isnan(inverse[[3, 5, 7]]).all()
+    assert np.isinf(condition[[3, 5, 7]]).all()
+    assert np.isfinite(inverse[[4, 6]]).all()

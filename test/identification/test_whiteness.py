@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, whiteness
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, are_smooth, whiteness
 
 RUNS = 20000
 
@@ -45,5 +45,15 @@ def test_a_smooth_part_far_below_the_noise_is_seen(waves, share):
     assert np.mean(whiteness(residual + smooth * (-1) ** line, 5) > 2) < 0.05
 
 
+@pytest.mark.parametrize("lines", [5, 41, 300])
+def test_limit_of_the_best_level_is_that_of_the_score(lines):
+    rng = np.random.default_rng(lines)
+    residual = noise(rng, lines, 4000) + 2 * rng.random((4000, 1))
+    smooth = are_smooth(residual, 5)
+    assert 0 < smooth.sum() < 4000
+    np.testing.assert_array_equal(smooth, whiteness(residual, 5) > SMOOTH_RESIDUAL)
+
+
 def test_fewer_than_three_lines_tell_nothing():
     assert np.isnan(whiteness(np.ones((4, 2), complex), 1)).all()
+    assert not are_smooth(np.ones((4, 2), complex), 1).any()
