@@ -67,15 +67,13 @@ class Envelope:
         if arm is None:
             return Breach(Cause.ARM_STALE, "no state of the arm has come")
         age = (now_ns - arm.time_ns) * 1e-9
-        if age > limits.arm_age_s:
-            text = (
-                f"state of the arm is {1e3 * age:.0f} ms old, limit {1e3 * limits.arm_age_s:g} ms"
-            )
+        if abs(age) > limits.arm_age_s:  # one of the future would seem fresh for long
+            text = f"state of the arm is {_age(age)}, limit {1e3 * limits.arm_age_s:g} ms"
             return Breach(Cause.ARM_STALE, text)
         if not arm.moving_allowed:
             return Breach(Cause.ARM_STOPPED, f"the arm may not move: {arm.message}")
         place = arm.tip.position_m
-        if not np.isfinite(np.concatenate([place, arm.tip.rotation_rad, arm.tip_velocity])).all():
+        if not is_finite(arm):
             return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is no number")
         box = limits.workspace
         for axis, x, low, high in zip("xyz", place, box.low_m, box.high_m, strict=True):
@@ -142,12 +140,8 @@ class Envelope:
     def judge_force_age(self, now_ns: int, watch: ForceWatch) -> Breach | None:
         """Whether forces still come."""
         age, limit = watch.age_s(now_ns), self.limits.force_age_s
-        if age > limit:
-            text = (
-                "no force has come"
-                if age == math.inf
-                else f"newest force is {1e3 * age:.0f} ms old"
-            )
+        if abs(age) > limit:
+            text = "no force has come" if age == math.inf else f"newest force is {_age(age)}"
             return Breach(Cause.FORCE_STALE, f"{text}, limit {1e3 * limit:g} ms")
         return None
 
@@ -188,6 +182,16 @@ class Envelope:
                 velocity *= room / abs(speed)
         angular *= _shrink(angular, limits.angular_speed_rad_s)
         return np.concatenate([velocity, angular])
+
+
+def _age(age_s: float) -> str:
+    return f"{1e3 * age_s:.0f} ms old" if age_s > 0 else f"{-1e3 * age_s:.0f} ms ahead of the clock"
+
+
+def is_finite(arm: ArmSample) -> bool:
+    """Whether pose and velocity of an arm are numbers."""
+    numbers = [arm.tip.position_m, arm.tip.rotation_rad, arm.tip_velocity]
+    return bool(np.isfinite(np.concatenate(numbers)).all())
 
 
 def _shrink(vector: FloatArray, most: float) -> float:

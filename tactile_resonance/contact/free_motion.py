@@ -20,8 +20,8 @@ from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
 
-TOUCH_IN_TRAVEL_N = 0.01
-"""Change of the untared force while coming down to the standoff that is a touch [N]."""
+TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL = 0.01, 8.0
+"""Change of the untared force, near the surface, that is a touch [N]; more where so much is noise."""
 
 
 class FreeMotion:
@@ -58,13 +58,9 @@ class FreeMotion:
             # it may still press, where something ended while it did: up before it goes along
             return Move(self._path.lift(arm, p))
         if near and math.isfinite(self._observer.watch.age_s(now_ns)):
-            # not tared yet, so only a change counts
-            if self._travel_force is None:
-                self._travel_force = self._observer.watch.force_n.copy()
-            change = float(np.linalg.norm(self._observer.watch.force_n - self._travel_force))
-            if change > TOUCH_IN_TRAVEL_N:
-                text = f"force changed by {1e3 * change:.1f} mN on the way to the standoff"
-                return failed(Cause.SURFACE_EARLY, text)
+            touched = self._touched("on the way to the standoff")
+            if touched is not None:
+                return touched
         if self._path.arrived(arm, p.standoff_m):
             self._still_ns = -1
             return Move(None, State.TARE)
@@ -74,6 +70,11 @@ class FreeMotion:
         """At rest for the zero of the force."""
         speed = float(np.linalg.norm(arm.tip_velocity[:3]))
         observer = self._observer
+        if observer.taring:
+            # not before: a tool on the cell has to come to rest
+            touched = self._touched("at the standoff, before its zero was known")
+            if touched is not None:
+                return touched
         if not observer.taring:
             if speed > STILL_M_S:
                 self._still_ns = -1
@@ -81,6 +82,7 @@ class FreeMotion:
                 self._still_ns = now_ns
             elif now_ns - self._still_ns > STILL_NS:
                 observer.begin_tare()
+                self._travel_force = None
                 self._tare_ns = now_ns
         elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
             breach = observer.end_tare()
@@ -88,6 +90,16 @@ class FreeMotion:
                 return Move(None, State.APPROACH)
             return Move(None, State.FAULT, breach)
         return REST
+
+    def _touched(self, where: str) -> Move | None:
+        """What follows where something pushes: without a zero only a change tells that."""
+        force_n = self._observer.watch.force_n
+        if self._travel_force is None:
+            self._travel_force = force_n.copy()
+        change = float(np.linalg.norm(force_n - self._travel_force))
+        if change <= max(TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL * self._parameters.cell_noise_n):
+            return None
+        return failed(Cause.SURFACE_EARLY, f"force changed by {1e3 * change:.1f} mN {where}")
 
     def approach(self, arm: ArmSample, place: Place) -> Move:
         """Down along the normal until the force tells a touch."""

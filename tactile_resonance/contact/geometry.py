@@ -79,11 +79,13 @@ class TipGeometry:
         height_m : float
             Of the tip above its first touch of the plane [m]; below 0 when pressed in.
         """
+        return float(self.ball_radius_m + height_m + normal @ self.housing_from_ball(turn))
+
+    def housing_from_ball(self, turn: FloatArray) -> FloatArray:
+        """The housing's lower edge (3,) from the ball's centre [m], `turn` (3, 3) as above."""
         rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
         run = self.beam_length_m * math.cos(self.beam_tilt_rad)
-        # from the ball's centre
-        edge = (rise - self.housing_below_m) * turn[:, 2] - run * turn[:, 0]
-        return float(self.ball_radius_m + height_m + normal @ edge)
+        return (rise - self.housing_below_m) * turn[:, 2] - run * turn[:, 0]
 
     def worst_height(self, depth_m: float, off_rad: float) -> float:
         """The same at a depth, the clamp turned down by an angle about the ball [m]."""

@@ -29,6 +29,13 @@ class State(str, Enum):
     FAULT = "fault"
 
 
+TOUCHING = (State.CONTACT, State.SETTLE, State.HOLD)
+"""States in which the tip is taken to press on tissue."""
+
+TARED = (State.APPROACH, *TOUCHING)
+"""States in which the zero of the force is known."""
+
+
 @dataclass(frozen=True)
 class ContactGoal:
     """What is asked for.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,14 +12,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.goal import Command, ContactGoal, State
-from tactile_resonance.contact.interfaces import Arm, ArmError, ForceError, ForceSource
+from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, ForceError, ForceSource
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 
 STOP_AGAIN_NS = 50_000_000
-"""A stop that holds is told again after so long."""
+"""A stop that holds is told again after so long, at least once, and until the arm is seen to rest."""
 
 
 class Clock(Protocol):
@@ -89,11 +91,15 @@ class ContactLoop:
         self._next_ns = clock.now_ns()
         self._refused: ArmError | None = None  # what a command raised, told in the next cycle
         self._stopped_ns: int | None = None
-        self._unheard: Command | None = None  # a stop that the arm has not taken
+        self._owed: Command | None = None  # a stop of which the arm has not been seen to rest
+        self._owed_ns = 0
 
     def start(self, goal: ContactGoal) -> None:
         """Begin a contact; raises ``ValueError`` where the controller refuses it."""
-        self.controller.start(goal, self._clock.now_ns())
+        arm = None
+        with contextlib.suppress(ArmError):  # then the first cycle tells it
+            arm = self._arm.state()
+        self.controller.start(goal, self._clock.now_ns(), arm)
 
     def make(self, goal: ContactGoal) -> ContactResult:
         """Begin a contact and run until it is reached, or has failed and stands still."""
@@ -123,16 +129,17 @@ class ContactLoop:
 
     def wait(self) -> None:
         """Wait for the next period; requests may be made meanwhile."""
-        self._clock.wait_until(self._next_ns)
+        # where the clock is set back the next period is not the one that was planned
+        self._clock.wait_until(min(self._next_ns, self._clock.now_ns() + self._period_ns()))
 
     def run_period(self) -> None:
         """Read both devices, decide, command."""
-        period_ns = round(1e9 * self.controller.parameters.period_s)
+        period_ns = self._period_ns()
         now = self._clock.now_ns()
         late_ns = now - self._next_ns
         self.cycles += 1
-        if late_ns > period_ns:
-            self.overruns += 1
+        if abs(late_ns) > period_ns:
+            self.overruns += late_ns > 0
             self._next_ns = now  # periods that are lost are not made up for
         self._next_ns += period_ns
         fault: ArmError | ForceError | None = self._refused
@@ -146,24 +153,43 @@ class ContactLoop:
             wrenches = self._force.read()
         except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
-        # the arm keeps a velocity, so a stop is told until it is heard, whatever state that ends in
-        command = self.controller.step(now, arm, wrenches, fault) or self._unheard
+        # the arm keeps a velocity, so a stop is told until it has worked, whatever state that ends in
+        command = self.controller.step(now, arm, wrenches, fault) or self._owed
         try:
-            if command is None:
-                self._stopped_ns = None
-            elif command.twist is not None:
-                self._stopped_ns = None
-                self._arm.speed(command.twist, command.acceleration_m_s2)
-            elif self._stopped_ns is None or now - self._stopped_ns > STOP_AGAIN_NS:
-                self._stopped_ns = now
-                self._arm.stop(command.acceleration_m_s2)
-            self._unheard = None
-        except ArmError as error:
-            self._refused = error
+            self._tell(command, now)
+        except (ArmError, ValueError) as error:  # a driver refuses figures that it may not pass on
+            self._refused = (
+                error
+                if isinstance(error, ArmError)
+                else ArmError(ArmFault.COMMAND_REFUSED, str(error))
+            )
             self._stopped_ns = None
-            if command is not None and command.twist is None:
-                self._unheard = command
+        else:
+            if self._owed is not None and abs(now - self._owed_ns) > STOP_AGAIN_NS and _rests(arm):
+                self._owed = None
         if self._listener is not None:
             state = self.controller.state
             bias_n = self.controller.bias_n
             self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, bias_n, fault))
+
+    def _tell(self, command: Command | None, now: int) -> None:
+        """Pass a command on; a stop that goes on is not told in every period."""
+        if command is None or command.twist is not None:
+            self._stopped_ns = self._owed = None
+        elif self._owed is None:
+            self._owed, self._owed_ns = command, now
+        if command is None:
+            return
+        if command.twist is not None:
+            self._arm.speed(command.twist, command.acceleration_m_s2)
+        elif self._stopped_ns is None or abs(now - self._stopped_ns) > STOP_AGAIN_NS:
+            self._stopped_ns = now
+            self._arm.stop(command.acceleration_m_s2)
+
+    def _period_ns(self) -> int:
+        return round(1e9 * self.controller.parameters.period_s)
+
+
+def _rests(arm: ArmSample | None) -> bool:
+    """Whether an arm is seen to stand still; what is no number is not."""
+    return arm is not None and bool(np.linalg.norm(arm.tip_velocity[:3]) < STILL_M_S)

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.admission import check_goal
-from tactile_resonance.contact.envelope import Envelope, Place
+from tactile_resonance.contact.envelope import Envelope, Place, is_finite
 from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.goal import Command, ContactGoal, State
+from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
+from tactile_resonance.contact.judgement import Judgement
 from tactile_resonance.contact.move import REST, Move
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.outcome import Outcome
@@ -40,8 +41,8 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 """After these the tip is not drawn back by itself: the arm moves again only when told to."""
 
 
-TOUCHING = (State.CONTACT, State.SETTLE, State.HOLD)
-TARED = (State.APPROACH, *TOUCHING)
+WISH_NS = 1_000_000_000
+"""For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
 
 
 class ContactController:
@@ -74,7 +75,9 @@ class ContactController:
         self._observer = Observer(parameters, limits.stuck_samples)
         self._outcome = Outcome(self._observer, 0)
         self._height_m = 0.0
+        self._state_ns = self._now_ns = 0
         self._wish_retract = False
+        self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 
     @property
     def result(self) -> ContactResult | None:
@@ -86,6 +89,12 @@ class ContactController:
         """What is known of the contact; None where there is none."""
         model = self._observer.model
         return None if model is None else model.estimate(self._height_m)
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing more happens by itself: idle, or in a fault of the arm."""
+        stays = self.state is State.FAULT and self._arm_was_bad and not self._wish_retract
+        return stays or self.state is State.IDLE
 
     @property
     def bias_n(self) -> FloatArray:
@@ -109,8 +118,8 @@ class ContactController:
         self.parameters, self.limits = parameters, limits
         self._envelope = Envelope(limits)
 
-    def start(self, goal: ContactGoal, now_ns: int) -> None:
-        """Begin a contact.
+    def start(self, goal: ContactGoal, now_ns: int, arm: ArmSample | None = None) -> None:
+        """Begin a contact, from where the arm is; None: its way to the standoff is not judged.
 
         Raises
         ------
@@ -119,22 +128,23 @@ class ContactController:
         """
         if self.state is not State.IDLE:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
-        check_goal(goal, self.parameters, self.limits, self._tip)
+        start = arm if arm is not None and is_finite(arm) else None
+        check_goal(goal, self.parameters, self.limits, self._tip, start)
         p, limits = self.parameters, self.limits
         self.goal = goal
-        self._start_ns = now_ns
         self._observer = Observer(p, limits.stuck_samples)
         self._outcome = Outcome(self._observer, now_ns)
         self._path = TipPath(goal, self._tip)
         self._free = FreeMotion(self._path, self._observer, p, limits)
         self._pressing = Pressing(goal, self._path, self._observer, p, limits)
-        self._wish_retract = self._arm_was_bad = self._pressed_too_hard = False
+        self._judgement = Judgement(self._envelope, self._observer, p, now_ns)
+        self._arm_was_bad = self._pressed_too_hard = False
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
         """Draw the tip back along the normal, at the next cycle; also out of a fault."""
         if self.state is not State.IDLE:
-            self._wish_retract = True
+            self._wish_retract, self._wish_ns = True, None
 
     def tell_touch(self) -> bool:
         """Another sensor tells the first contact: the rest of the approach is slow.
@@ -170,16 +180,19 @@ class ContactController:
         """
         if self.state is State.IDLE or self.goal is None:
             return None
-        place = None if arm is None else self._place(arm)
-        breach = self._judge(now_ns, arm, place, wrenches, fault)
+        # how long a state has lasted does not change where the clock is set back
+        back_ns = max(0, self._now_ns - now_ns)
+        self._now_ns, self._state_ns = now_ns, self._state_ns - back_ns
+        # of an arm whose place is no number nothing can be told but that
+        place = None if arm is None or not is_finite(arm) else self._place(arm)
+        breach = self._judgement.breach(
+            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault, back_ns
+        )
         if breach is not None and self.state is State.FAULT:
             self._arm_was_bad = True  # nothing else counts in this state
         elif breach is not None:
             self._fail(breach, now_ns)
-        if breach is None and self._wish_retract and self.state is not State.RETRACT:
-            text = "drawn back as asked for"
-            self._end(Breach(Cause.CANCELLED, text), now_ns)
-            self._enter(State.RETRACT, now_ns)
+        self._heed_wish(now_ns, breach)
         if arm is None or place is None:
             return self._stop()
         move = self._act(now_ns, arm, place)
@@ -199,47 +212,17 @@ class ContactController:
         self._observer.arm_model.step(0.0, limit)
         return Command(None, limit)
 
-    def _judge(
-        self,
-        now_ns: int,
-        arm: ArmSample | None,
-        place: Place | None,
-        wrenches: Sequence[WrenchSample],
-        fault: ArmError | ForceError | None,
-    ) -> Breach | None:
-        """The first thing that is wrong; in retraction and fault only what concerns the arm."""
-        if isinstance(fault, ArmError):
-            return Breach(Cause.ARM_LINK, str(fault))
-        breach = self._envelope.judge_arm(now_ns, arm)
-        if breach is not None or arm is None or place is None:
-            return breach
-        taken = self._observer.take(wrenches, arm.time_ns, place.height_m)
-        if self.state in (State.RETRACT, State.FAULT):
-            return None
-        if isinstance(fault, ForceError):
-            return Breach(Cause.FORCE_SOURCE, str(fault))
-        breach = taken or self._envelope.judge_motion(arm, place)
-        if breach is None and self.state in TARED:
-            breach = self._envelope.judge_force(now_ns, self._observer.watch)
-        elif breach is None and now_ns - self._start_ns > 1e9 * self.limits.force_age_s:
-            breach = self._envelope.judge_force_age(now_ns, self._observer.watch)
-        return breach or self._judge_time(now_ns)
-
-    def _judge_time(self, now_ns: int) -> Breach | None:
-        limits, tare = self.limits, 2 * self.parameters.tare_s + 2.0
-        most = {
-            State.TRAVEL: limits.travel_s,
-            State.TARE: tare,
-            State.APPROACH: limits.approach_s,
-            State.CONTACT: limits.press_s,
-            State.SETTLE: limits.press_s,
-            State.HOLD: limits.hold_s,
-        }[self.state]
-        if (now_ns - self._state_ns) * 1e-9 <= most:
-            return None
-        if self.state is State.HOLD:
-            return Breach(Cause.HOLD_ENDED, f"held for {most:g} s, as long as is allowed")
-        return Breach(Cause.TIME, f"{self.state.value} took longer than {most:g} s")
+    def _heed_wish(self, now_ns: int, breach: Breach | None) -> None:
+        """Draw back as asked for; a wish that the arm cannot follow soon is forgotten."""
+        if not self._wish_retract or self.state is State.RETRACT:
+            return
+        if breach is None:
+            self._end(Breach(Cause.CANCELLED, "drawn back as asked for"), now_ns)
+            self._enter(State.RETRACT, now_ns)
+        elif self._wish_ns is None:
+            self._wish_ns = now_ns
+        elif abs(now_ns - self._wish_ns) > WISH_NS:
+            self._wish_retract, self._wish_ns = False, None
 
     def _act(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
         """What the present state wishes."""
@@ -256,7 +239,7 @@ class ContactController:
             place = self._place(arm)
         if self.state in TOUCHING:
             return self._pressing.step(now_ns, self.state, arm, place)
-        since_s = (now_ns - self._state_ns) * 1e-9
+        since_s = self._since_s(now_ns)
         if self.state is State.RETRACT:
             return self._free.draw_back(since_s, arm, place)
         # in a fault it stands still, and is then drawn back, unless the arm itself was the fault
@@ -277,6 +260,10 @@ class ContactController:
 
     # pieces
 
+    def _since_s(self, now_ns: int) -> float:
+        """How long the state has lasted [s]."""
+        return (now_ns - self._state_ns) * 1e-9
+
     def _place(self, arm: ArmSample) -> Place:
         path, depth = self._path, None
         self._height_m = above = path.height_m(arm)
@@ -292,9 +279,9 @@ class ContactController:
         )
 
     def _enter(self, state: State, now_ns: int) -> None:
-        self.state, self._state_ns = state, now_ns
-        if state in (State.RETRACT, State.IDLE):
-            self._wish_retract = False
+        self.state, self._state_ns, self._now_ns = state, now_ns, now_ns
+        if state in (State.TRAVEL, State.RETRACT, State.IDLE):
+            self._wish_retract, self._wish_ns = False, None
 
     def _fail(self, breach: Breach, now_ns: int) -> None:
         """Note why, and stop."""

@@ -278,6 +278,10 @@ class Limits:
         ):
             value = getattr(parameters, name)
             require(value <= limit, name, value, f"at most the limit {limit}")
+        way_m, speed = parameters.standoff_m + parameters.search_m, parameters.approach_speed_m_s
+        least = way_m / speed
+        need = f"{least:g} s or more for {1e3 * way_m:g} mm at approach_speed_m_s = {speed:g}"
+        require(self.approach_s >= least, "approach_s", self.approach_s, need)
 
 
 def check_ranges(owner: object, ranges: dict[str, tuple[float, float]]) -> None:

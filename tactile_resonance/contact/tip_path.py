@@ -81,6 +81,10 @@ class TipPath:
         aside = float(np.linalg.norm(arm.tip.position_m - self.place_at(height)))
         return height < standoff_m - LIFTED_M and aside > ARRIVED_M
 
+    def turning_height_m(self, parameters: ContactParameters, limits: Limits) -> float:
+        """Height of the tip to which it goes while much is to be turned."""
+        return max(parameters.standoff_m, limits.near_m + TURNING_M)
+
     # twists (6,) in the base
 
     def lift(self, arm: ArmSample, parameters: ContactParameters) -> FloatArray:
@@ -94,7 +98,7 @@ class TipPath:
         """To the standoff; turned first, out of reach of the surface, where much is to be turned."""
         p, turn, height = parameters, self.turn(arm), parameters.standoff_m
         if float(np.linalg.norm(turn)) > limits.misalignment_rad / 2:
-            height = max(height, limits.near_m + TURNING_M)
+            height = self.turning_height_m(p, limits)
         way = self.place_at(height) - arm.tip.position_m
         distance = float(np.linalg.norm(way))
         braking = math.sqrt(p.acceleration_m_s2 * distance)  # half the limit: the arm lags

@@ -10,11 +10,13 @@ from rclpy.node import Node
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
-from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
+from tactile_resonance.fields import require
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.processes import may_take_priority, take_priority
@@ -99,6 +101,24 @@ def make_arm(node: Node, priority: int) -> UrArm:
     config = read_ur_config(_path(name))
     config = replace(config, host=host or config.host)
     return UrArm(replace(config, realtime_priority=config.realtime_priority or priority))
+
+
+def require_arm_allows(config: UrArmConfig, parameters: ContactParameters, limits: Limits) -> None:
+    """Raise ``ValueError`` where the arm's driver would refuse what the controller may command."""
+    speed, turn, acceleration = (
+        ("max_speed_m_s", config.max_speed_m_s),
+        ("max_turn_rad_s", config.max_turn_rad_s),
+        ("max_acceleration_m_s2", config.max_acceleration_m_s2),
+    )
+    for owner, name, (field, most) in (
+        (limits, "free_speed_m_s", speed),
+        (limits, "angular_speed_rad_s", turn),
+        (limits, "stop_deceleration_m_s2", acceleration),
+        (parameters, "acceleration_m_s2", acceleration),
+        (parameters, "relief_acceleration_m_s2", acceleration),
+    ):
+        value = getattr(owner, name)
+        require(value <= most, name, value, f"at most {field} = {most:g} of robot_config")
 
 
 def make_force_source(node: Node, arm: UrArm) -> TipForce:

@@ -4,41 +4,33 @@
 from __future__ import annotations
 
 import gc
-import math
 import time
 from collections.abc import Sequence
 
-import numpy as np
-from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
-from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
-from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
-from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
-from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.requirements import require_fit
-from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.nodes import contact_devices
+from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
-from tactile_resonance.nodes.conversions import (
-    poles_from_message,
-    time_message,
-)
+from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import POLES, STREAM, RCLError, run_node
+from tactile_resonance.nodes.running import POLES, run_node
+from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
@@ -55,7 +47,7 @@ PARAMETERS = (
         False,
         "First contact is told by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
-        "for blocks of 0.4 s.",
+        "for blocks of 0.4 s, with limits.approach_s of 20 s or more.",
         read_only=True,
     ),
     Parameter(
@@ -73,15 +65,8 @@ PARAMETERS = (
 
 POLL_S = 0.02
 FEEDBACK_EVERY = 5  # polls
-IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
-# A block whose middle lies so long after the last contact was taken in air as a whole.
-IN_AIR_FOR_NS = 1_000_000_000
 # How long the devices may be dead before the node gives up and is brought up anew.
 DEAD_CYCLES = 500
-_HOLDS = {
-    MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
-    MakeContact.Goal.HOLD_INDENTATION: HoldMode.INDENTATION,
-}
 
 
 class ContactNode(ManagedNode):
@@ -94,18 +79,17 @@ class ContactNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("contact_node", PARAMETERS)
         self._thread: ContactThread | None = None
+        self._arm: UrArm | None = None
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def configure(self) -> None:
         """Connect arm and force source."""
-        self._frame_id, self._base_frame = values(self, "frame_id", "base_frame")
-        (self._publish_every,) = values(self, "publish_every")
-        self._settings, self._limits = read_parameters(self)
-        self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-        self._pose = self.publish_on(PoseStamped, "tcp_pose", STREAM)
-        self._state = self.publish_on(msg.ContactState, "contact_state", STREAM)
+        frame_id, self._base_frame = values(self, "frame_id", "base_frame")
+        (every,) = values(self, "publish_every")
+        self._topics = ContactTopics(self, frame_id, self._base_frame, every)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
+        self._settings, self._limits = self._read_parameters()
         self.resources.callback(self._arm.close)
         self._force = contact_devices.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
@@ -115,12 +99,10 @@ class ContactNode(ManagedNode):
         self._goal: ServerGoalHandle | None = None
         self._finished: Future | None = None
         self._fault: ArmError | ForceError | None = None
-        self._dead = self._polls = self._unpublished = 0
-        self._wrenches: list[WrenchSample] = []
+        self._dead = self._polls = 0
         from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
+        self._touch = TouchFromPoles(false_alarm, self._tell_touch) if from_poles else None
         if from_poles:
-            self._touch = PolesTouch(false_alarm)
-            self._air_since_ns = time.time_ns()
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self.every(POLL_S, self._poll)
@@ -147,6 +129,7 @@ class ContactNode(ManagedNode):
         """Draw the tip back and end the loop."""
         if self._thread is not None:
             self._thread.close()
+            self._finish(self._thread.controller.result)
             self._thread = None
 
     def details(self) -> dict[str, str]:
@@ -170,13 +153,20 @@ class ContactNode(ManagedNode):
         if not changed or not self.has_parameter("contact.period_s"):
             return SetParametersResult(successful=True)
         try:
-            parameters, limits = read_parameters(self, **changed)
+            parameters, limits = self._read_parameters(**changed)
             if self._thread is not None:
                 self._thread.configure(parameters, limits)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._settings, self._limits = parameters, limits
         return SetParametersResult(successful=True)
+
+    def _read_parameters(self, **changed: float) -> tuple[ContactParameters, Limits]:
+        """Of the controller, as the arm allows them; ``ValueError`` where one is not accepted."""
+        parameters, limits = read_parameters(self, **changed)
+        if self._arm is not None:
+            contact_devices.require_arm_allows(self._arm.config, parameters, limits)
+        return parameters, limits
 
     def _on_request(self, _: MakeContact.Goal) -> GoalResponse:
         """Goals are taken one at a time, and only while both devices are well."""
@@ -189,7 +179,9 @@ class ContactNode(ManagedNode):
             if self._thread is None:
                 raise ValueError("contact_node is not active")
             limits = self._goal_limits(goal.request)
-            self._thread.start(self._contact_goal(goal.request), self._settings, limits)
+            asked = contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+            require_fit(self._force.info, asked.aim.force_n)
+            self._thread.start(asked, self._settings, limits)
         except ValueError as error:
             result.message = str(error)
             self.health.error(f"refused: {error}")
@@ -202,7 +194,7 @@ class ContactNode(ManagedNode):
             result.cause, result.message = "stopped", "contact_node was stopped"
             goal.abort()
             return result
-        result = _result_message(outcome)
+        result = result_message(outcome)
         if goal.is_cancel_requested:
             goal.canceled()
         elif outcome.reached:
@@ -224,23 +216,6 @@ class ContactNode(ManagedNode):
         response.success = True
         response.message = "asked; contact_state tells when it is idle"
         return response
-
-    def _contact_goal(self, request: MakeContact.Goal) -> ContactGoal:
-        frame = request.pose.header.frame_id
-        if frame != self._base_frame:
-            raise ValueError(f"pose: in frame {frame!r}, accepted is {self._base_frame!r}")
-        if request.hold not in _HOLDS:
-            raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
-        require_fit(self._force.info, request.force_n)
-        point, turn = request.pose.pose.position, request.pose.pose.orientation
-        quaternion = [turn.x, turn.y, turn.z, turn.w]
-        if not 0.99 < math.hypot(*quaternion) < 1.01:
-            raise ValueError(f"pose: orientation {quaternion}, expected a unit quaternion")
-        axes = Rotation.from_quat(quaternion).as_matrix()
-        given = np.array([request.normal.x, request.normal.y, request.normal.z])
-        normal = given if given.any() else axes[:, 2]
-        touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], self._tip.ball_radius_m)
-        return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
 
     def _goal_limits(self, request: MakeContact.Goal) -> Limits:
         """The node's limits, lowered where the goal asks for it."""
@@ -265,7 +240,8 @@ class ContactNode(ManagedNode):
         goal, controller = self._goal, thread.controller
         if goal is None:
             return
-        if goal.is_cancel_requested and controller.state not in (State.RETRACT, State.IDLE):
+        ended = (State.RETRACT, State.FAULT, State.IDLE)
+        if goal.is_cancel_requested and controller.state not in ended:
             thread.retract()
         result = controller.result
         over = controller.state in (State.IDLE, State.FAULT) if goal.is_cancel_requested else True
@@ -274,29 +250,21 @@ class ContactNode(ManagedNode):
             return
         self._polls += 1
         if self._polls % FEEDBACK_EVERY == 0:
-            force_n, depth_m, _ = self._estimate()
-            goal.publish_feedback(
-                MakeContact.Feedback(state=controller.state.value, force_n=force_n, depth_m=depth_m)
-            )
+            goal.publish_feedback(feedback_message(controller.state.value, controller.estimate))
+
+    def _tell_touch(self) -> bool:
+        return self._thread is not None and self._thread.tell_touch()
 
     def _finish(self, result: ContactResult | None) -> None:
         if self._finished is not None and not self._finished.done():
             self._finished.set_result(result)
 
     def _on_poles(self, message: msg.Poles) -> None:
-        """Poles of a block taken in air are the reference, those of an approach are tested against it."""
-        thread, (poles, origin) = self._thread, poles_from_message(message)
-        if thread is None or not len(poles.f0_hz) or poles.covariance is None:
+        thread = self._thread
+        if thread is None:
             return
-        strongest = int(np.argmax(np.abs(poles.residues)))
-        pole = [poles.f0_hz[strongest], poles.damping_ratio[strongest]]
-        covariance, state = poles.covariance[strongest], thread.controller.state
         try:
-            if state in IN_AIR and origin.time_ns > self._air_since_ns + IN_AIR_FOR_NS:
-                self._touch.add_air(pole, covariance)
-            elif state is not State.APPROACH or not self._touch.ready:
-                return
-            elif self._touch.touched(pole, covariance) and thread.tell_touch():
+            if self._touch.hear(message, thread.controller.state, time.time_ns()):
                 self.get_logger().info("the resonance tells the first contact")
         except ValueError as error:
             self.health.error(f"poles: {error}")
@@ -306,83 +274,9 @@ class ContactNode(ManagedNode):
     def _on_cycle(self, cycle: Cycle) -> None:
         self._dead = self._dead + 1 if cycle.fault is not None else 0
         self._fault = cycle.fault
-        if cycle.state not in IN_AIR:
-            self._air_since_ns = cycle.time_ns
-        self._wrenches += cycle.wrenches
-        self._unpublished += 1
-        if self._unpublished < self._publish_every:
-            return
-        self._unpublished = 0
-        wrenches, self._wrenches = self._wrenches, []
-        try:
-            self._publish(wrenches, cycle)
-        except RCLError:
-            # once ROS has been shut down nobody listens, but the tip is still to be drawn back
-            if self.context.ok():
-                raise
-
-    def _publish(self, wrenches: list[WrenchSample], cycle: Cycle) -> None:
-        if cycle.arm is not None and self._pose.get_subscription_count():
-            self._pose.publish(self._pose_message(cycle))
-        if wrenches and self._wrench.get_subscription_count():
-            self._wrench.publish(self._wrench_message(wrenches, cycle))
-        if self._state.get_subscription_count():
-            self._state.publish(self._state_message(cycle))
-
-    def _wrench_message(self, wrenches: list[WrenchSample], cycle: Cycle) -> WrenchStamped:
-        """Mean of these, less the tare, at the middle of their times."""
-        wrench = WrenchStamped()
-        wrench.header.stamp = time_message((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
-        wrench.header.frame_id = self._frame_id
-        count, parts = len(wrenches), wrench.wrench
-        force_n = sum(sample.force_n for sample in wrenches) / count - cycle.bias_n
-        torque_nm = sum(sample.torque_nm for sample in wrenches) / count
-        parts.force.x, parts.force.y, parts.force.z = force_n.tolist()
-        parts.torque.x, parts.torque.y, parts.torque.z = torque_nm.tolist()
-        return wrench
-
-    def _pose_message(self, cycle: Cycle) -> PoseStamped:
-        pose = PoseStamped()
-        pose.header.stamp = time_message(cycle.arm.time_ns)
-        pose.header.frame_id = self._base_frame
-        place, turn = pose.pose.position, pose.pose.orientation
-        place.x, place.y, place.z = cycle.arm.tip.position_m.tolist()
-        turn.x, turn.y, turn.z, turn.w = cycle.arm.tip.rotation.as_quat().tolist()
-        return pose
-
-    def _state_message(self, cycle: Cycle) -> msg.ContactState:
-        thread = self._thread
-        state = msg.ContactState(state=cycle.state.value)
-        state.header.stamp = time_message(cycle.time_ns)
-        state.header.frame_id = self._frame_id
-        state.force_n, state.depth_m, state.stiffness_n_per_m = self._estimate()
-        if thread is not None:
-            state.cycles, state.overruns = thread.loop.cycles, thread.loop.overruns
-            result = thread.controller.result
-            if result is not None:
-                state.cause, state.message = result.cause.value, result.message
-        return state
-
-    def _estimate(self) -> tuple[float, float, float]:
-        """Force, depth and stiffness; NaN where there is no contact."""
-        estimate = self._thread.controller.estimate if self._thread is not None else None
-        if estimate is None:
-            return math.nan, math.nan, math.nan
-        return estimate.force_n, estimate.depth_m, estimate.stiffness_n_per_m
-
-
-def _result_message(result: ContactResult) -> MakeContact.Result:
-    message = MakeContact.Result(
-        reached=result.reached, cause=result.cause.value, message=result.message
-    )
-    for name in (
-        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m"),
-        *("surface_m", "surface_std_m"),
-        *("contact_s", "total_s", "peak_force_n"),
-    ):
-        value = getattr(result, name)
-        setattr(message, name, math.nan if value is None else float(value))
-    return message
+        if self._touch is not None:
+            self._touch.moved(cycle.state, cycle.time_ns)
+        self._topics.take(cycle, self._thread)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import replace
+from functools import cache
 
 from rclpy.node import Node
 
@@ -26,7 +27,7 @@ _READ_ONLY = frozenset({"contact.period_s"})
 def contact_parameters() -> tuple[Parameter, ...]:
     """One parameter for each number, the defaults from ``config/contact.yaml``."""
     made = []
-    for (group, (kind, ranges)), defaults in zip(_GROUPS.items(), read_contact(), strict=True):
+    for (group, (kind, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
         told = _descriptions(kind)
         for name, (low, high) in ranges.items():
             full = f"{group}.{name}"
@@ -52,7 +53,7 @@ def read_parameters(node: Node, **changed: float) -> tuple[ContactParameters, Li
         If a value is out of range or beyond the limits.
     """
     read = []
-    for (group, (_, ranges)), defaults in zip(_GROUPS.items(), read_contact(), strict=True):
+    for (group, (_, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
         names = {name: f"{group}.{name}" for name in ranges}
         given = {
             name: changed.get(full, node.get_parameter(full).value) for name, full in names.items()
@@ -61,6 +62,12 @@ def read_parameters(node: Node, **changed: float) -> tuple[ContactParameters, Li
     parameters, limits = read
     limits.check(parameters)
     return parameters, limits
+
+
+@cache
+def _defaults() -> tuple[ContactParameters, Limits]:
+    """Of the file, read once: in a contact parsing would hold up the control loop."""
+    return read_contact()
 
 
 def _descriptions(kind: type) -> dict[str, str]:

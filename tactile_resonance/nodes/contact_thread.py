@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -82,7 +83,7 @@ class ContactThread:
         self.retract()
         deadline = time.monotonic() + RETRACT_WITHIN_S
         while self._thread.is_alive() and time.monotonic() < deadline:
-            if self.controller.state in (State.IDLE, State.FAULT):
+            if self.controller.settled:
                 break
             time.sleep(POLL_S)
         self._running = False
@@ -95,4 +96,7 @@ class ContactThread:
                 with self._lock:
                     self.loop.run_period()
         except Exception as error:
+            # nobody judges any more: first of all the arm stops
+            with contextlib.suppress(Exception):
+                self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
             self.error = error

@@ -10,11 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.housing_path import lowest_on_the_way
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.tip_path import TipPath
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, contact
@@ -81,3 +84,57 @@ def test_tip_that_dips_its_housing_in_the_approach_is_stopped():
     assert made.controller.result.cause is Cause.HOUSING
     assert "mm above the surface" in made.controller.result.message
     assert max(made.force_n) == 0
+
+
+def turned_start(made, height_m, turn_rad, aside_m=(0.0, 0.0)):
+    """Put the tip somewhere else, before anything has moved."""
+    touch = made.goal.touch
+    turned = Rotation.from_rotvec(turn_rad) * touch.rotation
+    pose = Pose(touch.position_m + [*aside_m, height_m], turned.as_rotvec())
+    made.bench.clock.motion.reported = made.bench.clock.motion.pose = pose
+    return made.bench.arm.state()
+
+
+def test_housing_is_nowhere_lower_on_the_way_than_told():
+    tip, rng, spare = TipGeometry(), np.random.default_rng(5), []
+    for _ in range(4):
+        made = with_tip(None, height_m=-0.3)  # nothing to be touched
+        turn = rng.standard_normal(3)
+        turn *= rng.uniform(0.06, 0.6) / np.linalg.norm(turn)
+        start = turned_start(
+            made, rng.uniform(8e-3, 5e-2), turn, aside_m=tuple(rng.uniform(-0.04, 0.04, 2))
+        )
+        limits = made.controller.limits
+        told = lowest_on_the_way(tip, made.goal, start, QUICK, limits)
+        path, heights = TipPath(made.goal, tip), []
+
+        def record(made=made, path=path, heights=heights, start=start):
+            arm = replace(start, tip=made.bench.clock.motion.reported)
+            if np.linalg.norm(path.turn(arm)) > made.controller.limits.misalignment_rad / 2:
+                heights.append(path.housing_m(arm, path.height_m(arm)))
+
+        made.bench.clock.on_step.append(record)
+        made.loop.start(made.goal)
+        assert made.run_until(State.TARE, 10.0)
+        spare.append(min(heights) - told.housing_m)
+    assert min(spare) > -1e-6
+    # told on the safe side by what a way down is faster and a turn is earlier than is said
+    assert max(spare) < 15e-3
+    assert np.median(spare) < 8e-3
+
+
+@pytest.mark.parametrize("turn_rad", [(0.0, -0.35, 0.0), (0.25, -0.2, 0.6)])
+def test_goal_on_whose_way_the_housing_would_touch_is_refused(turn_rad):
+    tip = TipGeometry()
+    made = with_tip(tip)
+    turned_start(made, 0.012, turn_rad)  # the clamp is turned down by so much
+    with pytest.raises(ValueError, match="housing would be at -.* mm above the plane") as told:
+        made.loop.start(made.goal)
+    assert "begin from higher" in str(told.value)
+    assert made.controller.state is State.IDLE
+    # the same from higher, and from as low with the clamp turned up
+    for height_m, turn in ((0.05, np.array(turn_rad)), (0.012, -np.array(turn_rad) * [1, 1, 0])):
+        made = with_tip(tip)
+        turned_start(made, height_m, turn)
+        made.loop.start(made.goal)
+        assert made.controller.state is State.TRAVEL

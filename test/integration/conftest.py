@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as real processes in a domain of their own, on loopback."""
 
+import sys
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
@@ -16,3 +19,31 @@ def domain(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     return number
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """contact_node on a simulated robot, for the tests of one file."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    from contact_rig import Bench
+
+    from tactile_resonance.processes import free_domain_id
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        made = Bench(tmp_path_factory.mktemp("log"))
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+@pytest.fixture
+def client(bench):
+    """Of the contact_node of `bench`, which has nothing under way."""
+    from contact_rig import ContactClient
+
+    with ContactClient(bench.nodes.check) as made:
+        made.back()
+        yield made

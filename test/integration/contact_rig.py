@@ -11,6 +11,10 @@ import time
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.action import ActionClient
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
@@ -39,6 +43,10 @@ class ContactClient(NodeClient):
     def join(self):
         self._action = ActionClient(self._node, MakeContact, "make_contact")
         self._retract = self._node.create_client(Trigger, "retract")
+        self._change = self._node.create_client(ChangeState, "contact_node/change_state")
+        self._set = self._node.create_client(
+            SetParametersAtomically, "contact_node/set_parameters_atomically"
+        )
         self._node.create_subscription(msg.ContactState, "contact_state", self._on_state, NEWEST)
 
     def _on_state(self, message):
@@ -74,32 +82,69 @@ class ContactClient(NodeClient):
 
     def start(self, xy_m=(0.0, 0.0), timeout_s=20.0, **fields):
         """Ask for a contact until the node takes it; return the goal's handle."""
-        goal = MakeContact.Goal(force_n=0.01, **fields)
-        goal.pose = PoseStamped()
-        goal.pose.header.frame_id = "base"
-        place, turn = goal.pose.pose.position, goal.pose.pose.orientation
-        place.x, place.y = (float(a + b) for a, b in zip(TABLE_IN_BASE, xy_m, strict=False))
-        place.z = TABLE_IN_BASE[2]
-        turn.x, turn.y, turn.z, turn.w = TURN
+        goal = goal_message(xy_m, **fields)
         deadline = time.monotonic() + timeout_s
         while True:
             if self._action.server_is_ready():
-                future = self._action.send_goal_async(goal)
-                self.wait(future.done, 10.0, "an answer to the goal")
-                if future.result().accepted:
-                    return future.result()
+                handle = self.send(goal)
+                if handle.accepted:
+                    return handle
             assert time.monotonic() < deadline, f"no goal is taken ({self.why()})"
             self.spin(0.05)
+
+    def send(self, goal):
+        """Send a goal once; return its handle."""
+        future = self._action.send_goal_async(goal)
+        self.wait(future.done, 10.0, "an answer to the goal")
+        return future.result()
 
     def result(self, handle, timeout_s=15.0):
         future = handle.get_result_async()
         self.wait(future.done, timeout_s, "the result")
         return future.result().result
 
-    def retract(self):
-        future = self._retract.call_async(Trigger.Request())
-        self.wait(future.done, 5.0, "an answer to retract")
+    def in_state(self, state, timeout_s=10.0):
+        """Wait until a state is told."""
+        self.wait(lambda: self.state is not None and self.state.state == state, timeout_s, state)
+
+    def cancel(self, handle):
+        future = handle.cancel_goal_async()
+        self.wait(future.done, 5.0, "an answer to cancel")
+
+    def _answer(self, service, request, what):
+        self.wait(service.service_is_ready, 5.0, what)
+        future = service.call_async(request)
+        self.wait(future.done, 5.0, f"an answer to {what}")
         return future.result()
+
+    def change_state(self, transition):
+        """Ask for a transition of contact_node's life, without waiting for its end."""
+        self.wait(self._change.service_is_ready, 5.0, "change_state")
+        self._change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+
+    def set(self, **values):
+        """Set parameters of contact_node, `limits__depth_m=1e-3`; why it refuses, empty where not."""
+        request = SetParametersAtomically.Request()
+        for name, value in values.items():
+            given = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+            request.parameters.append(Parameter(name=name.replace("__", "."), value=given))
+        result = self._answer(self._set, request, "parameters").result
+        return "" if result.successful else result.reason
+
+    def retract(self):
+        return self._answer(self._retract, Trigger.Request(), "retract")
+
+
+def goal_message(xy_m=(0.0, 0.0), **fields):
+    """1 cN at a place of the table."""
+    goal = MakeContact.Goal(force_n=0.01, **fields)
+    goal.pose = PoseStamped()
+    goal.pose.header.frame_id = "base"
+    place, turn = goal.pose.pose.position, goal.pose.pose.orientation
+    place.x, place.y = (float(a + b) for a, b in zip(TABLE_IN_BASE, xy_m, strict=False))
+    place.z = TABLE_IN_BASE[2]
+    turn.x, turn.y, turn.z, turn.w = TURN
+    return goal
 
 
 class Bench:
@@ -166,6 +211,16 @@ class Bench:
             assert time.monotonic() < deadline
             time.sleep(0.1)
 
+    def power_up(self):
+        """Release an emergency stop and bring the robot up again."""
+        self.order("release_emergency_stop")
+        for line, mode in (("power on", "IDLE"), ("brake release", "RUNNING")):
+            self.dashboard(line)
+            deadline = time.monotonic() + 10.0
+            while self.order("state")["robot_mode"] != mode:
+                assert time.monotonic() < deadline, self.order("state")
+                time.sleep(0.05)
+
     def close(self):
         self.nodes.stop()
         self.plant.terminate()
@@ -183,3 +238,8 @@ def last_way_down_s(time_s, tip_m, window_s=0.03, way_m=3e-5):
     later = np.minimum(later, len(time_s) - 1)
     down = height - height[later] > way_m
     return time_s[np.flatnonzero(down)[-1]] if down.any() else time_s[0]
+
+
+def height_m(bench):
+    """Of the tip above its first touch."""
+    return bench.order("truth")["tip_m"][2] - TABLE_IN_BASE[2] - 2.5e-3

@@ -19,10 +19,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.processes import free_domain_id, may_take_priority
+from tactile_resonance.processes import may_take_priority
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contact_rig import TABLE_IN_BASE, Bench, ContactClient, last_way_down_s
+from contact_rig import height_m, last_way_down_s
 
 pytestmark = pytest.mark.skipif(
     not may_take_priority(20), reason="a simulated robot beside nodes on these cores needs rtprio"
@@ -32,25 +32,6 @@ PARAMETERS, LIMITS = read_contact()
 STANDOFF_M = PARAMETERS.standoff_m
 REST_S = 0.2
 """Until the tip goes down no more: the fault is seen (10 to 40 ms), told, and the arm brakes."""
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        made = Bench(tmp_path_factory.mktemp("log"))
-        try:
-            yield made
-        finally:
-            made.close()
-
-
-@pytest.fixture
-def client(bench):
-    with ContactClient(bench.nodes.check) as made:
-        made.back()
-        yield made
 
 
 def cell(name, value=1):
@@ -134,11 +115,6 @@ def pressed_then(bench, client, inject, end=lambda bench: None):
     return result, tip_m
 
 
-def height_m(bench):
-    """Of the tip above its first touch."""
-    return bench.order("truth")["tip_m"][2] - TABLE_IN_BASE[2] - 2.5e-3
-
-
 def thinned(names, always):
     """All of them; those beside `always` only where slow tests are asked for."""
     return [n if n in always else pytest.param(n, marks=pytest.mark.slow) for n in names]
@@ -171,12 +147,20 @@ def test_lost_arm_is_stopped_by_its_watchdog_where_it_is(bench, client, name):
     client.back()
 
 
-def test_protective_stop_is_named_and_the_tip_stays(bench, client):
-    result, tip_m = pressed_then(bench, client, lambda b: b.order("protective_stop"))
+ROBOT_STOPS = {
+    "protective_stop": lambda bench: bench.release(),
+    "emergency_stop": lambda bench: bench.power_up(),
+}
+
+
+@pytest.mark.parametrize("stop", thinned(ROBOT_STOPS, {"protective_stop"}))
+def test_stop_of_the_robot_is_named_and_the_tip_stays(bench, client, stop):
+    result, tip_m = pressed_then(bench, client, lambda b: b.order(stop))
     assert not result.reached
     assert result.cause in {"arm_stopped", "arm_link"}, result.message
     assert np.ptp(tip_m[-50:, 2]) < 5e-5
-    bench.release()
+    ROBOT_STOPS[stop](bench)
+    time.sleep(0.5)
     assert height_m(bench) < 0, "released, it moves only when it is told to"
     # told to, once the newest state no longer shows the stop
     client.wait(lambda: client.retract().success, 2.0, "a retraction to be taken")

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goals, results, wrenches and states of contact control, from and to messages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance import msg
+from tactile_resonance.action import MakeContact
+from tactile_resonance.contact.estimator import ContactEstimate
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import ContactGoal
+from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.loop import Cycle
+from tactile_resonance.contact.result import ContactResult
+from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.nodes.conversions import time_message
+
+_HOLDS = {
+    MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
+    MakeContact.Goal.HOLD_INDENTATION: HoldMode.INDENTATION,
+}
+
+
+def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: float) -> ContactGoal:
+    """What a request asks for.
+
+    Raises
+    ------
+    ValueError
+        If its frame is not that of the base, the way to hold is none, or orientation or normal are none.
+    """
+    frame = request.pose.header.frame_id
+    if frame != base_frame:
+        raise ValueError(f"pose: in frame {frame!r}, accepted is {base_frame!r}")
+    if request.hold not in _HOLDS:
+        raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
+    point, turn = request.pose.pose.position, request.pose.pose.orientation
+    quaternion = [turn.x, turn.y, turn.z, turn.w]
+    if not 0.99 < math.hypot(*quaternion) < 1.01:
+        raise ValueError(f"pose: orientation {quaternion}, expected a unit quaternion")
+    axes = Rotation.from_quat(quaternion).as_matrix()
+    given = np.array([request.normal.x, request.normal.y, request.normal.z])
+    normal = given if given.any() else axes[:, 2]
+    touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], ball_radius_m)
+    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
+
+
+def result_message(result: ContactResult) -> MakeContact.Result:
+    """What became of a contact; NaN for what is not known."""
+    message = MakeContact.Result(
+        reached=result.reached, cause=result.cause.value, message=result.message
+    )
+    for name in (
+        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m"),
+        *("surface_m", "surface_std_m"),
+        *("contact_s", "total_s", "peak_force_n"),
+    ):
+        value = getattr(result, name)
+        setattr(message, name, math.nan if value is None else float(value))
+    return message
+
+
+def feedback_message(state: str, estimate: ContactEstimate | None) -> MakeContact.Feedback:
+    """How far a contact is."""
+    force_n, depth_m, _ = known(estimate)
+    return MakeContact.Feedback(state=state, force_n=force_n, depth_m=depth_m)
+
+
+def wrench_message(wrenches: Sequence[WrenchSample], cycle: Cycle, frame_id: str) -> WrenchStamped:
+    """Mean of these, less the tare, at the middle of their times."""
+    wrench = WrenchStamped()
+    wrench.header.stamp = time_message((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
+    wrench.header.frame_id = frame_id
+    count, parts = len(wrenches), wrench.wrench
+    force_n = sum(sample.force_n for sample in wrenches) / count - cycle.bias_n
+    torque_nm = sum(sample.torque_nm for sample in wrenches) / count
+    parts.force.x, parts.force.y, parts.force.z = force_n.tolist()
+    parts.torque.x, parts.torque.y, parts.torque.z = torque_nm.tolist()
+    return wrench
+
+
+def pose_message(cycle: Cycle, base_frame: str) -> PoseStamped:
+    """Where the tip is; of a cycle in which the arm was heard."""
+    assert cycle.arm is not None
+    pose = PoseStamped()
+    pose.header.stamp = time_message(cycle.arm.time_ns)
+    pose.header.frame_id = base_frame
+    place, turn = pose.pose.position, pose.pose.orientation
+    place.x, place.y, place.z = cycle.arm.tip.position_m.tolist()
+    turn.x, turn.y, turn.z, turn.w = cycle.arm.tip.rotation.as_quat().tolist()
+    return pose
+
+
+def state_message(
+    cycle: Cycle, estimate: ContactEstimate | None, result: ContactResult | None, frame_id: str
+) -> msg.ContactState:
+    """What the controller does and knows, without the loop's counts."""
+    state = msg.ContactState(state=cycle.state.value)
+    state.header.stamp = time_message(cycle.time_ns)
+    state.header.frame_id = frame_id
+    state.force_n, state.depth_m, state.stiffness_n_per_m = known(estimate)
+    if result is not None:
+        state.cause, state.message = result.cause.value, result.message
+    return state
+
+
+def known(estimate: ContactEstimate | None) -> tuple[float, float, float]:
+    """Force, depth and stiffness; NaN where there is no contact."""
+    if estimate is None:
+        return math.nan, math.nan, math.nan
+    return estimate.force_n, estimate.depth_m, estimate.stiffness_n_per_m

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""First contact told by the poles that arrive, against those in air."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from tactile_resonance import msg
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.resonance_touch import PolesTouch
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.nodes.conversions import poles_from_message
+
+IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
+RING_DOWN_NS = 100_000_000
+"""So long after it left the tissue the beam may still remember it."""
+
+
+class TouchFromPoles:
+    """Poles of a measurement taken in air are a reference, those of an approach are tested against them.
+
+    Poles are those of all that a measurement has taken so far. So a touch is told the sooner the shorter
+    measurements are, and only the last poles of each are a reference: those before hold the same data.
+
+    Parameters
+    ----------
+    false_alarm_probability : float
+        Of one block.
+    tell : callable
+        Passes a touch on; whether it was new and of use.
+    """
+
+    def __init__(self, false_alarm_probability: float, tell: Callable[[], bool]) -> None:
+        self._touch = PolesTouch(false_alarm_probability)
+        self._tell = tell
+        self._air_ns = self._clear_ns = time.time_ns()
+
+    def moved(self, state: State, now_ns: int) -> None:
+        """Where the contact is, in every cycle of the loop."""
+        if state not in IN_AIR:
+            self._air_ns = now_ns
+            if state is not State.APPROACH:
+                self._clear_ns = now_ns
+
+    def hear(self, message: msg.Poles, state: State, now_ns: int) -> bool:
+        """Take the poles of a measurement so far; whether they have told a touch.
+
+        Raises
+        ------
+        ValueError
+            Where they are no numbers or their covariance is unknown.
+        """
+        poles, origin = poles_from_message(message)
+        if not len(poles.f0_hz):
+            return False
+        # its middle is told; it ended before now, so it cannot have begun before this
+        began_ns = 2 * origin.time_ns - now_ns - RING_DOWN_NS
+        if state in IN_AIR:
+            if message.final and began_ns > self._air_ns:
+                self._touch.add_air(*_strongest(poles))
+            return False
+        if state is not State.APPROACH or not self._touch.ready or began_ns < self._clear_ns:
+            return False
+        return self._touch.touched(*_strongest(poles)) and self._tell()
+
+
+def _strongest(poles: Poles) -> tuple[list[float], np.ndarray]:
+    """f0 [Hz] and damping ratio (2,) of the strongest mode, and their covariance (2, 2)."""
+    if poles.covariance is None:
+        raise ValueError(f"covariance: unknown ({poles.message or poles.status.name.lower()})")
+    strongest = int(np.argmax(np.abs(poles.residues)))
+    pole = [float(poles.f0_hz[strongest]), float(poles.damping_ratio[strongest])]
+    return pole, poles.covariance[strongest]
