@@ -288,7 +288,7 @@ class UrArm:
         except OSError:
             data = b""
         if data is None:
-            late = self._late()
+            late = self._late(request["name"])
             self._kill()
             raise late
         if not data:
@@ -300,12 +300,13 @@ class UrArm:
             self._end()
             raise ArmError(ArmFault(answer["fault"]), answer["message"])
 
-    def _late(self) -> ArmError:
+    def _late(self, request: str) -> ArmError:
         """Why a request has no answer in time."""
         assert self._exchange is not None
         text = f"{self.config.host} is not ready after {self.config.connect_timeout_s:g} s"
-        client = self._exchange.read()
-        if client is not None and client.runtime_state == PROGRAM_PLAYING:
+        client = self._exchange.read()  # while it connects: the state that it found
+        running = client is not None and client.runtime_state == PROGRAM_PLAYING
+        if request == "connect" and running:
             # the library asks it to end in a register that the program may not read, and waits for ever
             return ArmError(
                 ArmFault.PROGRAM_NOT_STARTED,

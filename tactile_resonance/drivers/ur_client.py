@@ -43,6 +43,7 @@ class Client:
     def __init__(self, commands: socket.socket, exchange: Exchange) -> None:
         self._requests = Requests(commands)
         self._exchange = exchange
+        self._opened: Session | None = None  # kept where it failed: see `Session.open`
         self._session: Session | None = None
         self._fed_s = 0.0
         # number and deceleration of a stop that the robot has not taken yet
@@ -96,7 +97,8 @@ class Client:
         self._requests.answer(answer)
 
     def _connect(self, config: UrArmConfig) -> None:
-        session = Session(config, self._exchange, self._requests.stop_waits)
+        self._opened = session = Session(config, self._exchange, self._requests.stop_waits)
+        session.open()
         self._session = session
         threading.Thread(target=self._publish, args=(session.states,), daemon=True).start()
         session.guard()

@@ -32,7 +32,7 @@ CLEARING_S = 0.05
 
 
 class Session:
-    """Connections to one robot.
+    """Connections to one robot; nothing is connected before `open`.
 
     Parameters
     ----------
@@ -48,18 +48,24 @@ class Session:
     states : StateReader
     control : rtde_control.RTDEControlInterface
     motion : Motion
-
-    Raises
-    ------
-    ArmError
-        See `UrArm.connect`.
     """
+
+    states: StateReader
+    control: rtde_control.RTDEControlInterface
+    motion: Motion
 
     def __init__(
         self, config: UrArmConfig, exchange: Exchange, overtaken: Callable[[], bool]
     ) -> None:
         self.config = config
-        self._overtaken = overtaken
+        self._exchange, self._overtaken = exchange, overtaken
+
+    def open(self) -> None:
+        """Connect, start the program, prepare it. Raises `ArmError`, see `UrArm.connect`.
+
+        What was opened before it failed stays: the library's destructors wait, and may hang.
+        """
+        config = self.config
         if config.realtime_priority:
             try:
                 take_priority(config.realtime_priority)
@@ -71,7 +77,7 @@ class Session:
                 receive = rtde_receive.RTDEReceiveInterface(config.host, config.rate_hz, VARIABLES)
             except Exception as error:
                 raise ArmError(ArmFault.LINK_LOST, f"{config.host}: {error}") from error
-        self.states = StateReader(receive, exchange, round_trip_s)
+        self.states = StateReader(receive, self._exchange, round_trip_s)
         self.states.wait_for_first()
         self._check_modes()
         with _bounded():
@@ -80,7 +86,7 @@ class Session:
             except Exception as error:
                 raise _named(config.host, error) from error
         self.states.watch(self.control)
-        self.motion = Motion(self.control, overtaken)
+        self.motion = Motion(self.control, self._overtaken)
         self._prepare()
 
     @property

@@ -68,7 +68,7 @@ def test_host_that_takes_connections_and_says_nothing(start_arm):
         assert error.value.fault is ArmFault.LINK_LOST
 
 
-@pytest.mark.parametrize("host", ["..", "x" * 80, "no such host"])
+@pytest.mark.parametrize("host", ["..", "no such host"])
 def test_what_no_address_can_be_is_a_lost_link(start_arm, host):
     with pytest.raises(ArmError, match="no robot answers") as error:
         start_arm(host).connect()
