@@ -66,12 +66,23 @@ def run_node(make: Callable[[], Node]) -> None:
 
     An interrupt ends it even where a shell started it in the background, interrupts ignored.
     """
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    interrupted = False
+
+    def interrupt(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
         with rclpy.init():
             node = make()
             try:
                 rclpy.spin(node)
+            except (RuntimeError, RCLError):
+                # what rclpy makes of an interrupt that meets it while it takes a message
+                if not interrupted:
+                    raise
             finally:
                 node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
