@@ -10,6 +10,7 @@ asked for.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -188,7 +189,7 @@ def _refine(theta, groups, limits, variances, memory):
     return -1.0, -1.0
 
 
-def _entry(sources: int):
+def _entry(sources: int) -> Any:
     """`fit_points` of these sources: its cache on disk watches its own file, and values like this."""
 
     @njit(cache=True, **OPTIONS)
