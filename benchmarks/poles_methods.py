@@ -30,6 +30,7 @@ from tactile_resonance.identification.result import PolesBatch
 from tactile_resonance.identification.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)
+PRODUCTS = "joint, nothing but three normal matrices"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +93,20 @@ def local_polynomial_spectra(
     return harmonics * line_hz, result.spectra, result.covariance, result.noise_dof
 
 
+def _products_alone(plan: JointPlan, u: npt.NDArray, y: npt.NDArray) -> None:
+    """What a joint fit cannot do without: normal matrices of one start and two Gauss-Newton steps."""
+    *others, excited = plan.problem.groups
+    at = [(group, None, plan.others_at) for group in others] + [(excited, u, plan.excited_at)]
+    for first in range(0, len(y), plan.problem.chunk):
+        rows = slice(first, first + plan.problem.chunk)
+        for group, source, places in at:
+            y_g = y[rows, places]
+            u_g = None if source is None else source[rows, places]
+            weight = np.ones(y_g.shape)
+            for _ in range(3):
+                group.normal_entries(weight, y_g, u_g)
+
+
 def compare_methods(quick: bool) -> list[Method]:
     """Time per point against error on one cell: damping 2 %, 40 dB, 8 periods."""
     plant = Plant(0.02, 40.0, 8)
@@ -141,6 +156,15 @@ def compare_methods(quick: bool) -> list[Method]:
                     50,
                 ),
             ]
+            if kind is JointPlan:
+                contestants.append(
+                    Contestant(
+                        f"{PRODUCTS}, {model}, batched",
+                        lambda p=plan: _products_alone(p, joint_u, joint_y),
+                        runs,
+                        lambda _: np.full((1, 2), np.nan),
+                    )
+                )
         contestants += [
             Contestant(
                 f"FRF, {model}, batched",

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import lapack
 
+from tactile_resonance.identification import one_mode
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.normal_equations import MANY, solve_positive
 from tactile_resonance.identification.result import (
@@ -63,6 +65,10 @@ def _inverse(matrices: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         inverse, good = solve_positive(matrices, np.broadcast_to(np.eye(n), matrices.shape))
         if good.all():
             return inverse, singular
+    elif batch == 1:
+        _, inverse, fault = lapack.dposv(matrices[0], np.eye(n))
+        if fault == 0:
+            return np.ascontiguousarray(inverse)[None], singular
     try:
         return np.linalg.inv(matrices), singular
     except np.linalg.LinAlgError:
@@ -142,6 +148,9 @@ def pole_quantities(
         Covariance of the free coefficients, those of the denominator first.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        of_one = _one_mode(model, band_hz, parameters)
+        if of_one is not None:
+            return of_one
         poles = modes_in_band(model.poles_rad_s(), band_hz)
         f0_hz, damping_ratio = natural_frequency_and_damping(poles)
         residues, sensitivity = model.residues_and_sensitivity(poles)
@@ -154,3 +163,33 @@ def pole_quantities(
             "pole_covariance": covariance,
             "covariance": f0_damping_covariance(poles, covariance),
         }
+
+
+def _one_mode(
+    model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
+) -> dict[str, npt.NDArray] | None:
+    """`pole_quantities` of one point with one stable mode in the band; None for any other."""
+    variable = model.variable
+    if model.denominator.shape != (1, 3) or variable.domain != "s":
+        return None
+    margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
+    figures = np.empty(one_mode.FIGURES)
+    if not one_mode.pole_in_band(
+        model.denominator[0].tolist(),
+        model.numerator[0].tolist(),
+        parameters[0],
+        (model.denominator_basis.hessenberg, model.numerator_basis.hessenberg),
+        (variable.scale_rad_s, band_hz[0] - margin, band_hz[1] + margin),
+        figures,
+    ):
+        return None
+    pole, of_pole, of_f0 = one_mode.POLE, one_mode.POLE_COVARIANCE, one_mode.COVARIANCE
+    places = figures[pole : pole + 4].view(complex)
+    return {
+        "poles_rad_s": places[None, :1],
+        "f0_hz": figures[None, one_mode.F0_HZ, None],
+        "damping_ratio": figures[None, one_mode.DAMPING, None],
+        "residues": places[None, 1:],
+        "pole_covariance": figures[of_pole : of_pole + 4].reshape(1, 1, 2, 2),
+        "covariance": figures[of_f0 : of_f0 + 4].reshape(1, 1, 2, 2),
+    }

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance.identification import one_mode
 from tactile_resonance.identification.bins import BinGroup
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
@@ -87,10 +88,10 @@ class CompiledJointPlan(JointPlan):
         theta = np.empty((batch, n))
         covariance = np.empty((batch, n, n))
         residual = np.zeros((batch, self.excited_bins.size), complex)
-        figures = np.empty((batch, kernel.kernel_judgement.FIGURES))
+        figures = np.empty((batch, one_mode.FIGURES))
         out = (ordinary, theta, covariance, residual, figures)
         kernel.fit_points(flat_u, flat_y, *self._constants, out)
-        result = self._ordinary(kernel.kernel_judgement, theta, covariance, residual, figures)
+        result = self._ordinary(theta, covariance, residual, figures)
         ordinary &= ~are_smooth(residual, self.structure.parameters)
         if not ordinary.all():
             rows = np.flatnonzero(~ordinary)
@@ -99,7 +100,6 @@ class CompiledJointPlan(JointPlan):
 
     def _ordinary(
         self,
-        judgement: Any,
         theta: FloatArray,
         covariance: FloatArray,
         residual: ComplexArray,
@@ -109,24 +109,24 @@ class CompiledJointPlan(JointPlan):
         a, b, _ = self.problem.sizes
         denominator = np.ones((batch, a + 1))
         denominator[:, :a] = theta[:, :a]
-        pole, of_pole, of_f0 = judgement.POLE, judgement.POLE_COVARIANCE, judgement.COVARIANCE
+        pole, of_pole, of_f0 = one_mode.POLE, one_mode.POLE_COVARIANCE, one_mode.COVARIANCE
         places = figures[:, pole : pole + 4].copy().view(complex)
         return PolesBatch(
             poles_rad_s=places[:, :1],
-            f0_hz=figures[:, judgement.F0_HZ, None],
-            damping_ratio=figures[:, judgement.DAMPING, None],
+            f0_hz=figures[:, one_mode.F0_HZ, None],
+            damping_ratio=figures[:, one_mode.DAMPING, None],
             residues=places[:, 1:],
             covariance=figures[:, of_f0 : of_f0 + 4].reshape(batch, 1, 2, 2),
             total_covariance=np.full((batch, 1, 2, 2), np.nan),
             pole_covariance=figures[:, of_pole : of_pole + 4].reshape(batch, 1, 2, 2),
             coefficient_covariance=covariance,
-            cost=figures[:, judgement.COST],
-            expected_cost=figures[:, judgement.EXPECTED],
-            condition_number=figures[:, judgement.CONDITION],
+            cost=figures[:, one_mode.COST],
+            expected_cost=figures[:, one_mode.EXPECTED],
+            condition_number=figures[:, one_mode.CONDITION],
             residual=residual,
             lines=np.full(batch, self.excited_bins.size),
             status_code=np.full(batch, STATUS_CODE[PolesStatus.OK], np.uint8),
-            noise_variance=figures[:, judgement.NOISE_Y : judgement.NOISE_Y + 2],
+            noise_variance=figures[:, one_mode.NOISE_Y : one_mode.NOISE_Y + 2],
             fit=RationalModel(
                 denominator,
                 theta[:, a : a + b],

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +20,14 @@ from tactile_resonance.identification.joint_noise import (
     noise_between_harmonics,
     rough_noise,
 )
-from tactile_resonance.identification.many_points import ManyPoints, ManyValues
+from tactile_resonance.identification.many_points import ManyValues
 from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
     difference_of_halves,
     difference_of_models,
 )
 from tactile_resonance.identification.noise_level import f_quantile
-from tactile_resonance.identification.one_point import OnePoint, OneValue
+from tactile_resonance.identification.one_point import OneValue
 from tactile_resonance.identification.solver import Solution, minimise, refine
 from tactile_resonance.identification.whiteness import are_smooth
 
@@ -227,9 +228,7 @@ def _student_variance(dof):
     return np.where(dof > 1, dof / (dof - 1), np.nan)
 
 
-def _near(
-    layout: JointLayout, points: OnePoint | ManyPoints, data: list[BinData], u_o: ComplexArray
-) -> FloatArray:
+def _near(layout: JointLayout, points: Any, data: list[BinData], u_o: ComplexArray) -> FloatArray:
     """(n,) or (batch, n) one undamped step from start values: residuals are then all but noise.
 
     With weights as the errors show them at the start.

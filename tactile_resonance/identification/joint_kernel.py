@@ -10,12 +10,18 @@ asked for.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 from numba import njit
 
-from tactile_resonance.identification import kernel_algebra, kernel_judgement, kernel_model
+from tactile_resonance.identification import (
+    kernel_algebra,
+    kernel_judgement,
+    kernel_model,
+    one_mode,
+)
 from tactile_resonance.identification.kernel_algebra import (
     OPTIONS,
     compiled,
@@ -183,7 +189,7 @@ def _refine(theta, groups, limits, variances, memory):
     return -1.0, -1.0
 
 
-def _entry(sources: int):
+def _entry(sources: int) -> Any:
     """`fit_points` of these sources: its cache on disk watches its own file, and values like this."""
 
     @njit(cache=True, **OPTIONS)
@@ -235,10 +241,14 @@ def _entry(sources: int):
             found = (covariance[point], residual[point], figures[point])
             if not level(groups[1], at, limits, variances, costs, memory, found):
                 continue
-            ordinary[point] = pole_in_band(at, covariance[point], bases, limits, figures[point])
+            terms = bases[1].shape[0]
+            band = (limits[8], limits[9], limits[10])
+            ordinary[point] = pole_in_band(
+                at[:2], at[2 : 2 + terms], covariance[point], bases, band, figures[point]
+            )
 
     return fit_points
 
 
-_MODULES = (kernel_algebra, kernel_model, kernel_judgement)
+_MODULES = (kernel_algebra, kernel_model, kernel_judgement, one_mode)
 fit_points = _entry(crc32(b"".join(Path(str(m.__file__)).read_bytes() for m in _MODULES)))

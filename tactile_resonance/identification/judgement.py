@@ -119,7 +119,7 @@ def assemble(
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
     total_f0_damping = np.full_like(quantities["covariance"], np.nan)
-    rows = np.flatnonzero(np.isfinite(total).any(axis=(-2, -1)))
+    rows = np.flatnonzero(np.isfinite(total[:, 0, 0]))
     if rows.size:
         total_f0_damping[rows] = pole_quantities(
             fit.model if rows.size == total.shape[0] else _rows(fit.model, rows),

@@ -111,10 +111,8 @@ class ManyPoints:
     @property
     def weighted_power(self) -> FloatArray:
         """(batch,) ``sum |y|^2 / s_Y^2``."""
-        power = 0.0
-        for v in self._data:
-            power = power + np.sum((v.y.real**2 + v.y.imag**2) / v.variance_y, axis=-1)
-        return np.asarray(power)
+        powers = [(v.y.real**2 + v.y.imag**2) / v.variance_y for v in self._data]
+        return np.asarray(sum(power.sum(axis=-1) for power in powers))
 
     def evaluate(self, theta: FloatArray) -> ManyValues:
         """The model at theta (batch, n), unweighted: see `weight`."""
@@ -216,7 +214,8 @@ class ManyPoints:
         np.divide(1, inverse_2, out=inverse_2)
         inverse = np.conj(a, out=a)
         inverse *= inverse_2
-        g, model = None, None
+        g: ComplexArray | None = None
+        model: ComplexArray | None = None
         if group.transient is not None:
             model = group.evaluate(2, gamma)
             model *= inverse

@@ -104,14 +104,21 @@ def f_quantile(probability: float, dof_1: FloatArray, dof_2: FloatArray) -> Floa
     Stat. 13 (1942) 233-235. Within 1 % for degrees of freedom above 10. Infinite where the
     approximation ends.
     """
-    normal = float(special.ndtri(probability))
+    normal = _normal_quantile(probability)
     a, b = 2 / (9 * np.asarray(dof_1)), 2 / (9 * np.asarray(dof_2))
+    if a.size == b.size == 1:  # numbers are faster than arrays of one
+        a, b = a.reshape(())[()], b.reshape(())[()]
     bottom = (1 - b) ** 2 - normal**2 * b
     with np.errstate(divide="ignore", invalid="ignore"):
         root = (1 - a) * (1 - b) + normal * np.sqrt(
             np.maximum((1 - a) ** 2 * b + (1 - b) ** 2 * a - normal**2 * a * b, 0)
         )
         return np.where(bottom > 0, (root / bottom) ** 3, np.inf)
+
+
+@lru_cache(maxsize=16)
+def _normal_quantile(probability: float) -> float:
+    return float(special.ndtri(probability))
 
 
 def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = None) -> VarianceModel:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 
 START_ITERATIONS = 2
 # Values in a chunk's arrays: few enough for the cache, enough to make little of the calls.
-CHUNK_VALUES = 24576
+CHUNK_VALUES = 65536
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +78,8 @@ class Problem:
         """Points that are computed together."""
         return max(1, CHUNK_VALUES // max(1, sum(group.size for group in self.groups)))
 
-    def points(self, data: Sequence[BinData]) -> OnePoint | ManyPoints:
-        """Points with these data of each group."""
+    def points(self, data: Sequence[BinData]) -> Any:
+        """`OnePoint` or `ManyPoints` of these data: the same methods, on coefficients (n,) or (batch, n)."""
         return self.one_point(data) if data[0].y.shape[0] == 1 else self.many_points(data)
 
     def one_point(self, data: Sequence[BinData]) -> OnePoint:
@@ -89,15 +90,15 @@ class Problem:
         """Points with these data of each group."""
         return ManyPoints(self.groups, self.places, self.sizes, data)
 
-    def start(self, points: OnePoint | ManyPoints, data: Sequence[BinData]) -> FloatArray:
+    def start(self, points: Any, data: Sequence[BinData]) -> FloatArray:
         """(n,) or (batch, n) start values of points with these data.
 
         The first iteration only brings weights for the second one: bins with an input are enough.
         """
         if self.driven is self:
-            return points.start(START_ITERATIONS)
+            return np.asarray(points.start(START_ITERATIONS))
         first = self.driven.points(data[-1:]).start(1)
-        return points.start(START_ITERATIONS - 1, first)
+        return np.asarray(points.start(START_ITERATIONS - 1, first))
 
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients of A (with its last), B and C, each (batch, terms)."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.many_points import ManyPoints, ManyValues
 from tactile_resonance.identification.one_point import OnePoint, OneValue
-from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.problem import START_ITERATIONS, Problem
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -78,7 +78,7 @@ def minimise(
             rows = slice(first, first + chunk)
             part = [values.rows(rows) for values in data] if batch > chunk else list(data)
             points = problem.points(part)
-            begin = problem.start(points, part) if start is None else start[rows]
+            begin = points.start(START_ITERATIONS) if start is None else start[rows]
             parts.append(refine(points, np.atleast_2d(begin), None, max_iterations))
     if len(parts) == 1:
         return parts[0]

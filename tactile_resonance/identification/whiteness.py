@@ -97,13 +97,25 @@ def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, in
     power = _squared(parts @ cosines).cumsum(axis=-1)
     smooth = power[..., counts - 1]
     total = _squared(parts).sum(axis=-1, keepdims=True)
-    used = lines if residual.all() else np.count_nonzero(residual, axis=-1)[..., None]
-    others = np.maximum(used - counts, 1)
+    if residual.all():
+        ratio, a, b = _whole(lines, parameters)
+    else:
+        ratio, a, b = _terms(counts, np.count_nonzero(residual, axis=-1)[..., None])
     with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.cbrt(smooth / (total - smooth) * (others / counts))
-        a, b = 1 / (9 * counts), 1 / (9 * others)
+        root = np.cbrt(smooth / (total - smooth) * ratio)
         score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
     return score, counts.size
+
+
+@lru_cache(maxsize=64)
+def _whole(lines: int, parameters: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return _terms(components(lines, parameters)[0], np.array(lines))
+
+
+def _terms(counts: IntArray, used: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Ratio of the degrees of freedom, and 1/9 over half of either, for so many lines in use."""
+    others = np.maximum(used - counts, 1)
+    return others / counts, 1 / (9 * counts), 1 / (9 * others)
 
 
 def _squared(parts: FloatArray) -> FloatArray:
