@@ -70,7 +70,8 @@ class FreeMotion:
         """At rest for the zero of the force."""
         speed = float(np.linalg.norm(arm.tip_velocity[:3]))
         observer = self._observer
-        if math.isfinite(observer.watch.age_s(now_ns)):
+        if observer.taring:
+            # not before: a tool on the cell has to come to rest
             touched = self._touched("at the standoff, before its zero was known")
             if touched is not None:
                 return touched
@@ -81,6 +82,7 @@ class FreeMotion:
                 self._still_ns = now_ns
             elif now_ns - self._still_ns > STILL_NS:
                 observer.begin_tare()
+                self._travel_force = None
                 self._tare_ns = now_ns
         elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
             breach = observer.end_tare()

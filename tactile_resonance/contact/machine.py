@@ -75,6 +75,7 @@ class ContactController:
         self._observer = Observer(parameters, limits.stuck_samples)
         self._outcome = Outcome(self._observer, 0)
         self._height_m = 0.0
+        self._state_ns = self._now_ns = 0
         self._wish_retract = False
         self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 

@@ -65,7 +65,7 @@ def late(device, low_s, high_s):
 
 
 def cell_error(rig, rng):
-    rig.bench.cell.error = rng.choice(list(ForceFault))
+    rig.bench.cell.error = list(ForceFault)[rng.integers(len(ForceFault))]
     return lambda: setattr(rig.bench.cell, "error", None)
 
 
@@ -76,7 +76,7 @@ def frozen(rig, rng):
 
 def stopped(rig, rng):
     stops = [ArmFault.PROTECTIVE_STOP, ArmFault.EMERGENCY_STOP, ArmFault.PROGRAM_STOPPED]
-    rig.bench.arm.halt(rng.choice(stops))
+    rig.bench.arm.halt(stops[rng.integers(len(stops))])
     return lambda: repaired(rig)
 
 
@@ -210,7 +210,7 @@ def storm(rng, names):
     ends = []
     for name in names:
         begin, lasts_s, _ = FAULTS[name]
-        state = rng.choice(STATES)
+        state = STATES[rng.integers(len(STATES))]
         if state is State.RETRACT:
             rig.loop.run_while(lambda: rig.controller.state is not State.HOLD, 1.5)
             rig.controller.retract()
