@@ -178,6 +178,13 @@ def _page(
         "in which a tip at 4 mm/s goes 1.6 mm. Told from poles, a touch needs an approach at 0.25 mm/s or",
         "less (0.1 mm a block), or shorter blocks.",
         "",
+        "Live (`touch_from_poles` of contact_node) that is the end of a record and what comes after it: the",
+        "FRF, the poles, the messages. Measurements of one or two periods, asked for one after another, are",
+        "what it needs: the poles of a longer one are those of all its periods, most of them of air. On",
+        "gelatine the load cell is first, at 0.25 mm/s too; on softer tissue, where the cell takes a",
+        "second, they may be level. One period of one realisation has no covariance from noise; that from",
+        "the residuals of the fit is taken then.",
+        "",
         "![First contact](touch.png)",
         "",
     ]

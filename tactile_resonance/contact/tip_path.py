@@ -76,10 +76,8 @@ class TipPath:
         return near and float(np.linalg.norm(self.turn(arm))) < ARRIVED_RAD
 
     def must_lift(self, arm: ArmSample, standoff_m: float) -> bool:
-        """Whether the tip is so low beside the touch that it may press on something."""
-        height = self.height_m(arm)
-        aside = float(np.linalg.norm(arm.tip.position_m - self.place_at(height)))
-        return height < standoff_m - LIFTED_M and aside > ARRIVED_M
+        """Whether the tip is so low that it may press on something, at the touch or beside it."""
+        return self.height_m(arm) < standoff_m - LIFTED_M
 
     def turning_height_m(self, parameters: ContactParameters, limits: Limits) -> float:
         """Height of the tip to which it goes while much is to be turned."""

@@ -47,7 +47,8 @@ PARAMETERS = (
         False,
         "First contact is told by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
-        "for blocks of 0.4 s, with limits.approach_s of 20 s or more.",
+        "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and whoever measures has to ask for "
+        "measurements of one or two periods all the time.",
         read_only=True,
     ),
     Parameter(

@@ -15,8 +15,8 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message
 
 IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
-RING_DOWN_NS = 100_000_000
-"""So long after it left the tissue the beam may still remember it."""
+FORGOTTEN_NS = 1_000_000_000
+"""So long after the tip left the tissue a record may still show it: stamps err, and the bench plays ahead."""
 
 
 class TouchFromPoles:
@@ -57,7 +57,7 @@ class TouchFromPoles:
         if not len(poles.f0_hz):
             return False
         # its middle is told; it ended before now, so it cannot have begun before this
-        began_ns = 2 * origin.time_ns - now_ns - RING_DOWN_NS
+        began_ns = 2 * origin.time_ns - now_ns - FORGOTTEN_NS
         if state in IN_AIR:
             if message.final and began_ns > self._air_ns:
                 self._touch.add_air(*_strongest(poles))
@@ -69,8 +69,10 @@ class TouchFromPoles:
 
 def _strongest(poles: Poles) -> tuple[list[float], np.ndarray]:
     """f0 [Hz] and damping ratio (2,) of the strongest mode, and their covariance (2, 2)."""
-    if poles.covariance is None:
+    # of one period the noise is known from the residuals of the fit only
+    covariance = poles.total_covariance if poles.covariance is None else poles.covariance
+    if covariance is None:
         raise ValueError(f"covariance: unknown ({poles.message or poles.status.name.lower()})")
     strongest = int(np.argmax(np.abs(poles.residues)))
     pole = [float(poles.f0_hz[strongest]), float(poles.damping_ratio[strongest])]
-    return pole, poles.covariance[strongest]
+    return pole, covariance[strongest]

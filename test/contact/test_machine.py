@@ -283,6 +283,16 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
     assert way[-1] == pytest.approx(3e-3, abs=1e-4)
 
 
+def test_force_that_leaves_a_tip_left_pressing_is_no_touch():
+    made = contact(height_m=0.0, aim=Aim(0.018))
+    assert made.loop.make(made.goal).reached
+    # a new controller knows nothing of that, and is to touch at the same place
+    controller = ContactController(QUICK, Limits())
+    loop = ContactLoop(made.bench.arm, made.bench.force, made.bench.clock, controller)
+    result = loop.make(made.goal)
+    assert result.reached, result.message
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_touch_told_by_noise_above_the_surface_is_no_early_surface(seed):
     # 0.2 mm above the tissue the cell shows 3 mN for 10 ms; the surface lies within what is accepted

@@ -22,8 +22,8 @@ def domain(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    """contact_node on a simulated robot, for the tests of one file."""
+def bench(tmp_path_factory, request):
+    """contact_node on a simulated robot, for the tests of one file, with that file's `PARAMETERS_OF_NODE`."""
     sys.path.insert(0, str(Path(__file__).parent))
     from contact_rig import Bench
 
@@ -32,7 +32,8 @@ def bench(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        made = Bench(tmp_path_factory.mktemp("log"))
+        parameters = getattr(request.module, "PARAMETERS_OF_NODE", None)
+        made = Bench(tmp_path_factory.mktemp("log"), parameters=parameters)
         try:
             yield made
         finally:

@@ -14,6 +14,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.processes import may_take_priority
+from tactile_resonance.simulation.plant_defaults import PATIENT
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contact_rig import goal_message, height_m, last_way_down_s
@@ -22,6 +23,9 @@ from lifecycle_msgs.msg import Transition
 pytestmark = pytest.mark.skipif(
     not may_take_priority(20), reason="a simulated robot beside nodes on these cores needs rtprio"
 )
+
+PARAMETERS_OF_NODE = PATIENT
+"""A cell that is silent for 10 ms because the simulation stands still would have the node connect anew."""
 
 PARAMETERS, LIMITS = read_contact()
 STANDOFF_M = PARAMETERS.standoff_m

@@ -42,7 +42,7 @@ class Listener:
     """A `TouchFromPoles` with a clock that is told."""
 
     def __init__(self, references=3):
-        self.told, self.now_ns = 0, time.time_ns() + SECOND_NS
+        self.told, self.now_ns = 0, time.time_ns() + 2 * SECOND_NS
         self.rng = np.random.default_rng(2)
         self.touch = TouchFromPoles(1e-6, self._tell)
         for _ in range(references):
@@ -90,6 +90,9 @@ def test_measurement_that_began_in_contact_is_no_reference_and_no_touch():
     listener.stay(State.IDLE, 0.3)
     # half of it in the tissue: no reference, however far off
     listener.hear(GELATINE, State.IDLE, length_s=1.2, passed=True)
+    # seen live: taken wholly after the contact, and yet of the contact
+    listener.stay(State.IDLE, 0.2)
+    listener.hear(GELATINE, State.IDLE, length_s=0.4, passed=True)
     listener.stay(State.HOLD, 1.0)
     listener.stay(State.TRAVEL, 0.2)
     listener.stay(State.APPROACH, 0.2)
