@@ -35,7 +35,7 @@ STATE_STALE_S = 2.0
 DEVICE_CAUSES = frozenset(
     cause.value
     for cause in (
-        *(Cause.FORCE_SOURCE, Cause.FORCE_STALE),
+        *(Cause.FORCE_SOURCE, Cause.FORCE_STALE, Cause.FORCE_INVALID),
         *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
     )
 )
