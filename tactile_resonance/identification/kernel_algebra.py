@@ -33,11 +33,36 @@ def real_dot(x_re, x_im, y_re, y_im):
 
 
 @compiled
+def real_dot_row(rows_re, rows_im, row, y_re, y_im):
+    """`real_dot` with a row of (n, K) arrays: no view is made of it, which would be counted."""
+    total = 0.0
+    for k in range(y_re.size):
+        total += rows_re[row, k] * y_re[k] - rows_im[row, k] * y_im[k]
+    return total
+
+
+@compiled
+def dot_row(rows, row, y):
+    """`dot` with a row of an (n, K) array."""
+    total = 0.0
+    for k in range(y.size):
+        total += rows[row, k] * y[k]
+    return total
+
+
+@compiled
+def add_row(out, rows, row, factor):
+    """Add ``factor`` times a row of an (n, K) array."""
+    for k in range(out.size):
+        out[k] += factor * rows[row, k]
+
+
+@compiled
 def combine(basis_re, basis_im, coefficients, re, im):
     """Add ``sum_i coefficients[i] basis[i]`` to (K,) arrays."""
     for i in range(coefficients.size):
-        add_scaled(re, basis_re[i], coefficients[i])
-        add_scaled(im, basis_im[i], coefficients[i])
+        add_row(re, basis_re, i, coefficients[i])
+        add_row(im, basis_im, i, coefficients[i])
 
 
 @compiled
@@ -98,7 +123,7 @@ def square_block(normal, first, size, products, weight):
     row = 0
     for i in range(first, first + size):
         for j in range(i, first + size):
-            total = dot(products[row], weight)
+            total = dot_row(products, row, weight)
             normal[i, j] = total
             normal[j, i] = total
             row += 1
@@ -110,7 +135,7 @@ def cross_block(normal, first, size, products_re, products_im, w_re, w_im):
     row = 0
     for i in range(first[0], first[0] + size[0]):
         for j in range(first[1], first[1] + size[1]):
-            total = real_dot(products_re[row], products_im[row], w_re, w_im)
+            total = real_dot_row(products_re, products_im, row, w_re, w_im)
             normal[i, j] = total
             normal[j, i] = total
             row += 1

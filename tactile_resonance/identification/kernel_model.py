@@ -16,7 +16,7 @@ from tactile_resonance.identification.kernel_algebra import (
     dot,
     invert,
     multiply,
-    real_dot,
+    real_dot_row,
     scale,
     square_block,
     two_products,
@@ -107,11 +107,11 @@ def add_gradient(group, za_re, za_im, zb_re, zb_im, zc_re, zc_im, factor, gradie
     a, c = d_re.shape[0] - 1, t_re.shape[0]
     first = gradient.size - c
     for i in range(a):
-        gradient[i] += factor * real_dot(d_re[i], d_im[i], za_re, za_im)
+        gradient[i] += factor * real_dot_row(d_re, d_im, i, za_re, za_im)
     for i in range(n_re.shape[0]):
-        gradient[a + i] -= factor * real_dot(n_re[i], n_im[i], zb_re, zb_im)
+        gradient[a + i] -= factor * real_dot_row(n_re, n_im, i, zb_re, zb_im)
     for i in range(c):
-        gradient[first + i] -= factor * real_dot(t_re[i], t_im[i], zc_re, zc_im)
+        gradient[first + i] -= factor * real_dot_row(t_re, t_im, i, zc_re, zc_im)
 
 
 @compiled
