@@ -14,7 +14,7 @@ import can
 import numpy as np
 
 from tactile_resonance.contact.cell_checks import CellChecks
-from tactile_resonance.contact.clocks import ClockTracker
+from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import Flow, one_line, open_bus
@@ -51,6 +51,7 @@ class CanWrench:
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._samples: deque[CellSample] = deque(maxlen=KEPT_SAMPLES)
         self._clock = self._new_clock()
+        self._stamp_before_ns = 0
         self._assembler = self._new_assembler()
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
@@ -317,4 +318,9 @@ class CanWrench:
             return arrival_ns - round(delay_s * 1e9)
         self._clock.add(message.timestamp, arrival_ns)
         stamp_ns = self._clock.relation().to_local_ns(message.timestamp)
+        # a relation that has become better may be earlier by more than a period, but the order in which
+        # the wrenches were taken is certain; a step is none of the relation's, and left to be seen
+        if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:
+            stamp_ns = self._stamp_before_ns + 1
+        self._stamp_before_ns = stamp_ns
         return stamp_ns - round(self._config.latency_s * 1e9)
