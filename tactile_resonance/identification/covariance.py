@@ -70,11 +70,11 @@ def _inverse(matrices: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         if fault == 0:
             return np.ascontiguousarray(inverse)[None], singular
     try:
-        return np.linalg.inv(matrices), singular
+        return np.asarray(np.linalg.inv(matrices), float), singular
     except np.linalg.LinAlgError:
-        singular = np.linalg.matrix_rank(matrices, hermitian=True) < n
+        singular = np.asarray(np.linalg.matrix_rank(matrices, hermitian=True) < n)
         matrices[singular] = np.eye(n)
-        return np.linalg.inv(matrices), singular
+        return np.asarray(np.linalg.inv(matrices), float), singular
 
 
 def _squares(matrices: FloatArray) -> FloatArray:

@@ -6,11 +6,16 @@ Complex numbers are pairs of arrays, and loops touch few of them: so they become
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
 # Sums may be reordered, NaN and infinity keep their meaning.
-OPTIONS = {"fastmath": {"reassoc", "contract", "nsz", "arcp"}, "error_model": "numpy"}
+OPTIONS: dict[str, Any] = {
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+    "error_model": "numpy",
+}
 compiled = njit(**OPTIONS)
 
 

@@ -62,7 +62,7 @@ def solve_positive(
             if j + 1 < n:
                 solution[j] -= np.einsum("ib,irb->rb", work[j, j + 1 : n], solution[j + 1 :])
             solution[j] /= pivots[j]
-    return np.ascontiguousarray(np.moveaxis(solution, -1, 0)), (pivots > 0).all(axis=0)
+    return np.ascontiguousarray(np.moveaxis(solution, -1, 0)), np.asarray((pivots > 0).all(axis=0))
 
 
 def _solve_any(normal: FloatArray, gradient: FloatArray, damping: FloatArray | float) -> FloatArray:

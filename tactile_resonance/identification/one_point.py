@@ -160,7 +160,7 @@ class OnePoint:
         of_a, of_b, of_c = basis.values
         a = (theta[for_a] @ of_a).view(complex)
         a += basis.last
-        inverse = 1 / a
+        inverse = np.asarray(1 / a, complex)
         g = (theta[for_b] @ of_b).view(complex)
         last = basis.parts[-1]
         g *= inverse[last]
@@ -171,8 +171,9 @@ class OnePoint:
             model[last] += driven
         else:
             model = driven
-        empty = np.empty(0)
-        return OneValue(inverse, model, self._y - model, g, empty, empty, empty, basis.parts)
+        none = np.empty(0)
+        error = self._y - model
+        return OneValue(inverse, model, error, g, none, none.astype(complex), none, basis.parts)
 
     def weight(self, value: OneValue) -> OneValue:
         """The same with weighted errors and their cost."""
