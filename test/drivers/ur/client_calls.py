@@ -128,9 +128,11 @@ def flags(host):
         control = rtde_control.RTDEControlInterface(host, -1.0, flag | UPLOAD)
         above = c.pose() + [0, 0, 0.002, 0, 0, 0]
         assert control.moveL(above.tolist(), 0.1, 1.0)
-        near(control.getTCPOffset(), [0.0] * 6, 1e-9)
         c.wait(0.1)
         same_pose(c.pose(), above, 1e-4)
+        tip = [0.0, 0.01, 0.1, 0.0, 0.0, 0.0]  # its answer comes by the registers of that range too
+        assert control.setTcp(tip)
+        near(control.getTCPOffset(), tip, 1e-9)
         control.stopScript()
         control.disconnect()
 

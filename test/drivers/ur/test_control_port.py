@@ -16,7 +16,7 @@ from tactile_resonance.simulation.robot.control_port import PORT
     ("fields", "message"),
     [
         ({"command": "explode"}, "command: expected one of state"),
-        ({"command": "freeze"}, "seconds: None"),
+        ({"command": "freeze"}, "seconds: got None"),
         ({"command": "freeze", "seconds": 1, "part": "cable"}, "part: 'cable'"),
         ({"command": "script_starts", "value": 1}, "value: 1"),
         ({"command": "place_surface", "height_m": 7}, "surface_height_m"),
