@@ -153,7 +153,9 @@ def test_the_recording_holds_exactly_what_was_published(recorded):
         assert {c.topic for c in reader.connections} >= {*TOPICS, "/point_result"}
     keys = {key for _, key in found}
     points = {r.measurement_id for r in content.results}
-    assert keys == points  # nothing of what somebody else measured; and without a robot no reference in air
+    assert (
+        keys == points
+    )  # nothing of what somebody else measured; and without a robot no reference in air
     assert other not in keys
     for topic in TOPICS:
         for key in keys:

@@ -4,8 +4,11 @@
 import pytest
 
 
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("flags", "refused")]
+
+
 @pytest.mark.parametrize(
-    "name", ["connect", "moves", "streams", "settings", "watchdog", "stops", "flags", "refused"]
+    "name", ["connect", "moves", "streams", "settings", "watchdog", "stops", *SLOW]
 )
 def test_calls(robot, run_calls, name):
     run_calls(name, robot.host)
