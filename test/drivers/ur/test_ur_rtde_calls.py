@@ -3,7 +3,6 @@
 
 import pytest
 
-
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("flags", "refused")]
 
 
