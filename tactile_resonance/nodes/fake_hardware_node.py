@@ -30,7 +30,7 @@ from tactile_resonance.nodes.conversions import (
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
-from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.running import RESULTS, STREAM, TRUTHS, run_node
 from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
 from tactile_resonance.simulation.bench import SimulatedBench
@@ -103,7 +103,7 @@ class FakeHardwareNode(ManagedNode):
         self._tip = BenchTip(None, 0.0, 1.0)
         self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
-        self._truth = self.publish_on(msg.Poles, "bench/truth", LATCHED)
+        self._truth = self.publish_on(msg.Poles, "bench/truth", TRUTHS)
         host, table, seed = values(self, "robot_host", "table_in_base", "seed")
         if host:
             pose = pose_of(table, "table_in_base")

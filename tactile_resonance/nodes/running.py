@@ -41,6 +41,13 @@ EXCITATIONS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+# Truths: one with each block, and those of two blocks may leave the bench together.
+TRUTHS = QoSProfile(
+    depth=64,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 # Poles: small, and a map that is started or restarted in mid-scan gets those it missed.
 POLES = QoSProfile(
     depth=1024,

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, RESULTS, SERIES
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, TRUTHS
 from tactile_resonance.scan.hands import Recording
 
 
@@ -40,7 +40,7 @@ TOPICS = {
     "record": Recorded(msg.Record, RESULTS, measured=True, counted=True),
     "frf": Recorded(msg.FRF, RESULTS, measured=True, counted=True),
     "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True),
-    "bench/truth": Recorded(msg.Poles, LATCHED, latched=True, measured=True),
+    "bench/truth": Recorded(msg.Poles, TRUTHS, latched=True, measured=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
     "contact_state": Recorded(msg.ContactState, SERIES),

@@ -22,7 +22,7 @@ from tactile_resonance.nodes.conversions import (
     poles_from_message,
     pose_to_message,
 )
-from tactile_resonance.nodes.running import LATCHED, RESULTS, STREAM
+from tactile_resonance.nodes.running import RESULTS, STREAM, TRUTHS
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.srv import Truth
 
@@ -76,7 +76,7 @@ class ScanSession(NodeClient):
         subscribe = self._node.create_subscription
         subscribe(msg.FRF, "frf", lambda m: self._keep_final(self._frfs, m), RESULTS)
         subscribe(msg.Poles, "poles", lambda m: self._keep_final(self._poles, m), RESULTS)
-        subscribe(msg.Poles, "bench/truth", self._on_truth, LATCHED)
+        subscribe(msg.Poles, "bench/truth", self._on_truth, TRUTHS)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def wait_for_nodes(self, timeout_s: float) -> None:

@@ -79,7 +79,7 @@ def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
             told.append((poles, origin))
         else:
             middle_ns = origin.time_ns
-    # the bench may have played on, and of truths only the newest travel for sure
+    # the bench may have played on
     near = [(p, o) for p, o in told if abs(o.time_ns - middle_ns) < SAME_MIDDLE_NS]
     if not near:
         return None

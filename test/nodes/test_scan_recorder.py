@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the bench tells of a measurement is in its file, however close together it is told."""
+
+import os
+import time
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+
+from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.scan_recorder import ScanRecorder
+from tactile_resonance.processes import free_domain_id
+from tactile_resonance.recording.from_messages import poles_from_message
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.recorded import file_of
+from tactile_resonance.scan.references import POLES
+from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.simulation.bench_tip import BenchTip
+
+KEY, TRUTHS = 7, 12
+
+
+class Listener(ManagedNode):
+    def __init__(self):
+        super().__init__("scan_node", ())
+
+    def configure(self):
+        self.recorder = ScanRecorder(self)
+
+
+@pytest.fixture
+def nodes():
+    """Makes nodes and activates them, one executor for all."""
+    with rclpy.init(domain_id=free_domain_id(os.environ)):
+        executor = SingleThreadedExecutor()
+
+        def start(kind):
+            node = kind()
+            node.trigger_configure()
+            node.trigger_activate()
+            executor.add_node(node)
+            return node
+
+        yield start, executor
+        for node in executor.get_nodes():
+            node.destroy_node()
+
+
+def tell(bench, number):
+    """As `bench._play` does, when blocks end close together."""
+    for k in range(number):
+        pose = PoseStamped()
+        pose.header.stamp = time_message(1000 + k)
+        bench._publish_truth(pose, BenchTip(None, 0.0, 1.0), KEY)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
+    start, executor = nodes
+    bench = start(FakeHardwareNode)
+    if late:  # the recorder's subscription is made, or matched, after the bench spoke
+        tell(bench, TRUTHS)
+    recorder = start(Listener).recorder
+    plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
+    with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
+        with run.begin_point(0) as recording:
+            recorder.record_into(recording, KEY)
+            deadline_s = time.monotonic() + 20.0
+            while not bench._truth.get_subscription_count() and time.monotonic() < deadline_s:
+                executor.spin_once(0.05)
+            if not late:
+                tell(bench, TRUTHS)
+            deadline_s = time.monotonic() + 10.0
+            while recorder._counts["bench/truth"] < TRUTHS and time.monotonic() < deadline_s:
+                executor.spin_once(0.05)
+            recorder.stop()
+            recording.finish(PointResult(0, measurement_id=KEY))
+        (result,) = run.content.latest
+        messages = read_messages_of_type(file_of(run.path, result), POLES)
+        store = message_types()
+        told = [poles_from_message(store.deserialize_cdr(cdr, POLES))[1] for _, _, cdr in messages]
+    assert [origin.time_ns for origin in told] == [1000 + k for k in range(TRUTHS)]
