@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bench without robot and nodes, whose poles have a known spread, and scans on it."""
+
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.controls import Controls
+from tactile_resonance.scan.decision import BlockLimits, Precise
+from tactile_resonance.scan.hands import Measured, PointFailed
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.runner import ScanRunner
+from tactile_resonance.scan.scene import ScanScene
+
+SPREAD_HZ = 0.02
+
+
+@dataclass
+class Bench:
+    """Hands on a bench whose poles have a spread that falls with the root of the blocks."""
+
+    log: list = field(default_factory=list)
+    failing: tuple = ()
+    on_measure: object = None
+    holding: bool = False
+    free_air: bool = True
+
+    def missing(self):
+        return None
+
+    def touch(self, point, force_n, hold, check):
+        check()
+        assert not self.holding, "the tip was not drawn back before the next point"
+        if point.index in self.failing:
+            raise PointFailed("contact: surface_missing: nothing there")
+        self.holding = True
+        self.log.append(("touch", point.index))
+
+    def measure(self, design, label, seed, enough, recording, check):
+        blocks = 0
+        recording.write("/note", "std_msgs/msg/String", time.time_ns(), note(label))
+        while blocks < design.periods:
+            check()
+            blocks += 1
+            covariance = np.diag([SPREAD_HZ**2, 1e-9]) / blocks
+            poles = Poles(
+                poles_rad_s=np.array([-50 + 1600j]),
+                f0_hz=np.array([254.0]),
+                damping_ratio=np.array([0.03]),
+                residues=np.array([100 + 0j]),
+                covariance=covariance[None],
+                total_covariance=covariance[None],
+            )
+            if self.on_measure is not None and label != "air":
+                self.on_measure(self, blocks)
+            if enough(poles, blocks):
+                break
+        self.log.append(("measure", label, seed, blocks))
+        contact = Contact(0.01, 1e-4, (0.0, 0.0, 0.0), frame_id="base", time_ns=1)
+        return Measured(poles, Origin(measurement_id=1000 + seed, contact=contact, simulated=True))
+
+    def retract(self):
+        self.holding = False
+
+
+def note(text):
+    types = message_types()
+    kind = "std_msgs/msg/String"
+    return types.serialize_cdr(types.types[kind](data=text), kind)
+
+
+def scene(points=4, **changes):
+    positions = np.zeros((points, 3))
+    positions[:, 0] = 1e-3 * np.arange(points)
+    made = ScanScene(
+        name="test",
+        force_n=0.01,
+        positions_m=positions,
+        precision=Precise(f0_std_hz=SPREAD_HZ / 2),
+        blocks=BlockLimits(least=2, most=8),
+    )
+    return replace(made, **changes)
+
+
+def begin(path, made):
+    plan = make_plan(made)
+    run = RunDirectory.create(path, "name: test\n", plan.points, {"seed": 1})
+    return plan, run
+
+
+def scan(path, made, bench, controls=None):
+    plan, run = begin(path, made)
+    told = []
+    with run:
+        summary = ScanRunner(made, plan, run, bench, controls or Controls(), told.append).run()
+    return summary, read_run(path), told

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points that fail or are disturbed, nodes that go away: what comes again, what goes on, what ends."""
+
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.scan import runner
+from tactile_resonance.scan.controls import Controls, Request
+from tactile_resonance.scan.hands import (
+    ATTEMPTS,
+    ATTEMPTS_WITHOUT_NODE,
+    NodeAway,
+    PointDisturbed,
+    ScanEnded,
+)
+from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.scene import OnFailure, TimeLimits
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import Bench, scan, scene
+
+
+def test_a_point_that_fails_is_kept_with_its_reason_and_the_scan_goes_on(tmp_path):
+    summary, run, _ = scan(tmp_path / "run", scene(), Bench(failing=(1,)))
+    assert (summary.complete, summary.done, summary.failed) == (True, 3, 1)
+    failed = run.latest[1]
+    assert failed.outcome is Outcome.FAILED
+    assert failed.reason == "contact: surface_missing: nothing there"
+    assert np.isnan(failed.f0_hz)
+
+
+def test_a_scene_may_stop_at_a_failure(tmp_path):
+    made = scene(on_failure=OnFailure.STOP)
+    summary, run, _ = scan(tmp_path / "run", made, Bench(failing=(1,)))
+    assert not summary.complete
+    assert "point 2 failed and on_failure is stop" in summary.message
+    assert run.next_point.index == 2
+
+
+def test_a_point_that_is_disturbed_comes_again_and_fails_in_the_end(tmp_path):
+    def disturb(times):
+        left = [times]
+
+        def on_measure(bench, blocks):
+            if bench.log[-1] == ("touch", 1) and left[0]:
+                left[0] -= 1
+                raise PointDisturbed("contact: force_stale: 11 ms", "force_stale")
+
+        return Bench(on_measure=on_measure)
+
+    bench = disturb(2)
+    summary, run, told = scan(tmp_path / "twice", scene(), bench)
+    assert (summary.done, summary.failed) == (4, 0)
+    assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [0, 1, 1, 1, 2, 3]
+    assert [(r.index, r.attempt) for r in run.results] == [(k, 0) for k in range(4)]
+    assert [(r.repeats, r.disturbances) for r in run.results] == [
+        (0, ""), (2, "force_stale 2"), (0, ""), (0, "")
+    ]  # fmt: skip
+    assert summary.repeats == 2
+    assert told[-1].repeats == 2
+    summary, run, _ = scan(tmp_path / "always", scene(), disturb(ATTEMPTS))
+    assert (summary.done, summary.failed) == (3, 1)
+    assert "force_stale" in run.latest[1].reason
+    assert run.latest[1].repeats == ATTEMPTS - 1
+
+
+def test_a_reference_that_is_disturbed_comes_again(tmp_path):
+    @dataclass
+    class Disturbed(Bench):
+        left: int = 2
+
+        def measure(self, design, label, *rest):
+            if label == "air" and self.left:
+                self.left -= 1
+                raise PointDisturbed("frf: who publishes it was started anew")
+            return super().measure(design, label, *rest)
+
+    for disturbed, kept in ((2, ["air-before", "air-after"]), (ATTEMPTS, ["air-after"])):
+        path = tmp_path / f"{disturbed}"
+        summary, run, _ = scan(path, scene(), Disturbed(left=disturbed))
+        assert (summary.complete, summary.done) == (True, 4)
+        references = [file.name for file in run.files if file.name.startswith("reference-")]
+        assert [name[13:-5] for name in sorted(references)] == kept
+
+
+@dataclass
+class Leaving(Bench):
+    """At point 1 a node goes away so many times; after each it is missed for a while."""
+
+    left: int = ATTEMPTS + 2
+    away: int = 0
+
+    def missing(self):
+        assert not self.holding, "waits with the tip on the tissue"
+        self.away = max(0, self.away - 1)
+        return "frf: /frf_node is not active" if self.away else None
+
+    def measure(self, design, label, seed, enough, recording, check):
+        assert not self.away, "measured while the node was away"
+        if label != "air" and self.log[-1] == ("touch", 1) and self.left:
+            self.left -= 1
+            self.away = 4
+            raise NodeAway("frf: /frf_node is not active", "node away")
+        return super().measure(design, label, seed, enough, recording, check)
+
+
+def test_a_point_whose_node_is_away_comes_again_when_it_is_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "POLL_S", 0.001)
+    # the time that the point may take is not spent on waiting
+    made = scene(time_limits=TimeLimits(point_s=0.5, scan_s=3600))
+    summary, run, told = scan(tmp_path / "back", made, Leaving())
+    assert (summary.complete, summary.done, summary.failed) == (True, 4, 0)
+    assert run.latest[1].repeats == ATTEMPTS + 2
+    assert run.latest[1].disturbances == f"node away {ATTEMPTS + 2}"
+    assert "waiting" in [progress.phase for progress in told]
+    # a point that ends its node every time is given up at last
+    summary, run, _ = scan(tmp_path / "never", made, Leaving(left=10**6))
+    assert (summary.complete, summary.done, summary.failed) == (True, 3, 1)
+    assert run.latest[1].repeats == ATTEMPTS_WITHOUT_NODE - 1
+
+
+def test_a_scan_whose_node_stays_away_ends_with_its_name_and_can_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "NODE_BACK_WITHIN_S", 0.2)
+
+    def leave(bench, blocks):
+        if bench.log[-1] == ("touch", 2):
+            bench.away = 10**6
+            raise NodeAway("frf: /frf_node is not active", "node away")
+
+    summary, run, _ = scan(tmp_path / "run", scene(), Leaving(on_measure=leave, left=0))
+    assert not summary.complete
+    assert "/frf_node is not active" in summary.message
+    assert [result.outcome for result in run.latest] == [Outcome.DONE] * 2
+    assert run.next_point.index == 2
+
+
+def test_a_scan_that_waits_for_a_node_can_be_cancelled(tmp_path):
+    controls = Controls()
+    bench = Leaving(away=10**6)
+    threading.Timer(0.2, lambda: controls.ask(Request.CANCEL)).start()
+    summary, run, _ = scan(tmp_path / "run", scene(), bench, controls)
+    assert summary.message == "cancelled"
+    assert run.latest == ()
+
+
+def test_a_point_that_takes_too_long_fails_and_a_scan_that_does_ends(tmp_path):
+    made = scene(time_limits=TimeLimits(point_s=1e-9, scan_s=3600))
+    summary, run, _ = scan(tmp_path / "a", made, Bench())
+    assert summary.failed == 4
+    assert "time_limits.point_s" in run.latest[0].reason
+    made = scene(time_limits=TimeLimits(point_s=60, scan_s=1e-9))
+    summary, run, _ = scan(tmp_path / "b", made, Bench())
+    assert not summary.complete
+    assert "time_limits.scan_s" in summary.message
+    assert run.latest == ()
+
+
+def test_what_cannot_go_on_ends_with_its_reason_and_the_tip_free(tmp_path):
+    def gone(bench, blocks):
+        raise ScanEnded("measure: no node takes the goal for 60 s")
+
+    bench = Bench(on_measure=gone)
+    summary, run, _ = scan(tmp_path / "run", scene(), bench)
+    assert "no node takes the goal" in summary.message
+    assert not summary.complete
+    assert run.latest == ()
+    assert not bench.holding
