@@ -11,36 +11,24 @@ from tactile_resonance.contact.interfaces import ArmError, ArmFault
 MUTE = "127.253.254.1"
 
 
-def test_not_in_remote_control(robot, module_arm):
+@pytest.mark.parametrize(
+    ("name", "good", "fault"),
+    [
+        ("remote_control", True, ArmFault.NOT_REMOTE),
+        ("registers_in_use", False, ArmFault.REGISTERS_IN_USE),
+        ("script_starts", True, ArmFault.PROGRAM_NOT_STARTED),
+    ],
+)
+def test_what_the_robot_is_set_to_is_told_and_set_right_it_connects(
+    robot, module_arm, name, good, fault
+):
     arm = module_arm
     arm.close()
-    robot.order("remote_control", value=False)
+    robot.order(name, value=not good)
     with pytest.raises(ArmError) as error:
         arm.connect()
-    assert error.value.fault is ArmFault.NOT_REMOTE
-    robot.order("remote_control", value=True)
-    arm.connect()
-
-
-def test_registers_in_use(robot, module_arm):
-    arm = module_arm
-    arm.close()
-    robot.order("registers_in_use", value=True)
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.REGISTERS_IN_USE
-    robot.order("registers_in_use", value=False)
-    arm.connect()
-
-
-def test_script_that_never_starts(robot, module_arm):
-    arm = module_arm
-    arm.close()
-    robot.order("script_starts", value=False)
-    with pytest.raises(ArmError) as error:
-        arm.connect()
-    assert error.value.fault is ArmFault.PROGRAM_NOT_STARTED
-    robot.order("script_starts", value=True)
+    assert error.value.fault is fault
+    robot.order(name, value=good)
     arm.connect()
 
 
