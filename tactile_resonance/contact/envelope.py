@@ -26,6 +26,9 @@ WALL_TIME_S = 0.1
 REACTION_S, BRAKING_M_S2 = 0.03, 0.2
 """The arm answers this late [s] and is trusted to slow down this hard [m/s2] before it is near."""
 
+ROUNDING = 1e-12
+"""A part of a velocity this much smaller than all of it is rounding."""
+
 SPEED_MARGIN = 1.5
 """A measured speed may exceed a limit by this factor: vibration and noise of the encoders."""
 
@@ -179,7 +182,10 @@ class Envelope:
             wall = box.high_m[axis] if speed > 0 else box.low_m[axis]
             room = max(0.0, (wall - position_m[axis]) * math.copysign(1, speed)) / WALL_TIME_S
             if abs(speed) > room:
-                velocity *= room / abs(speed)
+                if abs(speed) <= ROUNDING * float(np.linalg.norm(velocity)):
+                    velocity[axis] = 0.0  # along the wall: it stops nothing
+                else:
+                    velocity *= room / abs(speed)
         angular *= _shrink(angular, limits.angular_speed_rad_s)
         return np.concatenate([velocity, angular])
 

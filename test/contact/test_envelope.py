@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tactile_resonance.contact.envelope import WALL_TIME_S, Envelope, Place
@@ -64,6 +64,15 @@ def test_what_is_let_through_keeps_every_limit(twist, position, place):
         assert v >= min(0.0, low - x) / WALL_TIME_S * SLACK - 1e-15
 
 
+# along the wall that it has passed, where rounding leaves 1e-149 m/s towards it
+ALONG_A_WALL = (
+    np.array([-1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
+    np.array([0.375, 0.0, 0.0]),
+    Place(np.array([1.0, -3.9e-147, 0.0]), 0.0, 4e-3, 0.0),
+)
+
+
+@example(*ALONG_A_WALL)
 @settings(max_examples=200, deadline=None)
 @given(twists, positions, places)
 def test_it_never_turns_a_motion_round_and_never_makes_one_faster(twist, position, place):
