@@ -3,31 +3,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import select
-import socket
-import subprocess
-import sys
-import tempfile
 import time
-from importlib.util import find_spec
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample, Pose
+from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, ClientState, Exchange
-from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, motion_fault, stop_fault
+from tactile_resonance.drivers.ur_exchange import ClientState
+from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
-GRACE_S = 1.5
-# Of what ur_rtde 1.6.5 writes when it finds its connection lost.
-LIBRARY_LOST = "Robot is disconnected"
 
 
 class UrArm:
@@ -47,10 +36,7 @@ class UrArm:
 
     def __init__(self, config: UrArmConfig) -> None:
         self.config = config
-        self._process: subprocess.Popen | None = None
-        self._commands: socket.socket | None = None
-        self._exchange: Exchange | None = None
-        self._errors: IO[bytes] | None = None
+        self._client: ClientProcess | None = None
         self._number = 0
         self._sent: dict[int, tuple[str, float]] = {}  # name and time [s] of what has no answer yet
         self._refused = 0
@@ -66,6 +52,11 @@ class UrArm:
         """States received in the last second."""
         return self._fresh().rate_hz
 
+    @property
+    def client_pid(self) -> int | None:
+        """Of the client's process; None while there is none."""
+        return None if self._client is None else self._client.pid
+
     def connect(self) -> None:
         """Connect, set TCP and payload, start the control program and its watchdog.
 
@@ -78,11 +69,11 @@ class UrArm:
             LINK_LOST, NOT_REMOTE, REGISTERS_IN_USE, PROGRAM_NOT_STARTED, PROTECTIVE_STOP,
             EMERGENCY_STOP, PROGRAM_STOPPED (not powered), COMMAND_REFUSED, CLIENT_DIED.
         """
-        if self._process is not None:
+        if self._client is not None:
             try:
                 state = self._fresh()
             except ArmError:
-                self._end()
+                self.close()
             else:
                 if motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None:
                     self._forget_commands()
@@ -93,7 +84,7 @@ class UrArm:
                 self._ask({"name": "restart"})
                 self._forget_commands()
                 return
-        self._begin()
+        self._client = ClientProcess(self.config)
         self._ask({"name": "connect", "config": self.config.to_dict()})
         self._forget_commands()
 
@@ -178,7 +169,17 @@ class UrArm:
 
     def close(self) -> None:
         """Stop the arm and its program and end the client; never raises."""
-        self._end()
+        if self._client is not None:
+            self._client.end()
+            self._client = None
+
+    def _ask(self, request: dict) -> None:
+        assert self._client is not None
+        try:
+            self._client.ask(request)
+        except ArmError:  # it has ended
+            self._client = None
+            raise
 
     def _command(self, name: str, values: list) -> int:
         client = self._fresh()
@@ -189,24 +190,17 @@ class UrArm:
         return self._send(name, values)
 
     def _send(self, name: str, values: list) -> int:
-        assert self._commands is not None
+        assert self._client is not None
         self._number += 1
-        message = json.dumps({"name": name, "number": self._number, "values": values})
-        try:
-            self._commands.send(message.encode(), socket.MSG_DONTWAIT)
-        except OSError as error:
-            raise self._death() from error
+        self._client.send({"name": name, "number": self._number, "values": values})
         self._sent[self._number] = (name, time.monotonic())
         return self._number
 
     def _fresh(self) -> ClientState:
         """Return the newest state, and show the client that its owner lives."""
-        if self._process is None or self._exchange is None:
+        if self._client is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        self._exchange.beat()
-        if self._process.poll() is not None:
-            raise self._death()
-        client = self._exchange.read()
+        client = self._client.state()
         if client is None or not client.connected:
             raise ArmError(ArmFault.LINK_LOST, f"the connection to {self.config.host} is lost")
         age_s = (time.monotonic_ns() - min(client.state_ns, client.received_ns)) * 1e-9
@@ -229,9 +223,8 @@ class UrArm:
             ):
                 return  # a stop is why; the state tells it
             name = sent[client.refused][0] if client.refused in sent else "an earlier command"
-            raise ArmError(
-                ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {self._last_error()}"
-            )
+            said = "" if self._client is None else self._client.last_error()
+            raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
         for name, sent_s in self._sent.values():
             if time.monotonic() - sent_s > ANSWER_S:
                 raise ArmError(
@@ -241,8 +234,8 @@ class UrArm:
     def _forget_commands(self) -> None:
         self._sent.clear()
         self._refused, self._move = self._number, 0
-        if self._exchange is not None:
-            self._exchange.beat()
+        if self._client is not None:
+            self._client.beat()
 
     def _check_acceleration(self, value: float) -> None:
         if not 0 < value <= self.config.max_acceleration_m_s2:
@@ -250,108 +243,3 @@ class UrArm:
                 f"acceleration: {value:g}, the configuration allows above 0 to "
                 f"{self.config.max_acceleration_m_s2:g}"
             )
-
-    def _begin(self) -> None:
-        if find_spec("rtde_control") is None:
-            raise ArmError(
-                ArmFault.CLIENT_DIED, "ur_rtde is not installed: pip install 'ur-rtde>=1.6.5,<1.7'"
-            )
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with tempfile.TemporaryFile() as page, theirs:
-            page.truncate(SIZE)
-            self._exchange = Exchange(page.fileno())
-            self._exchange.beat()
-            self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the client
-            self._commands = ours
-            self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "tactile_resonance.drivers.ur_client",
-                    str(theirs.fileno()),
-                    str(page.fileno()),
-                ],
-                pass_fds=(theirs.fileno(), page.fileno()),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._errors,
-                start_new_session=True,
-            )
-
-    def _ask(self, request: dict) -> None:
-        """Send a request and wait for its answer; ends the client where it fails."""
-        assert self._commands is not None
-        try:
-            self._commands.send(json.dumps(request).encode())
-            ready, _, _ = select.select([self._commands], [], [], self.config.connect_timeout_s)
-            data = self._commands.recv(8192) if ready else None
-        except OSError:
-            data = b""
-        if data is None:
-            late = self._late(request["name"])
-            self._kill()
-            raise late
-        if not data:
-            death = self._death()
-            self._kill()
-            raise death
-        answer = json.loads(data)
-        if not answer["ok"]:
-            self._end()
-            raise ArmError(ArmFault(answer["fault"]), answer["message"])
-
-    def _late(self, request: str) -> ArmError:
-        """Why a request has no answer in time."""
-        assert self._exchange is not None
-        text = f"{self.config.host} is not ready after {self.config.connect_timeout_s:g} s"
-        client = self._exchange.read()  # while it connects: the state that it found
-        running = client is not None and client.runtime_state == PROGRAM_PLAYING
-        if request == "connect" and running:
-            # the library asks it to end in a register that the program may not read, and waits for ever
-            return ArmError(
-                ArmFault.PROGRAM_NOT_STARTED,
-                f"{text}: another program runs there and does not end; stop it at the robot",
-            )
-        return ArmError(ArmFault.LINK_LOST, text)
-
-    def _death(self) -> ArmError:
-        """Why the client process is gone."""
-        assert self._process is not None
-        try:
-            status = self._process.wait(GRACE_S)
-        except subprocess.TimeoutExpired:
-            return ArmError(ArmFault.CLIENT_DIED, "the client process does not answer")
-        said = self._last_error()
-        # on a lost connection the library connects anew by itself, says so, and now and then crashes
-        # where a command is under way: the link is why
-        if status == EXIT_LINK_LOST or (status < 0 and LIBRARY_LOST in said):
-            return ArmError(ArmFault.LINK_LOST, f"the connection to {self.config.host} is lost")
-        return ArmError(
-            ArmFault.CLIENT_DIED, f"the client process ended with status {status}: {said}"
-        )
-
-    def _last_error(self) -> str:
-        if self._errors is None:
-            return "no output"
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").split("\n")
-        return next((line.strip() for line in reversed(lines) if line.strip()), "no output")
-
-    def _end(self) -> None:
-        """Let the client stop the arm and end; kill it where it does not."""
-        if self._commands is not None:
-            self._commands.close()
-        if self._process is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(GRACE_S)
-        self._kill()
-
-    def _kill(self) -> None:
-        if self._process is not None:
-            if self._process.poll() is None:
-                self._process.kill()
-            self._process.wait()
-        for resource in (self._commands, self._exchange, self._errors):
-            if resource is not None:
-                resource.close()
-        self._process = self._commands = self._exchange = self._errors = None

@@ -232,7 +232,7 @@ def test_owner_that_falls_silent_is_left_to_the_watchdog(robot, high):
 def test_client_dies_or_hangs_in_the_middle_of_a_motion(robot, high, number, fault):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
-    client = high._process.pid
+    client = high.client_pid
     os.kill(client, number)
     assert wait_for_fault(high).fault is fault
     assert standing(robot)
@@ -248,7 +248,7 @@ from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 arm = UrArm(UrArmConfig(sys.argv[1], max_state_age_s=0.5))
 arm.connect()
-print(arm._process.pid, flush=True)
+print(arm.client_pid, flush=True)
 while True:
     arm.speed(np.array([0, 0, 0.002, 0, 0, 0]), 0.5)
     time.sleep(0.01)
