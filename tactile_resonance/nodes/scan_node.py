@@ -32,9 +32,10 @@ from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.notes import parse_notes
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
-from tactile_resonance.scan.runner import Progress, ScanRunner, Summary
+from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,11 +28,11 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
     AirReference,
-    SensorHealth,
     read_reference,
     sensor_health,
 )
@@ -42,71 +42,6 @@ from tactile_resonance.scan.scene import OnFailure, ScanScene
 
 POLL_S = 0.05
 SKIPPED = "skipped on request"
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a scan is.
-
-    Attributes
-    ----------
-    point : ScanPoint or None
-        Under way; None before the first and after the last.
-    phase : str
-        For people: waiting, reference, contact, measure, retract, paused.
-    finished, points : int
-    blocks : int
-        At this point so far.
-    poles : Poles or None
-        At this point so far.
-    time_left_s : float
-        Estimated from the points so far, or the plan.
-    repeats : int
-        Attempts so far that were disturbed and begun again.
-    """
-
-    point: ScanPoint | None
-    phase: str
-    finished: int
-    points: int
-    blocks: int = 0
-    poles: Poles | None = None
-    time_left_s: float = float("nan")
-    repeats: int = 0
-
-
-@dataclass(frozen=True)
-class Summary:
-    """How a scan ended.
-
-    Attributes
-    ----------
-    complete : bool
-        Every point of the plan is finished.
-    message : str
-    done, failed, skipped : int
-        Points by their latest outcome.
-    blocks, blocks_saved : int
-    saved_s : float
-        Measuring time saved by ending points early.
-    repeats : int
-        Attempts that were disturbed and begun again.
-    health : SensorHealth
-    health_sentence : str
-        What the references in air say of the sensor.
-    """
-
-    complete: bool
-    message: str
-    done: int
-    failed: int
-    skipped: int
-    blocks: int
-    blocks_saved: int
-    saved_s: float
-    repeats: int
-    health: SensorHealth
-    health_sentence: str
 
 
 class ScanRunner:
