@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+from scipy import special
 
 from tactile_resonance.fields import require
 
@@ -80,7 +79,7 @@ class ScatterTouch:
         self._root = np.linalg.inv(np.linalg.cholesky(np.cov(given.T).reshape(d, d)))
         # (n - d) n / (d (n - 1) (n + 1)) T^2 is distributed as F(d, n - d)
         self._scale = (n - d) * n / (d * (n - 1) * (n + 1))
-        self.threshold = float(f_distribution.isf(false_alarm_probability, d, n - d))
+        self.threshold = float(special.fdtri(d, n - d, 1 - false_alarm_probability))
 
     def statistic(self, observation: ArrayLike) -> FloatArray:
         """Return the statistic of observations (..., d), shape (...); F-distributed in air."""
@@ -107,7 +106,7 @@ class PolesTouch:
     def __init__(self, false_alarm_probability: float = 1e-6, blocks: int = 3) -> None:
         _check_probability(false_alarm_probability)
         require(blocks >= 1, "blocks", blocks, "1 or above")
-        self._threshold = float(chi2.isf(false_alarm_probability, 2))
+        self._threshold = float(special.chdtri(2, false_alarm_probability))
         self._blocks = blocks
         self._air: list[tuple[FloatArray, FloatArray]] = []
         self._mean: FloatArray = np.zeros(2)

@@ -9,6 +9,7 @@ times slower.
 from __future__ import annotations
 
 import array
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +36,9 @@ from tactile_resonance.recording.from_messages import (
     record_from_message,  # noqa: F401 - for those who convert both ways
     time_from_message,  # noqa: F401 - for those who convert both ways
 )
-from tactile_resonance.simulation.truth import Truth
+
+if TYPE_CHECKING:  # most nodes convert no truths: they need not load the simulation
+    from tactile_resonance.simulation.truth import Truth
 
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 

@@ -145,6 +145,15 @@ class ManagerNode(Node):
             timeout_s = min(timeout_s, STATE_WITHIN_S)
         node.client, node.pending = client, client.call_async(request)
         node.deadline_s = now_s + timeout_s
+        node.pending.add_done_callback(lambda future: self._hear(node, future))
+
+    def _hear(self, node: _Managed, answer: Future) -> None:
+        """An answer by which a node has moved leads to the next question at once, others at the next tick."""
+        if node.pending is answer and not answer.cancelled():
+            before = node.state
+            self._take(node, time.monotonic())
+            if node.state != before:
+                self._tick()
 
     def _take(self, node: _Managed, now_s: float) -> None:
         answer, node.pending = node.pending.result(), None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy import special
 
 from tactile_resonance.fields import require
 from tactile_resonance.scan.surface import unit_normal
@@ -122,7 +122,7 @@ def fit_surface(
     spare = len(contacts) - terms
     cost, consistent = float(weighted @ weighted), True
     if spare > 0:
-        consistent = bool(chi2.sf(cost, spare) >= _IMPROBABLE)
+        consistent = bool(special.chdtrc(spare, cost) >= _IMPROBABLE)
         if not consistent:
             covariance = covariance * cost / spare
     return TouchedSurface(form, center, scale, coefficients, covariance, weighted * std, consistent)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special  # scipy.stats takes a node most of a second to import
 
 from tactile_resonance.fields import require
 
@@ -169,12 +169,12 @@ def _density_and_tail(
     log_volume = 0.5 * np.linalg.slogdet(correlation)[1] + float(np.sum(np.log(unit)))
     dof = tissue.degrees_of_freedom
     if np.isinf(dof):
-        log_shape, tail = -0.5 * distance2, stats.chi2.sf(distance2, 2)
+        log_shape, tail = -0.5 * distance2, special.chdtrc(2, distance2)
     else:
         # two dimensions: the constant of Student's density is that of the Gaussian, 1 / 2 pi
         log_shape, tail = (
             -(dof + 2) / 2 * np.log1p(distance2 / dof),
-            stats.f.sf(distance2 / 2, 2, dof),
+            special.fdtrc(2, dof, distance2 / 2),
         )
     return float(log_shape - log_volume - np.log(2 * np.pi)), float(tail)
 
