@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The NI driver on a stand-in of nidaqmx; nothing here has seen hardware."""
 
-import inspect
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.acquisition import DeviceError
@@ -281,79 +279,3 @@ def test_missing_package_is_one_line(monkeypatch):
     with pytest.raises(DeviceError, match="install the package") as raised:
         NiDaqDevice(CONFIG)
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"output": {"channel": "Dev1/ao0"}}, "output.max_voltage_v: missing"),
-        ({"between_samples": "linear"}, "between_samples: 'linear', accepted are"),
-        ({"channel_delay_s": "1e-6"}, "channel_delay_s: '1e-6', expected a number"),
-        ({"buffer_s": 0}, "buffer_s: 0, expected a positive number"),
-        ({"gain": 3}, "gain: no such field"),
-        ({"sensor": {"channel": 3}}, "sensor.channel: 3, expected a name"),
-        ({"sensor": None}, "sensor: None, expected fields"),
-        (
-            {"sensor": {"channel": "Dev1/ai0", "range_v": 1.0, "terminals": "rse"}},
-            "sensor.channel: Dev1/ai0, expected another",
-        ),
-        (
-            {"actuator": {"source": "commanded", "channel": "Dev1/ai0"}},
-            "actuator.channel: no such field",
-        ),
-    ],
-)
-def test_wrong_configuration_is_named(tmp_path, change, message):
-    content = yaml.safe_load(EXAMPLE.read_text()) | change
-    path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(content))
-    with pytest.raises(ValueError, match=message) as raised:
-        read_nidaq_config(path)
-    assert str(raised.value).startswith("mine.yaml: ")
-
-
-def test_stand_in_agrees_with_the_real_package():
-    """Every name, argument and constant of the stand-in exists in the package itself."""
-    pytest.importorskip("nidaqmx", reason="nidaqmx is not installed")
-    from nidaqmx import Task, constants, error_codes, stream_readers, system
-    from nidaqmx.task import InStream, OutStream, Timing
-    from nidaqmx.task.channels import AIChannel
-    from nidaqmx.task.collections import AIChannelCollection, AOChannelCollection
-    from nidaqmx.task.triggering import StartTrigger
-
-    pairs = [
-        (fake_nidaqmx.Task, Task, ("__init__", "write", "control", "start", "is_task_done")),
-        (fake_nidaqmx.Task, Task, ("close",)),
-        (fake_nidaqmx.Timing, Timing, ("cfg_samp_clk_timing",)),
-        (fake_nidaqmx.StartTrigger, StartTrigger, ("cfg_dig_edge_start_trig",)),
-        (fake_nidaqmx.AIChannelCollection, AIChannelCollection, ("add_ai_voltage_chan",)),
-        (fake_nidaqmx.AOChannelCollection, AOChannelCollection, ("add_ao_voltage_chan",)),
-        (
-            fake_nidaqmx.AnalogUnscaledReader,
-            stream_readers.AnalogUnscaledReader,
-            ("__init__", "read_int16", "read_int32"),
-        ),
-    ]
-    for ours, theirs, names in pairs:
-        for name in names:
-            mine = list(inspect.signature(getattr(ours, name)).parameters)
-            real = list(inspect.signature(getattr(theirs, name)).parameters)
-            assert real[: len(mine)] == mine, name
-    for name, ours in vars(fake_nidaqmx.Constants).items():
-        for member in ours if isinstance(ours, type) else ():
-            assert getattr(constants, name)[member.name].value == member.value
-    for owner, names in (
-        (Timing, ("samp_clk_rate",)),
-        (InStream, ("input_buf_size", "overwrite")),
-        (OutStream, ("output_buf_size", "regen_mode")),
-        (AIChannel, ("ai_dev_scaling_coeff", "ai_raw_samp_size", "ai_rng_low", "ai_rng_high")),
-        (
-            system.Device,
-            ("product_type", "ai_simultaneous_sampling_supported", "ao_voltage_rngs"),
-        ),
-        (Task, ("in_stream", "out_stream", "timing", "triggers", "ai_channels", "ao_channels")),
-    ):
-        for name in names:
-            assert isinstance(getattr(owner, name), property), name
-    codes = {code.value for code in error_codes.DAQmxErrors}
-    assert {-200279, -200222, -200283, -200361, -200010, -200284, -200018} <= codes

@@ -99,3 +99,9 @@ def make_client() -> Callable[..., Client]:
 @pytest.fixture
 def client(make_client) -> Client:
     return make_client()
+
+
+@pytest.fixture(params=[0, 24], ids=["lower", "upper"])
+def any_client(request, make_client):
+    """On the lower and on the upper registers."""
+    return make_client(offset=request.param)
