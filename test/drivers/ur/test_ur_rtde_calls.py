@@ -18,5 +18,6 @@ def test_force_and_contact(start_robots, run_calls):
     run_calls("force", robot.host)
 
 
-def test_four_robots_side_by_side(start_robots, run_calls):
-    run_calls("four", *(robot.host for robot in start_robots(count=4)))
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_robots_side_by_side(start_robots, run_calls, count):
+    run_calls("side_by_side", *(robot.host for robot in start_robots(count=count)))
