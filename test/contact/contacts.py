@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A contact on the bench in virtual time, started close to the surface so that it is soon made."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,8 +29,16 @@ class Contact:
     controller: ContactController
     loop: ContactLoop
     goal: ContactGoal
-    force_n: list
-    speed_m_s: list
+    force_n: list = field(default_factory=list)
+    speed_m_s: list = field(default_factory=list)
+
+    def __post_init__(self):
+        # a method, not a closure: a copy of the contact records into itself
+        self.bench.clock.on_step.append(self.record)
+
+    def record(self):
+        self.force_n.append(float(self.bench.plant.force_n[2]))
+        self.speed_m_s.append(float(self.bench.clock.motion.twist[2]))
 
     def run_until(self, state, longest_s=20.0):
         """Run until a state is reached; False where it is not."""
@@ -60,11 +68,8 @@ def contact(
     )
     controller = ContactController(parameters, Limits() if limits is None else limits)
     loop = ContactLoop(rig.arm, rig.force, rig.clock, controller)
-    force, speed = [], []
-    rig.clock.on_step.append(lambda: force.append(float(rig.plant.force_n[2])))
-    rig.clock.on_step.append(lambda: speed.append(float(rig.clock.motion.twist[2])))
     goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
-    return Contact(rig, controller, loop, goal, force, speed)
+    return Contact(rig, controller, loop, goal)
 
 
 def started(tissue=SOFT, **options):

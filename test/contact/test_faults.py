@@ -4,6 +4,8 @@
 The times are those that docs/safety.md states.
 """
 
+import copy
+import functools
 import sys
 from pathlib import Path
 
@@ -80,9 +82,14 @@ ARM_FAULTS = {
 }
 
 
-def brought_to(state, **options):
-    """A contact in a state."""
-    made = started(**options)
+def brought_to(state):
+    """A contact in a state, for whoever asks a copy of the same one."""
+    return copy.deepcopy(_brought_to(state))
+
+
+@functools.cache
+def _brought_to(state):
+    made = started()
     if state is State.RETRACT:
         assert made.run_until(State.HOLD)
         made.controller.retract()

@@ -10,34 +10,40 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 
-@pytest.fixture
-def domain(monkeypatch):
-    """Environment of a fresh domain; processes started from here inherit it."""
+def _fresh_domain(patch):
     from tactile_resonance.processes import free_domain_id
 
     number = free_domain_id({})
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    patch.setenv("ROS_DOMAIN_ID", str(number))
+    patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     return number
 
 
+@pytest.fixture
+def domain(monkeypatch):
+    """Environment of a fresh domain; processes started from here inherit it."""
+    return _fresh_domain(monkeypatch)
+
+
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory, request):
+def module_domain():
+    """The same for nodes that the tests of one file share: starting them takes longer than most tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield _fresh_domain(patch)
+
+
+@pytest.fixture(scope="module")
+def bench(module_domain, tmp_path_factory, request):
     """contact_node on a simulated robot, for the tests of one file, with that file's `PARAMETERS_OF_NODE`."""
     sys.path.insert(0, str(Path(__file__).parent))
     from contact_rig import Bench
 
-    from tactile_resonance.processes import free_domain_id
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        parameters = getattr(request.module, "PARAMETERS_OF_NODE", None)
-        made = Bench(tmp_path_factory.mktemp("log"), parameters=parameters)
-        try:
-            yield made
-        finally:
-            made.close()
+    parameters = getattr(request.module, "PARAMETERS_OF_NODE", None)
+    made = Bench(tmp_path_factory.mktemp("log"), parameters=parameters)
+    try:
+        yield made
+    finally:
+        made.close()
 
 
 @pytest.fixture

@@ -68,10 +68,12 @@ class Watcher:
         return all(self.state(node) == state for node in NODES)
 
 
-@pytest.fixture
-def running(domain, tmp_path):
-    with NodeProcesses(tmp_path / "log") as nodes, Watcher() as watcher:
-        nodes.bring_up(NODES, {"excitation_node": {"record_folder": tmp_path / "records"}})
+@pytest.fixture(scope="module")
+def running(module_domain, tmp_path_factory):
+    """Nodes that every test leaves as it found them: active."""
+    folder = tmp_path_factory.mktemp("running")
+    with NodeProcesses(folder / "log") as nodes, Watcher() as watcher:
+        nodes.bring_up(NODES, {"excitation_node": {"record_folder": folder / "records"}})
         watcher.wait(lambda: watcher.heard.get("/manager_node", {}).get("state") == "active")
         yield nodes, watcher
 

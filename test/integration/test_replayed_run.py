@@ -103,10 +103,8 @@ def bits(message, *without):
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def recorded(module_domain, tmp_path_factory):
     """A run, and what a subscriber heard while it was recorded."""
-    from tactile_resonance.processes import free_domain_id
-
     folder = tmp_path_factory.mktemp("recorded")
     scene, run = folder / "scene.yaml", folder / "run"
     scene.write_text(SCENE)
@@ -115,24 +113,19 @@ def recorded(tmp_path_factory):
         "excitation_node": {"record_folder": folder / "records"},
         "scan_node": {"contact": "none"},
     }
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
-            nodes.bring_up(
-                ("fake_hardware_node", "excitation_node", *READERS, "scan_node"), parameters
-            )
-            client.wait_until_up(60.0)
-            client.join_all(periods=3)
-            # somebody else is measuring when the scan begins: it waits, and records none of that
-            other = client.ask(periods=60)
-            goal = Scan.Goal(scene=str(scene), run_directory=str(run))
-            result = client.scan(goal, lambda _: None, 90.0)
-            assert other.done()
-            assert other.result().result.outcome == Measure.Result.DONE
-            for _ in range(10):
-                client.spin(0.05)
-            heard = client.by_measurement()
+    with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
+        nodes.bring_up(("fake_hardware_node", "excitation_node", *READERS, "scan_node"), parameters)
+        client.wait_until_up(60.0)
+        client.join_all(periods=3)
+        # somebody else is measuring when the scan begins: it waits, and records none of that
+        other = client.ask(periods=60)
+        goal = Scan.Goal(scene=str(scene), run_directory=str(run))
+        result = client.scan(goal, lambda _: None, 90.0)
+        assert other.done()
+        assert other.result().result.outcome == Measure.Result.DONE
+        for _ in range(10):
+            client.spin(0.05)
+        heard = client.by_measurement()
     assert result.outcome == Scan.Result.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (4, 0, 0)
     return run, heard, other.result().result.measurement_id

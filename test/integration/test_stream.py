@@ -21,7 +21,7 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_session import ScanSession
-from tactile_resonance.processes import NodeProcesses, free_domain_id
+from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 
@@ -73,14 +73,9 @@ class Listener:
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory):
-    """Nodes that run, and a client of theirs; shared, for starting takes longer than measuring."""
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        NodeProcesses(tmp_path_factory.mktemp("log")) as nodes,
-    ):
-        patch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+def session(module_domain, tmp_path_factory):
+    """Nodes that run, and a client of theirs."""
+    with NodeProcesses(tmp_path_factory.mktemp("log")) as nodes:
         parameters = {
             "fake_hardware_node": {"speed": 0.0},
             "excitation_node": {"record_folder": tmp_path_factory.mktemp("records")},

@@ -121,8 +121,8 @@ def test_a_paused_scan_waits_with_the_tip_free(tmp_path):
     assert len(read_run(tmp_path / "run").latest) == 2
 
 
-SCAN = """
-    import sys, time
+SCANS = """
+    import os, signal, sys, time
     sys.path.insert(0, sys.argv[2])
     from pathlib import Path
     import bench_hands as t
@@ -131,41 +131,48 @@ SCAN = """
     from tactile_resonance.scan.controls import Controls
     from tactile_resonance.scan.runner import ScanRunner
     path, made = Path(sys.argv[1]), t.scene(8)
-    run = RunDirectory.open(path) if path.exists() else t.begin(path, made)[1]
-    bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(3e-3))
-    with run:
-        print("running", flush=True)
-        ScanRunner(made, make_plan(made), run, bench, Controls(), lambda progress: None).run()
-    print("complete", flush=True)
+    def scan():
+        run = RunDirectory.open(path) if path.exists() else t.begin(path, made)[1]
+        bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(3e-3))
+        with run:
+            ScanRunner(made, make_plan(made), run, bench, Controls(), lambda progress: None).run()
+    for line in sys.stdin:  # a scan in a process of its own for each, which is killed so much later
+        process = os.fork()
+        if process == 0:
+            scan()
+            os._exit(0)
+        time.sleep(float(line))
+        os.kill(process, signal.SIGKILL)
+        print(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
 """
 
 
 def test_killed_at_random_moments_no_finished_point_is_lost_or_repeated(tmp_path):
     rng = random.Random(1)
     path = tmp_path / "run"
+    # once there is a run to go on with: what is killed before that leaves none
+    begin(path, scene(8))[1].close()
     finished, kills = [], 0
-    for run in range(60):
-        process = subprocess.Popen(
-            [sys.executable, "-c", textwrap.dedent(SCAN), str(path), os.path.dirname(__file__)],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        process.stdout.readline()
-        try:
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SCANS), str(path), os.path.dirname(__file__)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as scans:
+        for run in range(60):
             # longer from run to run: a machine with much other work comes to the end too
-            process.wait(rng.uniform(0.0, 0.15 + 0.01 * run))
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            kills += 1
-        ended = "complete" in process.stdout.read()
-        process.wait()
-        content = read_run(path)
-        assert content.problems == ()
-        now = [(r.index, r.attempt) for r in content.results]
-        assert now[: len(finished)] == finished, "a finished point was lost"
-        finished = now
-        if ended:
-            break
+            print(rng.uniform(0.0, 0.15 + 0.01 * run), file=scans.stdin, flush=True)
+            status = int(scans.stdout.readline())
+            assert status in (0, -signal.SIGKILL)
+            kills += status != 0
+            content = read_run(path)
+            assert content.problems == ()
+            now = [(r.index, r.attempt) for r in content.results]
+            assert now[: len(finished)] == finished, "a finished point was lost"
+            finished = now
+            if status == 0:
+                break
+        scans.stdin.close()
     assert kills >= 2
     # every point once: none was repeated after it was finished
     assert finished == [(index, 0) for index in range(8)]
