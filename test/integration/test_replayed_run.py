@@ -69,8 +69,10 @@ class Client(ScanClient):
     def join_all(self, **goal):
         """Measure until everything of a measurement is heard: all have found each other by then."""
         for _ in range(20):
+            for heard in self.heard.values():  # a replay has the same id again
+                heard.clear()
             result = self.measure(**goal)
-            for _ in range(20):
+            for _ in range(40):
                 self.spin(0.05)
                 messages = self.by_measurement()
                 if all(len(messages[t, result.measurement_id]) == result.blocks for t in self.heard
