@@ -129,11 +129,12 @@ class ContactFilter:
 
     def predict(self, dt_s: float) -> None:
         """Let time pass."""
-        # the rate dies out as relaxation does
+        # the rate dies out as relaxation does; what it adds is bounded, also over a clock set by an hour
         keep = math.exp(-dt_s)
-        self._x[1] += self._x[2] * dt_s
+        adds_s = -math.expm1(-dt_s)
+        self._x[1] += self._x[2] * adds_s
         self._x[2] *= keep
-        f = np.array([[1, 0, 0], [0, 1, dt_s], [0, 0, keep]])
+        f = np.array([[1, 0, 0], [0, 1, adds_s], [0, 0, keep]])
         self._p = f @ self._p @ f.T
         walk = self._walk**2 * dt_s
         self._p[1, 1] += walk

@@ -88,6 +88,24 @@ def test_force_is_followed_through_press_and_relaxation(c, beam):
     assert np.mean(deviations) < 0.3e-3
 
 
+def test_time_passes_alike_in_one_step_and_in_many_and_an_hour_is_not_too_long():
+    # a clock that is set ends the contact, but the filter hears of the new time first
+    heights, forces = press(np.random.default_rng(4), 800.0)
+    ways = [ContactFilter(heights, forces, noise_n=NOISE_N) for _ in range(2)]
+    for model in ways:
+        model._x[2] = 0.3
+    ways[0].predict(2.0)
+    for _ in range(1000):
+        ways[1].predict(DT)
+    once, often = ((model.c, model.c_rate_per_s) for model in ways)
+    assert once == pytest.approx(often, rel=1e-9)
+    before = ways[0].c
+    ways[0].predict(3600.0)
+    # ln C goes on by the rate times the second in which it dies out, whatever the time
+    assert ways[0].c == pytest.approx(before * math.exp(once[1]), rel=1e-9)
+    assert math.isfinite(ways[0].update(heights[-1], forces[-1]))
+
+
 def test_touch_is_found_soon_and_noise_is_none():
     rng = np.random.default_rng(3)
     detector = TouchDetector(NOISE_N, 7e-5)
