@@ -13,8 +13,8 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
-from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
 from tactile_resonance.identification.joint_model_error import systematic_of
+from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
 from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import f_quantile
