@@ -16,7 +16,7 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_fit import ROUNDED, JointFit, mean_power
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_model_error import systematic_of
-from tactile_resonance.identification.joint_noise import NoiseBands
+from tactile_resonance.identification.joint_noise import JointNoise, NoiseBands
 from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
 from tactile_resonance.identification.noise_level import KINDS, are_flat
 from tactile_resonance.identification.realisations_level import Levels
@@ -36,6 +36,9 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
+# The scatter of realisations and the noise are taken anew from a fit that they weigh.
+REWEIGHTINGS = 2
+
 
 @dataclass(frozen=True, eq=False)
 class _Round:
@@ -43,8 +46,12 @@ class _Round:
 
     Attributes
     ----------
+    plain : list of BinData
+        Of (batch M) rows, without variances.
+    u_others : (batch M, K_o) complex
+        Input between harmonics.
     data : list of BinData
-        Of (batch M) rows.
+        With variances, and without what came through the input.
     solution : Solution
     noise : (batch, 2) float
         Mean variances of the noise on both channels that the weights stand for.
@@ -54,6 +61,8 @@ class _Round:
         Of the variance weighted with that is noise; None where all of it is.
     """
 
+    plain: list[BinData]
+    u_others: ComplexArray
     data: list[BinData]
     solution: Solution
     noise: FloatArray
@@ -63,9 +72,16 @@ class _Round:
     def rows(self, which: IntArray) -> _Round:
         """Some of the points."""
         records = self.solution.theta.shape[1]
-        part = [values.rows(rows_of(which, records)) for values in self.data]
+        rows = rows_of(which, records)
         solution = Solution(*(getattr(self.solution, f.name)[which] for f in fields(Solution)))
-        return _Round(part, solution, self.noise[which], self.kind[which])
+        return _Round(
+            [values.rows(rows) for values in self.plain],
+            self.u_others[rows],
+            [values.rows(rows) for values in self.data],
+            solution,
+            self.noise[which],
+            self.kind[which],
+        )
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -90,8 +106,9 @@ def fit_realisations(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> J
     if not changed.any():
         return _judged(layout, first, levels, usable)
     rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
-    part = first.rows(rows)
-    second = _from_scatter(layout, part, _levels(layout, part, pieces), pieces)
+    second = first.rows(rows)
+    for _ in range(REWEIGHTINGS):
+        second = _from_scatter(layout, second, pieces)
     fit = _judged(layout, second, _levels(layout, second, pieces), usable[rows])
     if not rest.size:
         return fit
@@ -104,36 +121,47 @@ def fit_realisations(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> J
 def _from_noise(layout: JointLayout, u: ComplexArray, y: ComplexArray, records: int) -> _Round:
     """Weighted with the noise between harmonics, or, without any, as the layout says."""
     u_e, y_e = u.take(layout.excited_at, axis=1), y.take(layout.excited_at, axis=1)
+    u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
     problem, rows = layout.problem, u.shape[0]
+    one = np.ones((rows, 1))
     if layout.other_bins.size == 0:
-        one = np.ones((rows, 1))
         ratio = layout.input_noise_ratio or 0.0
         data = [BinData(y_e, u_e, one, ratio * one if ratio else None)]
-        batch = rows // records
-        noise = np.tile([1.0, ratio], (batch, 1))
+        noise = np.tile([1.0, ratio], (rows // records, 1))
         solution = minimise_shared(problem, data, records)
-        return _Round(data, solution, noise, np.zeros(batch, np.int64))
-    u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
-    one = np.ones((rows, 1))
-    data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
-    points = SharedPoints(problem, data, records)
-    theta = step_near(points, start_shared(problem, data, records), data, u_o, records)
+        return _Round(data, u_o, data, solution, noise, np.zeros(noise.shape[0], np.int64))
+    plain = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
+    points = SharedPoints(problem, plain, records)
+    theta = step_near(points, start_shared(problem, plain, records), plain, u_o, records)
     value = points.evaluate(theta)
-    bands = NoiseBands.of(layout.other_bins, layout.excited_bins, records)
-    noise_found = noise_of(layout, value.error_of(0), theta[:, 0], u_o, bands, records)
-    data = weighted(data, noise_found, bands, records)
-    if noise_found.through_input is None:
+    data, found = _with_noise(layout, plain, u_o, value.error_of(0), theta)
+    if found.through_input is None:
         points.weigh(data)
         solution = refine_shared(problem, points, data, theta, value)
     else:
         solution = minimise_shared(problem, data, records, theta)
-    kind = np.array([KINDS.index(name) for name in noise_found.kind])
-    return _Round(data, solution, noise_found.mean_variances, kind)
+    kind = np.array([KINDS.index(name) for name in found.kind])
+    return _Round(plain, u_o, data, solution, found.mean_variances, kind)
+
+
+def _with_noise(
+    layout: JointLayout,
+    plain: list[BinData],
+    u_others: ComplexArray,
+    error: ComplexArray,
+    theta: FloatArray,
+) -> tuple[list[BinData], JointNoise]:
+    """Data with the noise that errors (batch M, K_o) between harmonics show, and that noise."""
+    records = theta.shape[1]
+    bands = NoiseBands.of(layout.other_bins, layout.excited_bins, records)
+    noise = noise_of(layout, error, theta[:, 0], u_others, bands, records)
+    return weighted(plain, noise, bands, records), noise
 
 
 def _levels(layout: JointLayout, fitted: _Round, pieces: Pieces) -> Levels:
     by_piece = (fitted.kind == 2) & (fitted.share is not None)
-    return Levels.of(layout, fitted.solution, fitted.data[-1].u, pieces, by_piece)
+    variance = _residual_variance(layout, fitted)
+    return Levels.of(layout, fitted.solution, fitted.data[-1].u, variance, pieces, by_piece)
 
 
 def _weighted_wrongly(
@@ -156,9 +184,13 @@ def _weighted_wrongly(
 def _residual_variance(layout: JointLayout, fitted: _Round) -> FloatArray:
     """(batch, K_e) variance of the residuals of each realisation that is weighted with."""
     records = fitted.solution.theta.shape[1]
-    excited = fitted.data[-1].rows(slice(None, None, records))
-    variance = excited.residual_variance(_response(layout, fitted))
-    return np.broadcast_to(variance, (variance.shape[0], layout.excited_bins.size))
+    return _variance(fitted.data[-1], _response(layout, fitted), records)
+
+
+def _variance(excited: BinData, g: ComplexArray, records: int) -> FloatArray:
+    """(batch, K_e) variance of ``y - g u`` for a response g (batch, K_e): alike in all M rows."""
+    variance = excited.rows(slice(None, None, records)).residual_variance(g)
+    return np.broadcast_to(variance, g.shape)
 
 
 def _response(layout: JointLayout, fitted: _Round) -> ComplexArray:
@@ -168,40 +200,42 @@ def _response(layout: JointLayout, fitted: _Round) -> ComplexArray:
     return np.asarray(group.evaluate(1, beta) / group.evaluate(0, alpha))
 
 
-def _from_scatter(layout: JointLayout, fitted: _Round, levels: Levels, pieces: Pieces) -> _Round:
+def _from_scatter(layout: JointLayout, fitted: _Round, pieces: Pieces) -> _Round:
     """Excited lines weighted with what realisations differ by, and fitted again."""
-    records = fitted.solution.theta.shape[1]
+    theta = fitted.solution.theta
+    records = theta.shape[1]
     g = _response(layout, fitted)
     gain = g.real**2 + g.imag**2
-    weighted_with = _residual_variance(layout, fitted)
-    total, kind = smooth_variance(levels.line_variance * weighted_with, gain, pieces)
-    *others, excited = fitted.data
-    noise = fitted.noise
-    if others:
-        # no less than the noise, which the bins between harmonics tell better
-        level = levels.between[:, None]
-        known = weighted_with * level
-        variance_y = excited.variance_y + (np.maximum(total - known, 0) / level).repeat(
-            records, axis=0
-        )
-        excited = replace(excited, variance_y=variance_y)
+    levels = _levels(layout, fitted, pieces)
+    sample = levels.line_variance * _residual_variance(layout, fitted)
+    total, kind = smooth_variance(sample, gain, pieces)
+    if len(fitted.plain) > 1:
+        # of distorted lines with too large weights the transients were wrong, and so the noise
+        points = SharedPoints(layout.problem, fitted.plain, records)
+        error = points.evaluate(theta).error_of(0)
+        data, found = _with_noise(layout, fitted.plain, fitted.u_others, error, theta)
+        excited, noise = data[-1], found.mean_variances
+        known = _variance(excited, g, records)
+        more = np.maximum(total - known, 0).repeat(records, axis=0)
+        excited = replace(excited, variance_y=excited.variance_y + more)
         share = known / np.maximum(total, known)
     else:
-        ratio = layout.input_noise_ratio or 0.0
-        input_noise = levels.excited[:, None] * ratio
+        data, excited = [], fitted.plain[-1]
+        input_noise = levels.excited[:, None] * (layout.input_noise_ratio or 0.0)
         rest = np.maximum(total - input_noise * gain, 1e-3 * total)
         excited = BinData(
             excited.y,
             excited.u,
             rest.repeat(records, axis=0),
-            input_noise.repeat(records, axis=0) if ratio else None,
+            input_noise.repeat(records, axis=0) if layout.input_noise_ratio else None,
         )
         noise = np.stack([rest.mean(axis=-1), input_noise[:, 0]], axis=-1)
         share = np.ones_like(total)
-    data = [*others, excited]
+    data = [*data[:-1], excited]
     points = SharedPoints(layout.problem, data, records)
-    solution = refine_shared(layout.problem, points, data, fitted.solution.theta)
-    return _Round(data, solution, noise, kind, share.repeat(records, axis=0))
+    solution = refine_shared(layout.problem, points, data, theta)
+    share = share.repeat(records, axis=0)
+    return _Round(fitted.plain, fitted.u_others, data, solution, noise, kind, share)
 
 
 def _judged(layout: JointLayout, fitted: _Round, levels: Levels, usable: BoolArray) -> JointFit:

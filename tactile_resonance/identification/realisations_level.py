@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.arrow import ArrowInverse
+from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.joint_fit import student_variance
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
@@ -76,19 +77,34 @@ class Levels:
         layout: JointLayout,
         solution: Solution,
         u: ComplexArray,
+        variance: FloatArray,
         pieces: Pieces,
         by_piece: BoolArray,
     ) -> Levels:
-        """Levels of a fit with inputs (batch M, K_e) on the excited lines."""
+        """Levels of a fit.
+
+        Parameters
+        ----------
+        layout : JointLayout
+        solution : Solution
+        u : (batch M, K_e) complex
+            Input on excited lines.
+        variance : (batch, K_e) float
+            That these were weighted with.
+        pieces : Pieces
+        by_piece : (batch,) bool
+            Where that variance is from each of the pieces alone.
+        """
         a, b, _ = layout.problem.sizes
         shared = a + b
         batch, records, lines = solution.residual.shape
         scatter = Scatter.of(solution.residual, u.reshape(batch, records, lines))
         inverse = ArrowInverse.of(solution.normal.sum(axis=2), shared)
         used = inverse.leverage(solution.normal[:, :, -1])
-        # of the coefficients of each transient a part 1/M acts as a common error
-        own = np.clip(used - shared, 0, None)
-        excited_dof = np.maximum((records - 1) * (lines - own / (2 * records)), 0.5)
+        # what the transients take from a line: of each a part 1/M of what all have in common
+        taken = _taken_by_transients(layout, solution, variance)
+        line_dof = (records - 1) * np.maximum(1 - taken / (2 * records), 0.05)
+        excited_dof = np.maximum(line_dof.sum(axis=-1), 0.5)
         common_dof = np.maximum(records * lines - used / 2 - excited_dof, 0.5)
         excited = scatter.differing_cost / excited_dof
         between = between_dof = np.full(batch, np.nan)
@@ -119,7 +135,7 @@ class Levels:
             cost,
             expected,
             limit,
-            scatter.line_cost * (lines / excited_dof)[:, None],
+            scatter.line_cost / line_dof,
             np.where(by_piece, float(pieces.dof), 0.0),
         )
 
@@ -190,3 +206,25 @@ class Levels:
                 noise * (scale * student_variance(between_dof))[:, None, None],
                 total * (scale * student_variance(total_dof))[:, None, None],
             )
+
+
+def _taken_by_transients(
+    layout: JointLayout, solution: Solution, variance: FloatArray
+) -> FloatArray:
+    """(batch, K_e) real coefficients of all transients that go to each excited line.
+
+    Leverages with A and B as they are. A transient is large where the response is, and takes most
+    there.
+    """
+    a, b, own = layout.problem.sizes
+    group = layout.problem.groups[-1]
+    alpha, _, _ = layout.problem.split(solution.theta[:, 0])
+    size = group.evaluate(0, alpha)
+    basis = group.transient
+    assert basis is not None
+    blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
+    inverse = invert_normal(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
+    products = np.real(basis.conj()[:, :, None] * basis[:, None, :]).reshape(-1, own * own)
+    return (inverse.reshape(-1, own * own) @ products.T) / (
+        variance * (size.real**2 + size.imag**2)
+    )
