@@ -61,6 +61,13 @@ BROKEN = {
     "one spectrum": lambda m: m.sensor_real.extend([1.0] * LINES_HZ.size),
     "one variance": lambda m: m.sensor_variance.extend([1.0] * LINES_HZ.size),
     "bins short": lambda m: m.bins_sensor_imag.extend([1.0]),
+    "bins of no whole realisations": lambda m: [
+        setattr(m, "realisations", 2),
+        *(
+            getattr(m, f"bins_{name}").extend([1.0])
+            for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
+        ),
+    ],
     "bins without a rate": lambda m: [
         getattr(m, f"bins_{name}").extend([1.0])
         for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
