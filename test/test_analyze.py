@@ -190,7 +190,9 @@ def test_transients_of_several_realisations_do_no_harm(periods, tmp_path, capsys
     parts = [record(periods=periods, noise=1e-3, seed=m) for m in range(3)]
     content = {**parts[0]}
     w0 = 2 * np.pi * F0_HZ
-    decay = np.exp(w0 * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2)) * np.arange(periods * N) / RATE_HZ)
+    decay = np.exp(
+        w0 * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2)) * np.arange(periods * N) / RATE_HZ
+    )
     transients = [np.real(decay * np.exp(2j * m)) for m in range(3)]
     content["u"] = np.stack([part["u"] for part in parts]).reshape(3, periods, N)
     y = np.stack([part["y"] + more for part, more in zip(parts, transients, strict=True)])
@@ -208,7 +210,7 @@ def test_transients_of_several_realisations_do_no_harm(periods, tmp_path, capsys
     assert abs(found["damping_ratio"] - DAMPING) < 4 * std[1]
     assert cli.main([*arguments, "--method", "frf"]) == 0
     from_frf = json.loads(out.read_text())["poles"][0]
-    assert np.sqrt(from_frf["total_covariance"][0][0]) > 1.3 * std[0]
+    assert np.sqrt(from_frf["covariance"][0][0]) > 5 * std[0]
 
 
 def test_a_known_channel_delay_is_taken_out(tmp_path, capsys):

@@ -93,7 +93,8 @@ class JointPlan(JointLayout):
         if u.shape == y.shape:
             return u, y
         shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
-        return tuple(np.broadcast_to(v, (*shape, self.bins.size)) for v in (u, y))
+        whole = (*shape, self.bins.size)
+        return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
 
 
 def result_of(

@@ -22,7 +22,9 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def systematic_of(layout: JointLayout, data: list[BinData], theta: FloatArray) -> FloatArray:
-    """Outer products of what halves of the excited bins, and one mode more, move each pole by.
+    """Outer products of what halves of the data, and one mode more, move each pole by.
+
+    Halves are those of the excited bins and, of several realisations, the first and the last ones.
 
     Parameters
     ----------
@@ -44,6 +46,8 @@ def systematic_of(layout: JointLayout, data: list[BinData], theta: FloatArray) -
         half = replace(excited, variance_y=np.where(left_out, np.inf, excited.variance_y))
         poles.append(layout.poles_in_band(_fit(layout.problem, [*other, half], theta.shape, theta)))
     systematic = difference_of_halves(*poles)
+    if theta.ndim == 3:
+        systematic = systematic + _of_realisations(layout, data, theta)
     if layout.richer is not None:
         found = _fit(layout.richer.problem, [*other, excited], theta.shape, None)
         first = theta if theta.ndim == 2 else theta[:, 0]
@@ -51,6 +55,18 @@ def systematic_of(layout: JointLayout, data: list[BinData], theta: FloatArray) -
             layout.poles_in_band(first), layout.richer.poles_in_band(found)
         )
     return systematic
+
+
+def _of_realisations(layout: JointLayout, data: list[BinData], theta: FloatArray) -> FloatArray:
+    """(batch, places, 2, 2) what the first and the last realisations make of the poles."""
+    batch, records, _ = theta.shape
+    order = np.arange(batch * records) % records
+    poles = []
+    for part in (order < records // 2, order >= records - records // 2):
+        start = theta.reshape(batch * records, -1)[part].reshape(batch, records // 2, -1)
+        half = [values.rows(part) for values in data]
+        poles.append(layout.poles_in_band(_fit(layout.problem, half, start.shape, start)))
+    return difference_of_halves(*poles)
 
 
 def _fit(

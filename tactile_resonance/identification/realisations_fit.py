@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_fit import ROUNDED, JointFit, mean_power
@@ -29,7 +30,7 @@ from tactile_resonance.identification.shared_points import (
     start_shared,
 )
 from tactile_resonance.identification.solver import Solution
-from tactile_resonance.identification.whiteness import are_smooth
+from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, are_smooth, whiteness
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -161,7 +162,9 @@ def _with_noise(
 def _levels(layout: JointLayout, fitted: _Round, pieces: Pieces) -> Levels:
     by_piece = (fitted.kind == 2) & (fitted.share is not None)
     variance = _residual_variance(layout, fitted)
-    return Levels.of(layout, fitted.solution, fitted.data[-1].u, variance, pieces, by_piece)
+    u = fitted.data[-1].u
+    assert u is not None
+    return Levels.of(layout, fitted.solution, u, variance, pieces, by_piece)
 
 
 def _weighted_wrongly(
@@ -244,7 +247,8 @@ def _judged(layout: JointLayout, fitted: _Round, levels: Levels, usable: BoolArr
     batch, records, _ = solution.theta.shape
     a, b, _ = layout.problem.sizes
     common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
-    suspect = are_smooth(common, layout.structure.parameters)
+    drifting = _differ_smoothly(levels.scatter.turned, layout.structure.parameters)
+    suspect = are_smooth(common, layout.structure.parameters) | drifting
     if suspect.any():  # what rounding leaves of exact data says nothing
         floor = ROUNDED * mean_power(excited.y).reshape(batch, records).mean(axis=1)
         variance = levels.excited[:, None] * _residual_variance(layout, fitted)
@@ -276,6 +280,16 @@ def _judged(layout: JointLayout, fitted: _Round, levels: Levels, usable: BoolArr
         residual=common,
         systematic=systematic,
     )
+
+
+def _differ_smoothly(differing: ComplexArray, parameters: int) -> BoolArray:
+    """(batch,) whether a realisation (batch, M, K) departs from the others as another system would.
+
+    Noise and distortion are independent from line to line. The chance of one in a thousand is
+    shared by the realisations.
+    """
+    limit = -special.ndtri(special.ndtr(-SMOOTH_RESIDUAL) / differing.shape[1])
+    return np.asarray((whiteness(differing, parameters) > limit).any(axis=1))
 
 
 def _noise_normal(layout: JointLayout, fitted: _Round) -> FloatArray:

@@ -158,4 +158,4 @@ def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
             f"residuals smooth over the lines (whiteness {batch.whiteness[index]:.1f} where "
             f"noise makes {SMOOTH_RESIDUAL} at most)"
         )
-    return ", ".join(found)
+    return ", ".join(found) or "realisations differ smoothly over the lines, as systems would"

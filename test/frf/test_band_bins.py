@@ -62,4 +62,6 @@ def test_what_cannot_be_sent_is_refused():
                 np.arange(1, 9000), 20000, sample_rate_hz=50e3, band_hz=band, max_periods=8
             )
     with pytest.raises(ValueError, match="bins to 100"):
-        BandBins(91, np.zeros((1, 10), complex), np.zeros((1, 10), complex), np.arange(1), 50.0, 64, 3)
+        BandBins(
+            91, np.zeros((1, 10), complex), np.zeros((1, 10), complex), np.arange(1), 50.0, 64, 3
+        )
