@@ -82,7 +82,8 @@ def grid_table(runs: int) -> list[str]:
         f"ratios: {mean:.3f}; worst {max(np.max(cell.ratio) for cell in cells):.3f}; coverage "
         f"{min(covered):.4f} to {max(covered):.4f}; failed fits: "
         f"{sum(cell.failed for cell in cells)}. Alarms: fits that claim a model error, of which "
-        f"there is none here; {alarms:.2g} in a thousand over all cells.",
+        f"there is none here; {alarms:.2g} in a thousand over all cells, three tests of one in a "
+        "thousand each.",
         "",
         "| realisations | periods | damping | SNR | distortion over noise | MSE | coverage, total "
         "| coverage, noise | alarms |",

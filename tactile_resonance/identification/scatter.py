@@ -130,11 +130,11 @@ def smooth_variance(
     kind = model_variance(pieces.means(sample), pieces.dof, pieces.means(gain)).kind
     every = np.ones(sample.shape, bool)
     variance = two_channels(sample, gain, every)
-    for which, curve in (
-        (1, lambda values: log_linear(values, every[: values.shape[0]])),
-        (2, lambda values: pieces.means(values)[:, pieces.of_line]),
-    ):
-        rows = kind == which
-        if rows.any():
-            variance[rows] = curve(sample[rows])
+    sloped, each = kind == 1, kind == 2
+    if sloped.any():  # with noise of both channels, whose sum follows the resonance
+        curve = log_linear(sample[sloped], every[sloped])
+        more = two_channels(sample[sloped] / curve, gain[sloped], every[sloped])
+        variance[sloped] = curve * more
+    if each.any():
+        variance[each] = pieces.means(sample[each])[:, pieces.of_line]
     return variance, kind
