@@ -36,7 +36,7 @@ class JointFit:
     Attributes
     ----------
     theta : (batch, n) float
-        Coefficients [A without its last, B, C].
+        Coefficients [A without its last, B, C]; of several records the C of each.
     covariance : (batch, n, n) float
         Of them, from noise; NaN where noise cannot be told from all else. Of several realisations
         of the coefficients that they share.
