@@ -25,14 +25,9 @@ from benchmarks.poles_methods import (
     joint_plan,
     local_polynomial_spectra,
 )
-from benchmarks.poles_plant import (
-    BAND_HZ,
-    Plant,
-    judge,
-)
-from tactile_resonance.identification.identify import (
-    identify_spectra,
-)
+from benchmarks.poles_plant import BAND_HZ, Plant, judge
+from benchmarks.poles_realisations import grid_table
+from tactile_resonance.identification.identify import identify_spectra
 from tactile_resonance.identification.result import PolesBatch, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -44,7 +39,7 @@ CHUNK = 1000
 MARGIN_HZ = 30.0
 
 
-PARTS = ("methods", "bias", "grid")
+PARTS = ("methods", "bias", "grid", "realisations")
 
 
 def run(output: Path, quick: bool, part: str | None = None) -> str:
@@ -55,15 +50,16 @@ def run(output: Path, quick: bool, part: str | None = None) -> str:
     output : Path
         Folder, made if need be.
     quick : bool
-        A thinned Monte Carlo: 500 runs a cell instead of 20 000.
-    part : {"methods", "bias", "grid"}, optional
+        A thinned Monte Carlo: 500 runs a cell instead of 20 000, of realisations instead of 3000.
+    part : {"methods", "bias", "grid", "realisations"}, optional
         Renew this table alone, the others stay as they are in `output`. All when absent.
     """
     output.mkdir(parents=True, exist_ok=True)
     page = output / "poles.md"
-    sections = [_heading(quick), [], [], []]
+    sections = [_heading(quick), *([] for _ in PARTS)]
     if part is not None:
-        sections[1:] = _sections(page.read_text(encoding="utf-8"))[1:]
+        there = _sections(page.read_text(encoding="utf-8"))
+        sections[1 : len(there)] = there[1:]
     for k, name in enumerate(PARTS, 1):
         if part in (None, name):
             sections[k] = _measured(name, output, quick)
@@ -80,6 +76,8 @@ def _measured(part: str, output: Path, quick: bool) -> list[str]:
         return _method_table(methods)
     if part == "bias":
         return _bias_table()
+    if part == "realisations":
+        return grid_table(500 if quick else 3000)
     runs = 500 if quick else 20000
     cells = [
         measure_cell(Plant(zeta, snr, periods), runs)
@@ -269,7 +267,7 @@ def _grid_table(cells: list[Cell], runs: int) -> list[str]:
             f"| {c.ratio[0]:.3f}, {c.ratio[1]:.3f} | {c.coverage:.4f} "
             f"| {c.failed} | {c.alarms} | {elis} | {covered} |"
         )
-    return rows
+    return [*rows, ""]
 
 
 def _figure(methods: list[Method], path: Path) -> None:

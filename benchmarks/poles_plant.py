@@ -114,27 +114,59 @@ class Plant:
         in steady state and known to be. Unknown noise levels change neither: their score is
         uncorrelated with those of the other parameters. The unknown true input is eliminated.
         """
-        bins = self.bins()
-        theta = self.theta
-        free = theta.size if transient else 5
+        jacobian, variance = self.derivatives()
+        if not transient:
+            jacobian = jacobian[:, :5] * (self.bins() % self.periods == 0)[:, None]
+        return _inverse_information(jacobian, variance)
+
+    def derivatives(self) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
+        """(K, 7) derivative of Y by theta on the bins of the band, and (K,) variance of ``Y - G U``."""
+        bins, theta = self.bins(), self.theta
         columns = []
-        for k in range(free):
+        for k in range(theta.size):
             step = 1e-6 * (abs(theta[k]) if k < 5 else np.hypot(*theta[5:]))
             up, down = theta.copy(), theta.copy()
             up[k] += step
             down[k] -= step
             columns.append((self.output(bins, up) - self.output(bins, down)) / (2 * step))
-        jacobian = np.stack(columns, axis=-1)
         variance_y, variance_u = self.noise
         excited = bins % self.periods == 0
         s = 2j * np.pi * bins * (SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD / self.periods)
-        variance = variance_y + np.where(excited, np.abs(response(theta, s)) ** 2, 0) * variance_u
-        if not transient:
-            jacobian = jacobian * excited[:, None]
-        scale = np.sqrt(np.sum(np.abs(jacobian) ** 2 / variance[:, None], axis=0))
-        scaled = jacobian / np.sqrt(variance)[:, None] / scale
-        information = 2 * np.real(scaled.conj().T @ scaled)
-        return (np.linalg.inv(information) / np.outer(scale, scale))[:2, :2]
+        gain = np.where(excited, np.abs(response(theta, s)) ** 2, 0)
+        return np.stack(columns, axis=-1), variance_y + gain * variance_u
+
+
+def bound_of_realisations(plants: list[Plant], distortion: float = 0.0) -> npt.NDArray[np.float64]:
+    """(2, 2) Cramer-Rao bound of (f0, damping) from records of one plant, other phases in each.
+
+    Every initial state is unknown. Unknown levels change nothing, see `Plant.bound`.
+
+    Parameters
+    ----------
+    plants : list of Plant
+        Which differ in their seeds.
+    distortion : float
+        Variance of an independent error of Y on excited bins.
+    """
+    rows, variances = [], []
+    for m, plant in enumerate(plants):
+        of_one, variance = plant.derivatives()
+        row = np.zeros((of_one.shape[0], 5 + 2 * len(plants)), complex)
+        row[:, :5] = of_one[:, :5]
+        row[:, 5 + 2 * m : 7 + 2 * m] = of_one[:, 5:]
+        rows.append(row)
+        variances.append(variance + distortion * (plant.bins() % plant.periods == 0))
+    return _inverse_information(np.concatenate(rows), np.concatenate(variances))
+
+
+def _inverse_information(
+    jacobian: npt.NDArray[np.complex128], variance: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """(2, 2) block of the first two parameters."""
+    scale = np.sqrt(np.sum(np.abs(jacobian) ** 2 / variance[:, None], axis=0))
+    scaled = jacobian / np.sqrt(variance)[:, None] / scale
+    information = 2 * np.real(scaled.conj().T @ scaled)
+    return (np.linalg.inv(information) / np.outer(scale, scale))[:2, :2]
 
 
 def pole_and_residue(system: npt.NDArray) -> tuple[complex, complex]:

@@ -72,8 +72,9 @@ def analyse(
     frf_method : str
         See `frf.estimate.estimate_frf`.
     poles_method : {"auto", "joint", "frf"}
-        Poles from all bins of the band together with the transient (`identification.joint`; one
-        realisation), or from the FRF. ``auto`` takes the first where there is one realisation.
+        Poles from all bins of the band together with the transients (`identification.joint`, of
+        several realisations `identification.realisations`), or from the FRF. ``auto`` takes the
+        first unless there is a channel delay to be taken out.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.
     channel_delay_s : float
@@ -122,7 +123,7 @@ def analyse(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
     if poles_method == "auto":
-        poles_method = "joint" if recording.u.shape[0] == 1 and not channel_delay_s else "frf"
+        poles_method = "frf" if channel_delay_s else "joint"
     poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
     identified = time.perf_counter()
     distortion = None
@@ -168,13 +169,9 @@ def _poles(
         raise ValueError("method: joint takes no channel delay, use frf")
     if method == "frf":
         return identify_poles(frf, band_hz, structure)
-    if recording.u.shape[0] > 1:
-        raise ValueError(
-            f"method: joint takes one realisation, the record has {recording.u.shape[0]}; use frf"
-        )
     return identify_poles_from_records(
-        recording.u[0],
-        recording.y[0],
+        recording.u,
+        recording.y,
         sample_rate_hz=recording.sample_rate_hz,
         harmonics=harmonics,
         band_hz=band_hz,

@@ -184,13 +184,33 @@ def test_every_method_agrees_with_the_truth(options, domain, tmp_path, capsys):
     assert std[0] < 0.05
 
 
-def test_joint_method_takes_one_realisation(tmp_path, capsys):
-    content = record(periods=8)
-    for name in "uy":
-        content[name] = content[name].reshape(2, 4, N)
+@pytest.mark.parametrize("periods", [1, 3])
+def test_transients_of_several_realisations_do_no_harm(periods, tmp_path, capsys):
+    """Each begins with a decay of its own, far above the noise, of which their mean FRF keeps some."""
+    parts = [record(periods=periods, noise=1e-3, seed=m) for m in range(3)]
+    content = {**parts[0]}
+    w0 = 2 * np.pi * F0_HZ
+    decay = np.exp(
+        w0 * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2)) * np.arange(periods * N) / RATE_HZ
+    )
+    transients = [np.real(decay * np.exp(2j * m)) for m in range(3)]
+    content["u"] = np.stack([part["u"] for part in parts]).reshape(3, periods, N)
+    y = np.stack([part["y"] + more for part, more in zip(parts, transients, strict=True)])
+    content["y"] = y.reshape(3, periods, N)
     np.savez(tmp_path / "a.npz", **content)
-    assert cli.main(["analyze", str(tmp_path / "a.npz"), "--method", "joint"]) == 1
-    assert "joint takes one realisation, the record has 2" in capsys.readouterr().err
+    out = tmp_path / "out.json"
+    arguments = ["analyze", str(tmp_path / "a.npz"), "--band", "200", "300", "--json", str(out)]
+    assert cli.main(arguments) == 0
+    answer = json.loads(out.read_text())
+    assert answer["method"] == "joint maximum likelihood of poles and transients, 3 realisations"
+    assert answer["status"] == "ok"
+    found = answer["poles"][0]
+    std = np.sqrt(np.diag(found["total_covariance"]))
+    assert abs(found["f0_hz"] - F0_HZ) < 4 * std[0]
+    assert abs(found["damping_ratio"] - DAMPING) < 4 * std[1]
+    assert cli.main([*arguments, "--method", "frf"]) == 0
+    from_frf = json.loads(out.read_text())["poles"][0]
+    assert np.sqrt(from_frf["covariance"][0][0]) > 5 * std[0]
 
 
 def test_a_known_channel_delay_is_taken_out(tmp_path, capsys):

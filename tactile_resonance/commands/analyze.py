@@ -81,8 +81,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--method",
         choices=POLES_METHODS,
         default="auto",
-        help="poles from all bins together with the transient (joint, one realisation) or from the "
-        "FRF (default: joint where there is one realisation)",
+        help="poles from all bins together with the transients (joint) or from the FRF (default: "
+        "joint, with --channel-delay frf)",
     )
     parser.add_argument(
         "--frf",

@@ -82,8 +82,8 @@ class BandBinsStream:
         u, y = values[:, (every >= first) & (every <= last)] / (self._samples_per_period * periods)
         return BandBins(
             first,
-            u,
-            y,
+            u[None],
+            y[None],
             self.harmonics,
             self._sample_rate_hz,
             self._samples_per_period,

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tactile_resonance.frf.band_bins_stream import BandBinsStream
+from tactile_resonance.frf.band_bins import BandBins, stacked_bins
+from tactile_resonance.frf.band_bins_stream import MOST_BINS, BandBinsStream
 from tactile_resonance.frf.fault_types import Fault, FaultKind, FaultReport
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -28,7 +29,8 @@ class MeasurementFrf:
     order, dof : int
         Of the local polynomial method.
     bins_band_hz : (low, high), optional
-        All bins of this band go with the FRF while there is one realisation.
+        All bins of this band go with the FRF, as long as all realisations have as many periods and
+        the bins of all are no more than `band_bins_stream.MOST_BINS`.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class MeasurementFrf:
         self._bins_band_hz = bins_band_hz
         self._stream: FrfStream | None = None
         self._bins: BandBinsStream | None = None
+        self._finished_bins: list[BandBins] = []
         self._realisation = -1
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
@@ -145,7 +148,7 @@ class MeasurementFrf:
         """Periods (P, N) that follow those of the same realisation without a gap."""
         if realisation != self._realisation and stream.periods:
             stream.next_realisation()
-            self._bins = None  # several realisations speak through their mean FRF
+            self._put_bins_aside()
         self._realisation = realisation
         for period_u, period_y in zip(u, y, strict=True):
             single = stream.add_period(period_u, period_y)
@@ -157,7 +160,26 @@ class MeasurementFrf:
             if self._bins is not None:
                 self._frf = replace(single, bins=self._bins.bins())
         elif stream.periods >= max(self._periods.values()):
-            self._frf = stream.robust().frf
+            self._frf = replace(stream.robust().frf, bins=self._all_bins())
+
+    def _put_bins_aside(self) -> None:
+        """Those of the present realisation, before the next one begins."""
+        if self._bins is None:
+            return
+        bins = self._bins.bins()
+        if bins is None:
+            self._bins = None
+            return
+        self._finished_bins.append(bins)
+        self._bins.clear()
+
+    def _all_bins(self) -> BandBins | None:
+        """Of all realisations; None where they differ in periods, or are too many to travel along."""
+        now = None if self._bins is None else self._bins.bins()
+        if now is None:
+            return None
+        bins = stacked_bins([*self._finished_bins, now])
+        return None if bins is None or bins.u.size > MOST_BINS else bins
 
     def _check(self, u: np.ndarray, y: np.ndarray, excitation: Excitation) -> None:
         """Keep the worst fault of each kind that one block (P, N) shows by itself."""

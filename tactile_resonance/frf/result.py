@@ -47,7 +47,7 @@ class FRF:
     spectra_covariance : (..., 2, 2, F) complex or None
         Noise covariance of these means [V^2].
     bins : BandBins or None
-        All bins of a band of the record behind G, where asked for and from one realisation.
+        All bins of a band of the records behind G, where asked for: of as many realisations.
     periods, realisations : int
         How many were used.
     method : str

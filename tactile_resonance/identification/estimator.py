@@ -64,7 +64,9 @@ def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelSt
     """Why there can be no joint estimate; empty where there can."""
     bins = frf.bins
     if bins is None:
-        return "the FRF brings no bins: it is from several realisations, or they were not asked for"
+        return (
+            "the FRF brings no bins: they were not asked for, or its realisations differ in periods"
+        )
     low_hz, high_hz = bins.band_hz
     margin = bins.resolution_hz * (1 + 1e-9)  # the band's ends need not lie on bins
     if band_hz[0] <= low_hz - margin or band_hz[1] >= high_hz + margin:

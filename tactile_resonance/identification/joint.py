@@ -75,53 +75,74 @@ class JointPlan(JointLayout):
         u, y : (..., K) complex
             At ``bins``.
         """
+        u, y = self._checked(u, y)
+        shape = y.shape[:-1]
+        flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
+        chunk = self.problem.chunk
+        starts = range(0, max(flat_u.shape[0], 1), chunk)
+        parts = [fit_bins(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts]
+        return result_of(self, JointFit.joined(parts), shape, METHOD, self.level_known)
+
+    def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Bins of both channels, of one shape (..., K)."""
         for name, values in (("u", u), ("y", y)):
             if values.shape[-1:] != self.bins.shape:
                 raise ValueError(
                     f"{name}: shape {values.shape}, expected (..., {self.bins.size}) bins"
                 )
+        if u.shape == y.shape:
+            return u, y
         shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
-        if u.shape != y.shape:
-            u, y = (np.broadcast_to(v, (*shape, self.bins.size)) for v in (u, y))
-        flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
-        chunk = self.problem.chunk
-        starts = range(0, max(flat_u.shape[0], 1), chunk)
-        parts = [fit_bins(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts]
-        return self._result(JointFit.joined(parts), shape)
+        whole = (*shape, self.bins.size)
+        return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
 
-    def _result(self, fit: JointFit, shape: tuple[int, ...]) -> PolesBatch:
-        a, b, _ = self.problem.sizes
-        theta = fit.theta
-        model = RationalModel(
-            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-            numerator=theta[:, a : a + b],
-            transient=theta[:, a + b :],
-            variable=self.variable,
-            denominator_basis=self.denominator_basis,
-            numerator_basis=self.numerator_basis,
-        )
-        lines_fit = LinesFit(
-            model, fit.cost, fit.covariance, fit.condition, fit.converged, fit.residual
-        )
-        known = self.other_bins.size > 0 or self.input_noise_ratio is not None
-        unknown = np.full_like(fit.covariance, np.nan)
-        evidence = Evidence(
-            lines_fit,
-            np.where(fit.usable, self.excited_bins.size, 0),
-            fit.usable,
-            fit.cost,
-            fit.expected,
-            fit.suspect,
-            fit.covariance if known else unknown,
-            unknown if known else fit.covariance,
-            fit.kind,
-            known,
-            fit.noise,
-        )
-        if evidence.suspect.any():
-            evidence = evidence.with_model_error(fit.covariance)
-        result = assemble(evidence, self.structure, self.band_hz, shape, METHOD)
-        if evidence.suspect.any():
-            total = result.total_covariance
-            total += fit.systematic.reshape(total.shape)
-        return result
+
+def result_of(
+    layout: JointLayout, fit: JointFit, shape: tuple[int, ...], method: str, level_known: bool
+) -> PolesBatch:
+    """What a batch of fits is worth.
+
+    Parameters
+    ----------
+    layout : JointLayout
+    fit : JointFit
+    shape : tuple of int
+        Leading axes, of as many points as the batch has.
+    method : str
+    level_known : bool
+        Whether the level of the noise is told by more than the residuals.
+    """
+    a, b, _ = layout.problem.sizes
+    theta = fit.theta
+    model = RationalModel(
+        denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
+        numerator=theta[:, a : a + b],
+        transient=theta[:, a + b :],
+        variable=layout.variable,
+        denominator_basis=layout.denominator_basis,
+        numerator_basis=layout.numerator_basis,
+    )
+    lines_fit = LinesFit(
+        model, fit.cost, fit.covariance, fit.condition, fit.converged, fit.residual
+    )
+    evidence = Evidence(
+        lines_fit,
+        np.where(fit.usable, layout.excited_bins.size, 0),
+        fit.usable,
+        fit.cost,
+        fit.expected,
+        fit.suspect,
+        fit.covariance,
+        fit.total,
+        fit.kind,
+        level_known,
+        fit.noise,
+    )
+    if evidence.suspect.any():
+        known = np.isfinite(fit.total)
+        evidence = evidence.with_model_error(np.where(known, fit.total, fit.covariance))
+    result = assemble(evidence, layout.structure, layout.band_hz, shape, method)
+    if evidence.suspect.any():
+        total = result.total_covariance
+        total += fit.systematic.reshape(total.shape)
+    return result

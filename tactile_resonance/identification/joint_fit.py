@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -14,20 +13,11 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import invert_normal
 from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
-from tactile_resonance.identification.joint_noise import (
-    BINS_PER_BAND,
-    JointNoise,
-    noise_between_harmonics,
-    rough_noise,
-)
-from tactile_resonance.identification.many_points import ManyValues
-from tactile_resonance.identification.model_error import (
-    MODEL_ERROR_PROBABILITY,
-    difference_of_halves,
-    difference_of_models,
-)
+from tactile_resonance.identification.joint_model_error import systematic_of
+from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
+from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
+from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import f_quantile
-from tactile_resonance.identification.one_point import OneValue
 from tactile_resonance.identification.solver import Solution, minimise, refine
 from tactile_resonance.identification.whiteness import are_smooth
 
@@ -46,9 +36,12 @@ class JointFit:
     Attributes
     ----------
     theta : (batch, n) float
-        Coefficients [A without its last, B, C].
+        Coefficients [A without its last, B, C]; of several records the C of each.
     covariance : (batch, n, n) float
-        Of them, from noise.
+        Of them, from noise; NaN where noise cannot be told from all else. Of several realisations
+        of the coefficients that they share.
+    total : same shape
+        From noise and distortion; NaN where nothing but noise is known.
     condition : (batch,) float
     converged, usable : (batch,) bool
         Usable are points whose bins are all finite.
@@ -69,6 +62,7 @@ class JointFit:
 
     theta: FloatArray
     covariance: FloatArray
+    total: FloatArray
     condition: FloatArray
     converged: BoolArray
     usable: BoolArray
@@ -79,6 +73,10 @@ class JointFit:
     kind: npt.NDArray[np.str_]
     residual: ComplexArray
     systematic: FloatArray
+
+    def rows(self, which: npt.NDArray[np.int64]) -> JointFit:
+        """Some of the points."""
+        return JointFit(*(getattr(self, f.name)[which] for f in fields(JointFit)))
 
     @classmethod
     def joined(cls, parts: list[JointFit]) -> JointFit:
@@ -128,11 +126,11 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
         data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
         points = problem.points(data)
-        theta = _near(layout, points, data, u_o)
+        theta = step_near(points, problem.start(points, data), data, u_o)
         value = points.evaluate(theta)
         theta = theta.reshape(batch, -1)
-        noise = _noise(layout, value, theta, u_o)
-        kind, data = noise.kind, _weighted(layout, data, noise)
+        noise = noise_of(layout, value.error_of(0), theta, u_o, layout.noise_bands)
+        kind, data = noise.kind, weighted(data, noise, layout.noise_bands)
         if noise.through_input is None:
             points.weigh(data)
             solution = refine(points, theta, value)
@@ -147,15 +145,20 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     residual = data[-1].turned(solution.residual) / np.sqrt(level.scale)[:, None]
     suspect = are_smooth(residual, layout.structure.parameters)
     if suspect.any():  # what rounding leaves of exact data says nothing
-        suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * _power(y_e)
+        suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * mean_power(y_e)
     suspect |= level.suspect
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     if suspect.any():
-        systematic[suspect] = _systematic(layout, data, solution.theta, suspect)
+        part = [values.rows(suspect) for values in data]
+        systematic[suspect] = systematic_of(layout, part, solution.theta[suspect])
     # real and imaginary part of a circular complex error have half its variance each
+    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
+    unknown = np.full_like(covariance, np.nan)
+    known = layout.level_known
     return JointFit(
         theta=solution.theta,
-        covariance=inverse * (0.5 * level.scale * level.correction)[:, None, None],
+        covariance=covariance if known else unknown,
+        total=unknown if known else covariance,
         condition=condition,
         converged=solution.converged,
         usable=usable,
@@ -182,7 +185,7 @@ def _level_from_residuals(layout: JointLayout, solution: Solution) -> _Level:
         nothing,
         np.zeros(batch, bool),
         np.stack([level, ratio * level], axis=-1),
-        np.full(batch, _student_variance(dof)),
+        np.full(batch, student_variance(dof)),
     )
 
 
@@ -219,89 +222,15 @@ def _level_from_others(
         expected,
         suspect,
         noise.mean_variances * level[:, None],
-        _student_variance(dof),
+        student_variance(dof),
     )
 
 
-def _student_variance(dof):
+def student_variance(dof):
     """Variance of Student's distribution for a level of `dof` complex degrees of freedom."""
     return np.where(dof > 1, dof / (dof - 1), np.nan)
 
 
-def _near(layout: JointLayout, points: Any, data: list[BinData], u_o: ComplexArray) -> FloatArray:
-    """(n,) or (batch, n) one undamped step from start values: residuals are then all but noise.
-
-    With weights as the errors show them at the start.
-    """
-    theta = layout.problem.start(points, data)
-    value = points.evaluate(theta)
-    variance_y, variance_u = rough_noise(value.error_of(0), u_o)
-    others, excited = data
-    points.weigh(
-        [
-            BinData(others.y, None, variance_y),
-            BinData(excited.y, excited.u, variance_y, variance_u),
-        ]
-    )
-    gradient, normal = points.normals(points.weight(value))
-    moved = theta - points.step(normal, gradient)[0]
-    return np.where(np.isfinite(moved).all(axis=-1, keepdims=True), moved, theta)
-
-
-def _noise(
-    layout: JointLayout, value: OneValue | ManyValues, theta: FloatArray, u_o: ComplexArray
-) -> JointNoise:
-    """The noise that the bins between harmonics show."""
-    error = value.error_of(0)
-
-    def response() -> ComplexArray:
-        alpha, beta, _ = layout.problem.split(theta)
-        return np.asarray(
-            (beta @ layout.numerator_on_others.T) / (alpha @ layout.problem.groups[0].denominator.T)
-        )
-
-    return noise_between_harmonics(
-        error, u_o, response, layout.noise_bands, layout.problem.sizes[2]
-    )
-
-
-def _weighted(layout: JointLayout, data: list[BinData], noise: JointNoise) -> list[BinData]:
-    """Data with the variances of their noise, and without what came through the input."""
-    others, excited = data
-    bands = layout.noise_bands
-    y_o = others.y if noise.through_input is None else others.y - noise.through_input
-    return [
-        BinData(y_o, None, noise.on(bands.of_others, noise.variance_rest)),
-        BinData(
-            excited.y,
-            excited.u,
-            noise.on(bands.of_excited, noise.variance_y),
-            noise.on(bands.of_excited, noise.variance_u),
-            noise.covariance_yu,
-        ),
-    ]
-
-
-def _systematic(
-    layout: JointLayout, data: list[BinData], theta: FloatArray, rows: BoolArray
-) -> FloatArray:
-    """(rows, places, 2, 2) what halves of the excited bins, and one mode more, make of the poles."""
-    *other, excited = (values.rows(rows) for values in data)
-    poles = []
-    for parity in (0, 1):
-        left_out = np.arange(excited.y.shape[1]) % 2 == parity
-        half = replace(excited, variance_y=np.where(left_out, np.inf, excited.variance_y))
-        found = minimise(layout.problem, [*other, half], theta[rows]).theta
-        poles.append(layout.poles_in_band(found))
-    systematic = difference_of_halves(*poles)
-    if layout.richer is not None:
-        found = minimise(layout.richer.problem, [*other, excited]).theta
-        systematic = systematic + difference_of_models(
-            layout.poles_in_band(theta[rows]), layout.richer.poles_in_band(found)
-        )
-    return systematic
-
-
-def _power(values: ComplexArray) -> FloatArray:
+def mean_power(values: ComplexArray) -> FloatArray:
     """(batch,) mean square."""
     return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1))

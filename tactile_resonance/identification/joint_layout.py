@@ -114,19 +114,20 @@ class JointLayout:
             frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
         )
         groups = [BinGroup(denominator.values[excited], numerator.values, transient[excited])]
-        if not excited.all():
-            groups.insert(0, BinGroup(denominator.values[~excited], None, transient[~excited]))
+        others = self._between(bins, excited)
+        if others.any():
+            groups.insert(0, BinGroup(denominator.values[others], None, transient[others]))
         fields = {
             "transient_terms": terms,
             "bins": bins,
             "excited_bins": bins[excited],
-            "other_bins": bins[~excited],
+            "other_bins": bins[others],
             "problem": Problem(tuple(groups)),
             "variable": variable,
             "denominator_basis": denominator,
             "numerator_basis": numerator,
-            "numerator_on_others": numerator.at(x[~excited])[0],
-            "noise_bands": NoiseBands.of(bins, excited),
+            "numerator_on_others": numerator.at(x[others])[0],
+            "noise_bands": NoiseBands.of(bins[others], bins[excited]),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -140,6 +141,11 @@ class JointLayout:
     def others_at(self) -> IntArray:
         """(K_o,) place of the other bins among all."""
         return self.other_bins - self.bins[0]
+
+    @property
+    def level_known(self) -> bool:
+        """Whether the noise of one record is told by more than the residuals."""
+        return self.other_bins.size > 0 or self.input_noise_ratio is not None
 
     @cached_property
     def richer(self) -> JointLayout | None:
@@ -161,6 +167,10 @@ class JointLayout:
         """(batch, places) poles [rad/s] of coefficients (batch, n)."""
         roots = self.denominator_basis.roots(self.problem.split(theta)[0])
         return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
+
+    def _between(self, bins: IntArray, excited: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """(K,) which bins show transient and noise alone."""
+        return ~excited
 
     def _check(self) -> None:
         for name in ("sample_rate_hz", "samples_per_period", "periods"):

@@ -32,26 +32,37 @@ class NoiseBands:
     of_others, of_excited : (K_o,), (K_e,) int
         Which piece a bin belongs to.
     starts : (pieces,) int
-        First of the other bins in each piece.
+        First of the values on other bins in each piece.
     counts : (pieces,) int
+        Values in each.
+    dof : int
+        Complex degrees of freedom of the variance of a piece.
     """
 
     of_others: IntArray
     of_excited: IntArray
     starts: IntArray
     counts: IntArray
+    dof: int
 
     @classmethod
-    def of(cls, bins: IntArray, excited: npt.NDArray[np.bool_]) -> NoiseBands:
-        """Pieces of `BINS_PER_BAND` other bins each, the last one longer."""
-        others = int(np.sum(~excited))
-        pieces = max(1, others // BINS_PER_BAND)
-        starts = np.arange(pieces) * BINS_PER_BAND
-        of_others = np.minimum(np.arange(others) // BINS_PER_BAND, pieces - 1)
-        place = np.searchsorted(bins[~excited], bins[excited])
-        of_excited = np.minimum(place // BINS_PER_BAND, pieces - 1)
-        counts = np.diff(np.append(starts, others))
-        return cls(of_others, of_excited, starts, counts)
+    def of(cls, others: IntArray, excited: IntArray, records: int = 1) -> NoiseBands:
+        """Pieces of `BINS_PER_BAND` values on other bins, or a few more, the last one longer.
+
+        Parameters
+        ----------
+        others, excited : (K_o,), (K_e,) int
+            Bins, ascending.
+        records : int
+            Values on each bin, one after the other.
+        """
+        size = -(-BINS_PER_BAND // records)  # bins of a piece
+        pieces = max(1, others.size // size)
+        starts = np.arange(pieces) * (size * records)
+        of_others = np.minimum(np.arange(others.size) // size, pieces - 1)
+        of_excited = np.minimum(np.searchsorted(others, excited) // size, pieces - 1)
+        counts = np.diff(np.append(starts, others.size * records))
+        return cls(of_others, of_excited, starts, counts, size * records)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +203,13 @@ def _pieces(
     mean = mean_power * factor
     if _are_flat(values, bands):
         return mean, np.zeros(values.shape[0], np.int64)
-    model = model_variance(_samples(values, bands) * factor, BINS_PER_BAND)
+    model = model_variance(_samples(values, bands) * factor, bands.dof)
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
 
 
 def _are_flat(values: ComplexArray, bands: NoiseBands) -> bool:
     """Whether all of a batch have a flat variance, or too few pieces to tell."""
-    return bands.starts.size < FEWEST_PIECES or is_flat(_samples(values, bands), BINS_PER_BAND)
+    return bands.starts.size < FEWEST_PIECES or is_flat(_samples(values, bands), bands.dof)
 
 
 def _samples(values: ComplexArray, bands: NoiseBands) -> FloatArray:

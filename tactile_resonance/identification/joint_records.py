@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poles of one record by the joint estimator, from its samples or from bins kept of it."""
+"""Poles of one point by the joint estimator, from the samples of its records or from bins kept of them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
@@ -28,12 +29,13 @@ def identify_poles_from_records(
     structure: ModelStructure | None = None,
     input_noise_ratio: float | None = None,
 ) -> Poles:
-    """Poles from the samples of one record; many want a `JointPlan`, which this makes every time.
+    """Poles from the samples of one point; many want a `JointPlan`, which this makes every time.
 
     Parameters
     ----------
-    u, y : (P, N) float
-        Actuator and sensor: P consecutive periods of N samples, from any initial state.
+    u, y : (P, N) or (M, P, N) float
+        Actuator and sensor: P consecutive periods of N samples, from any initial state, of one
+        realisation or of M.
     sample_rate_hz, harmonics, band_hz, structure, input_noise_ratio
         See `JointPlan`.
 
@@ -42,12 +44,14 @@ def identify_poles_from_records(
     Poles
         Always with a status; raised is only what `JointPlan` raises.
     """
-    if np.ndim(u) != 2:
-        raise ValueError(f"u: shape {np.shape(u)}, expected (P, N)")
-    plan = JointPlan(
+    if np.ndim(u) not in (2, 3):
+        raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
+    if np.ndim(u) == 3 and len(u) == 1:
+        u, y = u[0], y[0]
+    plan = (JointPlan if np.ndim(u) == 2 else RealisationsPlan)(
         sample_rate_hz,
-        np.shape(u)[1],
-        np.shape(u)[0],
+        np.shape(u)[-1],
+        np.shape(u)[-2],
         harmonics,
         band_hz,
         structure or ModelStructure(),
@@ -91,14 +95,18 @@ def identify_poles_from_bins(
         (float(band_hz[0]), float(band_hz[1])),
         structure or ModelStructure(),
         input_noise_ratio,
+        bins.u.shape[0] > 1,
     )
     first = plan.bins[0] - bins.first_bin
-    if first < 0 or first + plan.bins.size > bins.u.size:
+    if first < 0 or first + plan.bins.size > bins.count:
         raise ValueError(
             f"band_hz: {band_hz}, the bins cover {bins.band_hz[0]:g} to {bins.band_hz[1]:g} Hz"
         )
     here = slice(first, first + plan.bins.size)
-    return single(plan.from_bins(bins.u[here], bins.y[here]), notes=notes)
+    u, y = bins.u[:, here], bins.y[:, here]
+    if u.shape[0] == 1:
+        u, y = u[0], y[0]
+    return single(plan.from_bins(u, y), notes=notes)
 
 
 @lru_cache(maxsize=32)
@@ -110,8 +118,9 @@ def _plan(
     band_hz: tuple[float, float],
     structure: ModelStructure,
     input_noise_ratio: float | None,
+    several: bool,
 ) -> JointPlan:
-    return JointPlan(
+    return (RealisationsPlan if several else JointPlan)(
         sample_rate_hz,
         samples_per_period,
         periods,

@@ -186,25 +186,33 @@ class ManyPoints:
 
     def start(self, iterations: int, theta: FloatArray | None = None) -> FloatArray:
         """(batch, n) coefficients by Sanathanan-Koerner iterations, from weights 1 or those of theta."""
-        data, groups = self._data, self._groups
-        batch, n = data[0].y.shape[0], sum(self._sizes)
         for _ in range(iterations):
-            gradient = np.zeros((batch, n))
-            normal = np.zeros((batch, n, n))
-            for group, values, places in zip(groups, data, self._places, strict=True):
-                size: npt.NDArray = values.variance_y
-                if theta is not None:
-                    a = group.evaluate(0, self._split(theta)[0])
-                    size = size * (a.real**2 + a.imag**2)
-                m = np.broadcast_to(1 / size, values.y.shape)
-                z = np.conj(values.y * group.denominator[:, -1])
-                z *= m
-                z_beta = z if values.u is None else z * values.u
-                gradient += self._gradient(group, z * values.y, z_beta, z)
-                normal += group.normal_entries(m, values.y, values.u)[:, places]
+            gradient, normal = self.start_equations(theta)
             theta = -solve_scaled(normal, gradient)[0]
         assert theta is not None
         return theta
+
+    def start_equations(self, theta: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Gradient (batch, n) and normal matrices (batch, n, n) of a Sanathanan-Koerner iteration.
+
+        Of coefficients that solve them with a minus; weights are 1 or those of theta (batch, n).
+        """
+        data, groups = self._data, self._groups
+        batch, n = data[0].y.shape[0], sum(self._sizes)
+        gradient = np.zeros((batch, n))
+        normal = np.zeros((batch, n, n))
+        for group, values, places in zip(groups, data, self._places, strict=True):
+            size: npt.NDArray = values.variance_y
+            if theta is not None:
+                a = group.evaluate(0, self._split(theta)[0])
+                size = size * (a.real**2 + a.imag**2)
+            m = np.broadcast_to(1 / size, values.y.shape)
+            z = np.conj(values.y * group.denominator[:, -1])
+            z *= m
+            z_beta = z if values.u is None else z * values.u
+            gradient += self._gradient(group, z * values.y, z_beta, z)
+            normal += group.normal_entries(m, values.y, values.u)[:, places]
+        return gradient, normal
 
     def _group_value(self, group: BinGroup, values: BinData, theta: FloatArray) -> GroupValue:
         alpha, beta, gamma = self._split(theta)

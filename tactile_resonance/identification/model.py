@@ -63,7 +63,8 @@ class RationalModel:
     variable : Variable
     denominator_basis, numerator_basis : PolynomialBasis
     transient : (..., t) float
-        Coefficients of the transient's numerator, empty where there is none.
+        Coefficients of the transient's numerator, empty where there is none; of several records
+        one after the other.
     delay_s : (...) float
     """
 

@@ -153,7 +153,7 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
             model = np.broadcast_to(mean, variance.shape)
             spread = np.log(mean[:, 0]) - log_mean
         else:
-            model = _two_channels(known, gain, usable)
+            model = two_channels(known, gain, usable)
             ratio = known / model  # 0 where a line is left out
             log_model = np.log(model) if whole else np.where(usable, np.log(model), 0.0)
             spread = np.log(ratio.sum(axis=-1) / count) - log_mean + log_model.sum(axis=-1) / count
@@ -161,7 +161,7 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     if unequal.any():
         model = model.copy()
         rest = np.flatnonzero(unequal)
-        curve = _log_linear(known[rest], usable[rest])
+        curve = log_linear(known[rest], usable[rest])
         ratio = np.where(usable[rest], known[rest] / curve, 1.0)
         with np.errstate(divide="ignore"):
             spread = (
@@ -178,11 +178,16 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
 
 def is_flat(variance: FloatArray, dof: int) -> bool:
     """Whether the test of `model_variance` finds every point of (batch, F) variances flat."""
+    return bool(are_flat(variance, dof).all())
+
+
+def are_flat(variance: FloatArray, dof: int) -> npt.NDArray[np.bool_]:
+    """(batch,) whether the test of `model_variance` finds (batch, F) variances flat."""
     lines = variance.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.log(variance.sum(axis=-1) / lines) - np.log(variance).sum(axis=-1) / lines
     limit = flat_limit(lines, dof)
-    return bool((spread <= limit).all())  # NaN, where a variance is not positive, is not flat
+    return np.asarray(spread <= limit)  # NaN, where a variance is not positive, is not flat
 
 
 @lru_cache(maxsize=256)
@@ -200,7 +205,7 @@ def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> 
     return quantile * correction / (real_dof * count)
 
 
-def _two_channels(
+def two_channels(
     variance: FloatArray, gain: FloatArray, usable: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
@@ -234,7 +239,7 @@ def _two_channels(
     return model * scale
 
 
-def _log_linear(variance: FloatArray, usable: npt.NDArray[np.bool_]) -> FloatArray:
+def log_linear(variance: FloatArray, usable: npt.NDArray[np.bool_]) -> FloatArray:
     """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
 
     By Fisher scoring, over the usable lines.

@@ -123,7 +123,8 @@ class PolesBatch:
     covariance, total_covariance, pole_covariance : (..., n, 2, 2) float
         As in `Poles`; the total one is NaN where nothing but noise is known.
     coefficient_covariance : (..., p, p) float
-        Of the free coefficients of ``fit``: denominator, numerator, transient (from noise).
+        Of the free coefficients of ``fit``: denominator, numerator, transient (from noise); without
+        the transients where these are of several records.
     cost, expected_cost, condition_number : (...) float
     residual : (..., F) complex
         Weighted residuals on the (excited) lines; 0 on those left out. Those of spectra are turned

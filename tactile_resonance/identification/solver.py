@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.many_points import ManyPoints, ManyValues
 from tactile_resonance.identification.one_point import OnePoint, OneValue
 from tactile_resonance.identification.problem import START_ITERATIONS, Problem
 
@@ -87,18 +87,18 @@ def minimise(
 
 
 def refine(
-    points: OnePoint | ManyPoints,
+    points: Any,
     start: FloatArray,
-    value: OneValue | ManyValues | None = None,
+    value: Any = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> Solution:
     """Minimise the cost of points that are computed together.
 
     Parameters
     ----------
-    points : OnePoint or ManyPoints
-    start : (batch, n) float
-    value : OneValue or ManyValues, optional
+    points : OnePoint, ManyPoints or SharedPoints
+    start : (batch, n) or, of `SharedPoints`, (batch, M, n) float
+    value : what `points.evaluate` returns, optional
         The model there, where it is known already.
     max_iterations : int
         Evaluations of the model after the first one.
@@ -106,7 +106,6 @@ def refine(
     if isinstance(points, OnePoint):
         assert value is None or isinstance(value, OneValue)
         return _refine_one(points, start[0], value, max_iterations)
-    assert value is None or isinstance(value, ManyValues)
     return _refine_many(points, start, value, max_iterations)
 
 
@@ -153,9 +152,7 @@ def _refine_one(
     )
 
 
-def _refine_many(
-    points: ManyPoints, theta: FloatArray, value: ManyValues | None, max_iterations: int
-) -> Solution:
+def _refine_many(points: Any, theta: FloatArray, value: Any, max_iterations: int) -> Solution:
     batch = theta.shape[0]
     value = points.weight(points.evaluate(theta) if value is None else value)
     limit, floor = STEP_TOLERANCE**2 / points.free, ROUNDING**2 * points.weighted_power

@@ -253,16 +253,22 @@ def _write_bins(message: msg.FRF, bins: BandBins) -> None:
 
 
 def _bins(message: msg.FRF) -> BandBins | None:
+    """Those of the realisations one after the other."""
     names = [f"bins_{c}_{part}" for c in ("actuator", "sensor") for part in ("real", "imag")]
     sizes = {len(getattr(message, name)) for name in names}
     if sizes == {0}:
         return None
     if len(sizes) > 1:
         raise ValueError(f"{', '.join(names)}: sizes {sorted(sizes)}, expected as many of each")
+    records = max(1, message.realisations)
+    if max(sizes) % records:
+        raise ValueError(
+            f"{names[0]}: size {max(sizes)}, expected as many of each of {records} realisations"
+        )
     return BandBins(
         message.bins_first,
-        _complex(message, "bins_actuator_"),
-        _complex(message, "bins_sensor_"),
+        _complex(message, "bins_actuator_").reshape(records, -1),
+        _complex(message, "bins_sensor_").reshape(records, -1),
         array_of(message.bins_harmonics).astype(np.int64),
         message.bins_sample_rate_hz,
         message.bins_samples_per_period,

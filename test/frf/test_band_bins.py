@@ -25,7 +25,8 @@ def test_equal_the_transform_of_the_whole_record(samples, band):
             assert bins is None
             continue
         whole = record[:, :periods].reshape(2, -1)
-        expected = np.fft.rfft(whole)[:, bins.first_bin : bins.first_bin + bins.u.size]
+        expected = np.fft.rfft(whole)[:, bins.first_bin : bins.first_bin + bins.count]
+        assert bins.u.shape == (1, bins.count)
         assert np.abs(bins.u - expected[0] / whole.shape[1]).max() < 1e-12
         assert np.abs(bins.y - expected[1] / whole.shape[1]).max() < 1e-12
         # all bins of the band and no other: without the mean, up to the last line below Nyquist
@@ -61,4 +62,6 @@ def test_what_cannot_be_sent_is_refused():
                 np.arange(1, 9000), 20000, sample_rate_hz=50e3, band_hz=band, max_periods=8
             )
     with pytest.raises(ValueError, match="bins to 100"):
-        BandBins(91, np.zeros(10, complex), np.zeros(10, complex), np.arange(1), 50.0, 64, 3)
+        BandBins(
+            91, np.zeros((1, 10), complex), np.zeros((1, 10), complex), np.arange(1), 50.0, 64, 3
+        )

@@ -145,3 +145,21 @@ def test_a_record_that_does_not_fit_is_refused(channels):
     u, y = channels
     with pytest.raises(ValueError, match="199 and 200 samples, expected whole periods of 200"):
         MeasurementFrf(1).add(record(u[0, 0, :-1], y[0, 0], 0, 0), excitation(0))
+
+
+@pytest.mark.parametrize("periods", [(4, 4), (4, 3)])
+def test_bins_of_all_realisations_come_along_where_they_are_alike(channels, periods):
+    u, y = channels
+    measurement = MeasurementFrf(1, bins_band_hz=(80.0, 120.0))
+    for m in range(2):
+        for p in range(periods[m]):
+            measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
+            now = measurement.frf().bins
+            # the first realisation alone, until the second one has as many periods
+            assert now.u.shape[0] == (2 if (m, p) == (1, 3) else 1)
+    bins = measurement.frf().bins
+    for m in range(bins.u.shape[0]):
+        for channel, found in ((u, bins.u), (y, bins.y)):
+            whole = np.fft.rfft(channel[m].ravel()) / channel[m].size
+            here = slice(bins.first_bin, bins.first_bin + bins.count)
+            np.testing.assert_allclose(found[m], whole[here], atol=1e-12)

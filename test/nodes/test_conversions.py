@@ -120,7 +120,7 @@ def complex_normal(*shape):
 def test_frf(complete):
     covariance = complex_normal(2, 2, 30)
     covariance = covariance + np.conj(np.swapaxes(covariance, 0, 1))  # Hermitian
-    bins = BandBins(17, complex_normal(12), complex_normal(12), np.arange(5, 8), 1e3, 64, 4)
+    bins = BandBins(17, complex_normal(2, 6), complex_normal(2, 6), np.arange(5, 8), 1e3, 64, 4)
     frf = FRF(
         frequency_hz=np.sort(RNG.uniform(1, 100, 30)),
         g=complex_normal(30),

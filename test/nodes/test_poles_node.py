@@ -61,6 +61,13 @@ BROKEN = {
     "one spectrum": lambda m: m.sensor_real.extend([1.0] * LINES_HZ.size),
     "one variance": lambda m: m.sensor_variance.extend([1.0] * LINES_HZ.size),
     "bins short": lambda m: m.bins_sensor_imag.extend([1.0]),
+    "bins of no whole realisations": lambda m: [
+        setattr(m, "realisations", 2),
+        *(
+            getattr(m, f"bins_{name}").extend([1.0])
+            for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
+        ),
+    ],
     "bins without a rate": lambda m: [
         getattr(m, f"bins_{name}").extend([1.0])
         for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
@@ -136,3 +143,51 @@ def test_bins_give_after_every_block_what_the_whole_record_gives(node, monkeypat
     node._on_frf(sent[-1])
     assert node.published[-1].status == msg.Poles.STATUS_FAILED
     assert "bins cover 200 to 300 Hz" in node.published[-1].message
+
+
+def test_bins_of_two_realisations_give_what_their_records_give(node, monkeypatch):
+    """Through the messages of both nodes; the second realisation under way leaves the first alone."""
+    rng = np.random.default_rng(4)
+    frf_node = FrfNode()
+    frf_node.trigger_configure()
+    frf_node.trigger_activate()
+    sent = []
+    monkeypatch.setattr(frf_node._publisher, "publish", sent.append)
+    records = []
+    for m in range(2):
+        excitation = design_multisine(
+            sample_rate_hz=5e3, samples_per_period=2000, band_hz=(100, 1000), seed=1, periods=2,
+            realisation=m, realisations=2,
+        )  # fmt: skip
+        u = np.tile(excitation.period(), 2)
+        s = 2j * np.pi * np.fft.rfftfreq(4 * u.size, 1 / 5e3)
+        g = 0.02 + 100 * s / (s**2 + 10 * np.pi * s * 2 + (500 * np.pi) ** 2)
+        y = np.fft.irfft(np.fft.rfft(u, 4 * u.size) * g)[: u.size]  # from rest
+        u, y = (x + 1e-4 * rng.standard_normal(x.size) for x in (u, y))
+        records.append(np.stack([u, y]).reshape(2, 2, 2000))
+        frf_node._on_excitation(excitation_to_message(excitation, 0, "tip"))
+        for block in range(2):
+            record = Record(
+                Channel(records[m][0, block]), Channel(records[m][1, block]), 5e3, 2000,
+                block_index=block, realisation=m,
+                origin=Origin(0, excitation.excitation_id, final=m == block == 1),
+            )  # fmt: skip
+            frf_node._on_record(record_to_message(record))
+            node._on_frf(sent[-1])
+    frf_node.destroy_node()
+    _, first, under_way, both = node.published
+    assert first.method == under_way.method == "joint maximum likelihood of poles and transient"
+    assert under_way.f0_hz[0] == first.f0_hz[0]
+    u, y = np.stack(records, axis=1)
+    expected = identify_poles_from_records(
+        u, y, sample_rate_hz=5e3, harmonics=excitation.harmonics, band_hz=(200.0, 300.0)
+    )
+    assert both.method == expected.method
+    assert both.method.endswith("2 realisations")
+    assert both.status == msg.Poles.STATUS_OK
+    assert both.f0_hz[0] == pytest.approx(expected.f0_hz[0], rel=1e-9)
+    assert np.array(both.covariance) == pytest.approx(expected.covariance.ravel(), rel=1e-5)
+    total = expected.total_covariance.ravel()
+    assert np.array(both.total_covariance) == pytest.approx(total, rel=1e-5)
+    error = expected.damping_ratio[0] - 0.02
+    assert abs(error) < 4 * np.sqrt(total[3])

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What parts of the data and a richer model make of the poles that a joint fit found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.joint_layout import JointLayout
+from tactile_resonance.identification.model_error import (
+    difference_of_halves,
+    difference_of_models,
+)
+from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.shared_points import minimise_shared
+from tactile_resonance.identification.solver import minimise
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def systematic_of(layout: JointLayout, data: list[BinData], theta: FloatArray) -> FloatArray:
+    """Outer products of what halves of the data, and one mode more, move each pole by.
+
+    Halves are those of the excited bins and, of several realisations, the first and the last ones.
+
+    Parameters
+    ----------
+    layout : JointLayout
+    data : list of BinData
+        Of a batch of records, or, of several realisations, of (batch M) rows.
+    theta : (batch, n) or (batch, M, n) float
+        The fit.
+
+    Returns
+    -------
+    (batch, places, 2, 2) float
+        In (f0_hz, damping_ratio).
+    """
+    *other, excited = data
+    poles = []
+    for parity in (0, 1):
+        left_out = np.arange(excited.y.shape[1]) % 2 == parity
+        half = replace(excited, variance_y=np.where(left_out, np.inf, excited.variance_y))
+        poles.append(layout.poles_in_band(_fit(layout.problem, [*other, half], theta.shape, theta)))
+    systematic = difference_of_halves(*poles)
+    if theta.ndim == 3:
+        systematic = systematic + _of_realisations(layout, data, theta)
+    if layout.richer is not None:
+        found = _fit(layout.richer.problem, [*other, excited], theta.shape, None)
+        first = theta if theta.ndim == 2 else theta[:, 0]
+        systematic = systematic + difference_of_models(
+            layout.poles_in_band(first), layout.richer.poles_in_band(found)
+        )
+    return systematic
+
+
+def _of_realisations(layout: JointLayout, data: list[BinData], theta: FloatArray) -> FloatArray:
+    """(batch, places, 2, 2) what the first and the last realisations make of the poles."""
+    batch, records, _ = theta.shape
+    order = np.arange(batch * records) % records
+    poles = []
+    for part in (order < records // 2, order >= records - records // 2):
+        start = theta.reshape(batch * records, -1)[part].reshape(batch, records // 2, -1)
+        half = [values.rows(part) for values in data]
+        poles.append(layout.poles_in_band(_fit(layout.problem, half, start.shape, start)))
+    return difference_of_halves(*poles)
+
+
+def _fit(
+    problem: Problem, data: list[BinData], shape: tuple[int, ...], start: FloatArray | None
+) -> FloatArray:
+    """(batch, n) coefficients; of several realisations those of the first."""
+    if len(shape) == 2:
+        return minimise(problem, data, start).theta
+    return minimise_shared(problem, data, shape[1], start).theta[:, 0]

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several realisations of the phases: bound, ellipses, distortion and model error told apart."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks.poles_plant import (
+    BAND_HZ,
+    HARMONICS,
+    SAMPLE_RATE_HZ,
+    SAMPLES_PER_PERIOD,
+    Plant,
+    bound_of_realisations,
+    judge,
+)
+from tactile_resonance.identification.arrow import ArrowInverse
+from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.dense import jacobian_covariance, minimise_dense
+from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.realisations import RealisationsPlan
+from tactile_resonance.identification.result import PolesStatus
+from tactile_resonance.identification.shared_points import minimise_shared, side_by_side
+from tactile_resonance.identification.single_point import single
+from tactile_resonance.identification.solver import minimise
+from tactile_resonance.identification.structure import ModelStructure
+
+BARE = ModelStructure(2, 2)
+RUNS = 600
+
+
+def plants(damping_ratio, snr_db, periods, realisations):
+    return [Plant(damping_ratio, snr_db, periods, seed=10 + m) for m in range(realisations)]
+
+
+def circular(rng, shape, variance):
+    return np.sqrt(variance / 2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+
+
+def spectra(plants, rng, runs, distortion=0.0):
+    """(runs, M, K) both; distortion is the variance of another error on excited bins."""
+    bins = plants[0].bins()
+    pairs = [plant.noisy(rng, runs, bins) for plant in plants]
+    u, y = (np.stack(channel, axis=1) for channel in zip(*pairs, strict=True))
+    if distortion:
+        y += circular(rng, y.shape, distortion) * (bins % plants[0].periods == 0)
+    return u, y
+
+
+def plan_of(periods, structure=BARE, kind=RealisationsPlan, **options):
+    return kind(
+        SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, periods, HARMONICS, BAND_HZ, structure, **options
+    )
+
+
+def errors_of(result, damping_ratio):
+    return np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - damping_ratio], -1)
+
+
+def assert_honest(errors, covariance, bound):
+    """Goals fail where the 99.9 % interval of the Monte Carlo excludes them."""
+    runs = errors.shape[0]
+    ratio, coverage = judge(errors, covariance, bound)
+    assert np.all(ratio * runs / stats.chi2.ppf(0.9995, runs) <= 1.05)
+    assert np.all(ratio * runs / stats.chi2.ppf(0.0005, runs) >= 0.95)
+    assert stats.binom.cdf(coverage * runs, runs, 0.94) > 0.0005
+    assert stats.binom.sf(coverage * runs - 1, runs, 0.96) > 0.0005
+
+
+@pytest.mark.parametrize("damping_ratio", [0.01, 0.05])
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (2, 2), (4, 8), (7, 1)])
+def test_reaches_the_bound_with_honest_ellipses(realisations, periods, damping_ratio):
+    all_plants = plants(damping_ratio, 30.0, periods, realisations)
+    u, y = spectra(all_plants, np.random.default_rng(1), RUNS)
+    result = plan_of(periods).from_bins(u, y)
+    errors = errors_of(result, damping_ratio)
+    for covariance in (result.covariance, result.total_covariance):
+        assert_honest(errors, covariance[:, 0], bound_of_realisations(all_plants))
+    # three tests of one in a thousand each
+    alarms = np.sum(result.has_status(PolesStatus.MODEL_ERROR))
+    assert stats.binom.sf(alarms - 1, RUNS, 3e-3) > 0.001
+    assert np.all(result.has_status(PolesStatus.OK) | result.has_status(PolesStatus.MODEL_ERROR))
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (2, 2), (4, 2), (4, 8)])
+def test_distortion_is_told_from_noise_and_from_model_error(realisations, periods):
+    all_plants = plants(0.01, 40.0, periods, realisations)
+    level = 100 * all_plants[0].noise[0]
+    u, y = spectra(all_plants, np.random.default_rng(2), RUNS, level)
+    result = plan_of(periods).from_bins(u, y)
+    bound = bound_of_realisations(all_plants, level)
+    assert_honest(errors_of(result, 0.01), result.total_covariance[:, 0], bound)
+    alarms = np.sum(result.has_status(PolesStatus.MODEL_ERROR))
+    assert stats.binom.sf(alarms - 1, RUNS, 3e-3) > 0.001
+    if periods == 1:  # all in one
+        assert result.covariance == pytest.approx(result.total_covariance, rel=1e-6, nan_ok=True)
+    else:
+        assert np.median(result.noise_variance[:, 0]) == pytest.approx(level / 100, rel=0.05)
+
+
+def test_covariance_from_noise_is_what_repeated_noise_makes():
+    """Distortion stays the same from run to run: it is the system's, only noise is another."""
+    all_plants = plants(0.02, 40.0, 2, 3)
+    rng = np.random.default_rng(3)
+    u, y = spectra(all_plants, rng, RUNS)
+    fixed = circular(rng, y.shape[1:], 100 * all_plants[0].noise[0])
+    result = plan_of(2).from_bins(u, y + fixed * (all_plants[0].bins() % 2 == 0))
+    found = np.var(errors_of(result, 0.02), axis=0, ddof=1)
+    stated = np.mean(np.diagonal(result.covariance[:, 0], axis1=-2, axis2=-1), axis=0)
+    assert np.all(found / stated * RUNS < stats.chi2.ppf(0.9995, RUNS))
+    assert np.all(found / stated * RUNS > stats.chi2.ppf(0.0005, RUNS))
+    total = np.mean(result.total_covariance[:, 0, 0, 0])
+    assert total > 1.5 * stated[0]
+
+
+def test_input_noise_that_nobody_knows_is_weighted_by_what_realisations_differ_by():
+    all_plants = plants(0.01, 40.0, 1, 4)
+    u, y = spectra(all_plants, np.random.default_rng(4), RUNS)
+    result = plan_of(1).from_bins(u, y)
+    errors = errors_of(result, 0.01)
+    assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants))
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (3, 4)])
+@pytest.mark.parametrize("distorted", [False, True])
+def test_a_neighbouring_mode_is_a_model_error(realisations, periods, distorted):
+    all_plants = plants(0.02, 60.0, periods, realisations)
+    bins = all_plants[0].bins()
+    level = 100 * all_plants[0].noise[0] if distorted else 0.0
+    u, y = spectra(all_plants, np.random.default_rng(5), 20, level)
+    s, w0 = 2j * np.pi * bins * 2.5 / periods, 2 * np.pi * 280
+    size = 0.005 if distorted else 0.002
+    second = size * w0**2 / (s**2 + 2 * 0.01 * w0 * s + w0**2)
+    steady = np.stack([plant.input(bins) for plant in all_plants])
+    result = plan_of(periods).from_bins(u, y + second * steady)
+    assert result.has_status(PolesStatus.MODEL_ERROR).all()
+    total = np.sqrt(np.diagonal(result.total_covariance[:, 0], axis1=-2, axis2=-1))
+    noise = np.sqrt(np.diagonal(result.covariance[:, 0], axis1=-2, axis2=-1))
+    assert np.all(np.abs(errors_of(result, 0.02)) < 3 * total)
+    assert np.all(total > 2 * noise)
+
+
+@pytest.mark.parametrize("periods", [1, 3])
+def test_eliminated_transients_equal_all_side_by_side(periods):
+    """Coefficients, their covariance and the condition number of the whole block arrow."""
+    all_plants = plants(0.02, 40.0, periods, 3)
+    u, y = (v.reshape(-1, v.shape[-1]) for v in spectra(all_plants, np.random.default_rng(6), 2))
+    plan = plan_of(periods)
+    variance = np.full((u.shape[0], 1), all_plants[0].noise[0])
+    data = [BinData(y[:, plan.excited_at], u[:, plan.excited_at], variance, variance)]
+    if periods > 1:
+        data.insert(0, BinData(y[:, plan.others_at], None, variance))
+    solution = minimise_shared(plan.problem, data, 3)
+    assert solution.converged.all()
+    shared = sum(plan.problem.sizes[:2])
+    inverse = ArrowInverse.of(solution.normal.sum(axis=2), shared)
+    for k in range(2):
+        stacked, parts = side_by_side(
+            plan.problem, [values.rows(slice(3 * k, 3 * k + 3)) for values in data]
+        )
+        dense = minimise_dense(stacked, parts)
+        covariance, condition = jacobian_covariance(dense.jacobian)
+        std = np.sqrt(0.5 * np.diag(covariance))
+        found = np.concatenate(
+            [solution.theta[k, 0, :shared], solution.theta[k, :, shared:].ravel()]
+        )
+        assert np.all(np.abs(found - dense.theta) < 1e-3 * std)
+        assert np.allclose(
+            solution.theta[k, :, :shared], solution.theta[k, :1, :shared], rtol=1e-12
+        )
+        assert inverse.shared[k] == pytest.approx(covariance[:shared, :shared], rel=1e-2)
+        assert solution.cost[k] == pytest.approx(dense.group_cost.sum(), rel=1e-6)
+        assert 1 / 3 < inverse.condition[k] / condition < 11
+
+
+@pytest.mark.parametrize("periods", [1, 4])
+def test_one_realisation_is_what_it_always_was(periods):
+    plant = Plant(0.02, 40.0, periods)
+    u, y = plant.noisy(np.random.default_rng(7), 4, plant.bins())
+    options = {"input_noise_ratio": 0.3} if periods == 1 else {}
+    alone = plan_of(periods, kind=JointPlan, **options).from_bins(u, y)
+    plan = plan_of(periods, **options)
+    result = plan.from_bins(u[:, None], y[:, None])
+    for name in ("f0_hz", "damping_ratio", "covariance", "cost", "residual", "status_code"):
+        assert getattr(result, name) == pytest.approx(getattr(alone, name), rel=1e-9, nan_ok=True)
+    # and so is the fit itself where a transient is eliminated that could have stayed
+    one = np.ones((4, 1))
+    data = [BinData(y[:, plan.excited_at], u[:, plan.excited_at], one, 0.3 * one)]
+    if periods > 1:
+        data.insert(0, BinData(y[:, plan.others_at], None, one))
+    found, expected = minimise_shared(plan.problem, data, 1), minimise(plan.problem, data)
+    assert found.theta[:, 0] == pytest.approx(expected.theta, rel=1e-9)
+    assert found.normal[:, 0] == pytest.approx(expected.normal, rel=1e-6)
+
+
+@pytest.mark.parametrize("periods", [1, 2])
+def test_exact_records_from_rest_give_the_exact_pole(periods):
+    all_plants = plants(0.02, 40.0, periods, 3)
+    bins = all_plants[0].bins()
+    u, y = (
+        np.stack([getattr(plant, name)(bins) for plant in all_plants])
+        for name in ("input", "output")
+    )
+    result = plan_of(periods).from_bins(u, y)
+    assert result.status() is PolesStatus.OK
+    assert result.f0_hz[0] == pytest.approx(250, rel=1e-7)
+    assert result.damping_ratio[0] == pytest.approx(0.02, rel=1e-5)
+
+
+def test_even_distortion_of_an_odd_grid_is_no_noise():
+    """What even harmonics carry would be taken for noise of the bins between excited lines."""
+    rng = np.random.default_rng(8)
+    plant = Plant(0.02, 40.0, 2)
+    bins = plant.bins()
+    odd = HARMONICS[HARMONICS % 2 == 1]
+    excited = np.isin(bins, odd * 2)
+    even = (bins % 2 == 0) & ~excited
+    u, y = spectra(plants(0.02, 40.0, 2, 3), rng, 200)
+    keep = np.where(excited | (bins % 2 == 1), 1.0, 0.0)
+    y = y * keep + circular(rng, y.shape, 1e4 * plant.noise[0]) * even
+    plan = RealisationsPlan(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 2, odd, BAND_HZ, BARE)
+    result = plan.from_bins(u * excited, y)
+    # of half the lines the input is gone, their share of the transient stays
+    assert np.median(result.noise_variance[:, 0]) == pytest.approx(plant.noise[0], rel=0.1)
+    assert np.mean(result.variance_model == "flat") > 0.98
+
+
+def test_leading_axes_samples_and_nan():
+    rng = np.random.default_rng(9)
+    u, y = spectra(plants(0.02, 40.0, 2, 2), rng, 6)
+    plan = plan_of(2)
+    batch = plan.from_bins(u.reshape(2, 3, 2, -1), y.reshape(2, 3, 2, -1))
+    assert batch.shape == (2, 3)
+    assert plan.from_bins(u[4], y[4]).f0_hz == pytest.approx(batch.f0_hz[1, 1], rel=1e-9)
+    y[1, 1, 7] = np.nan
+    result = plan.from_bins(u, y)
+    assert [result.status(k) is PolesStatus.OK for k in range(6)] == [True, False] + 4 * [True]
+    with pytest.raises(ValueError, match="expected"):
+        plan.from_bins(u[0, 0], y[0, 0])
+    samples = np.cumsum(rng.standard_normal((2, 2, 2, SAMPLES_PER_PERIOD)), axis=-1)
+    one = identify_poles_from_records(
+        *samples, sample_rate_hz=SAMPLE_RATE_HZ, harmonics=HARMONICS, band_hz=BAND_HZ
+    )
+    assert one.method == "joint maximum likelihood of poles and transients, 2 realisations"
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_scaled_data_scale_nothing(scale):
+    u, y = spectra(plants(0.02, 40.0, 2, 2), np.random.default_rng(10), 3)
+    first, other = (plan_of(2).from_bins(u, factor * y) for factor in (1.0, scale))
+    assert other.f0_hz == pytest.approx(first.f0_hz, rel=1e-9)
+    assert other.total_covariance == pytest.approx(first.total_covariance, rel=1e-3)
+
+
+def test_a_system_that_changes_between_realisations_is_told():
+    """Noise and distortion would differ from line to line; a mode that moves does not."""
+    rng = np.random.default_rng(11)
+    moved = [Plant(0.02 + 0.0002 * m, 40.0, 2, seed=10 + m) for m in range(3)]
+    u, y = spectra(moved, rng, 20)
+    result = plan_of(2).from_bins(u, y)
+    assert result.has_status(PolesStatus.MODEL_ERROR).all()
+    total = np.sqrt(result.total_covariance[:, 0, 1, 1])
+    assert np.all(np.abs(result.damping_ratio[:, 0] - 0.0202) < 2 * total)
+    assert np.all(total > 1e-4)
+    poles = single(plan_of(2).from_bins(u[0], y[0]))
+    assert "realisations differ smoothly" in poles.message
+
+
+@pytest.mark.parametrize(
+    ("kind", "realisations", "periods"),
+    [("generator", 3, 8), ("common", 3, 8), ("sloped", 3, 8), ("steps", 3, 8), ("sloped", 6, 1)],
+)
+def test_ellipse_is_honest_whatever_the_noise(kind, realisations, periods):
+    """Noise of the generator, which the plant answers; noise on both channels; coloured noise."""
+    all_plants = plants(0.02, 40.0, periods, realisations)
+    rng = np.random.default_rng(12)
+    bins = all_plants[0].bins()
+    variance_y, variance_u = all_plants[0].noise
+    s, w0 = 2j * np.pi * bins * 2.5 / periods, 2 * np.pi * 250
+    g = 0.1 + 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
+    u, y = (
+        np.stack([getattr(plant, name)(bins) for plant in all_plants]) + np.zeros((400, 1, 1))
+        for name in ("input", "output")
+    )
+    position = np.linspace(-1, 1, bins.size)
+    factor = 1.0
+    if kind == "generator":
+        disturbance = circular(rng, u.shape, 100 * variance_u)
+        u, y = u + disturbance, y + g * disturbance
+    elif kind == "common":
+        disturbance = circular(rng, u.shape, variance_y)
+        u, y = u + disturbance, y - 2 * disturbance
+    else:
+        u += circular(rng, u.shape, variance_u)
+        factor = np.exp(2 * position) if kind == "sloped" else np.where(position > 0.05, 16.0, 1.0)
+    result = plan_of(periods).from_bins(u, y + circular(rng, y.shape, variance_y * factor))
+    inside = 400 * judge(errors_of(result, 0.02), result.total_covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside, 400, 0.94) > 0.0005
+    assert stats.binom.sf(inside - 1, 400, 0.96) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.98
