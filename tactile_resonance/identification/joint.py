@@ -58,6 +58,8 @@ class JointPlan(JointLayout):
     def transform(self, samples: npt.NDArray[np.floating], name: str = "samples") -> ComplexArray:
         """(..., K) bins of the band of records (..., P, N), scaled by 1 / (P N)."""
         samples = np.asarray(samples)
+        if samples.dtype.kind not in "iuf":
+            raise ValueError(f"{name}: values of type {samples.dtype}, expected real numbers")
         shape = (self.periods, self.samples_per_period)
         if samples.shape[-2:] != shape:
             raise ValueError(
@@ -65,7 +67,8 @@ class JointPlan(JointLayout):
             )
         record = samples.reshape(*samples.shape[:-2], shape[0] * shape[1])
         spectrum = scipy.fft.rfft(record, axis=-1)[..., self.bins[0] : self.bins[-1] + 1]
-        return np.asarray(spectrum / record.shape[-1], dtype=complex)
+        with np.errstate(invalid="ignore", over="ignore"):  # the status tells of such samples
+            return np.asarray(spectrum / record.shape[-1], dtype=complex)
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records.
@@ -75,12 +78,18 @@ class JointPlan(JointLayout):
         u, y : (..., K) complex
             At ``bins``.
         """
+        u, y = (np.asarray(values, complex) for values in (u, y))
         for name, values in (("u", u), ("y", y)):
             if values.shape[-1:] != self.bins.shape:
                 raise ValueError(
                     f"{name}: shape {values.shape}, expected (..., {self.bins.size}) bins"
                 )
-        shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+        try:
+            shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+        except ValueError:
+            raise ValueError(
+                f"y: shape {y.shape}, expected leading axes like those of u, {u.shape}"
+            ) from None
         if u.shape != y.shape:
             u, y = (np.broadcast_to(v, (*shape, self.bins.size)) for v in (u, y))
         flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)

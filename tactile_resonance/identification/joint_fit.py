@@ -130,7 +130,7 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         points = problem.points(data)
         theta = _near(layout, points, data, u_o)
         value = points.evaluate(theta)
-        theta = theta.reshape(batch, -1)
+        theta = theta.reshape(batch, theta.shape[-1])
         noise = _noise(layout, value, theta, u_o)
         kind, data = noise.kind, _weighted(layout, data, noise)
         if noise.through_input is None:
