@@ -26,7 +26,7 @@ from tactile_resonance.identification.model_error import (
     difference_of_halves,
     difference_of_models,
 )
-from tactile_resonance.identification.noise_level import f_quantile
+from tactile_resonance.identification.noise_level import KINDS, f_quantile
 from tactile_resonance.identification.one_point import OneValue
 from tactile_resonance.identification.solver import Solution, minimise, refine
 from tactile_resonance.identification.whiteness import are_smooth
@@ -37,6 +37,9 @@ ComplexArray = npt.NDArray[np.complex128]
 
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
+# How often the noise is taken anew, and the change of its variance below which it is the same.
+MOST_RETURNS = 4
+SAME_LEVEL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +91,14 @@ class JointFit:
         names = [f.name for f in fields(cls)]
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
+    def replaced(self, rows: BoolArray, fit: JointFit) -> JointFit:
+        """With some points of another batch."""
+        arrays = {}
+        for name in (f.name for f in fields(self)):
+            arrays[name] = getattr(self, name).copy()
+            arrays[name][rows] = getattr(fit, name)
+        return JointFit(**arrays)
+
 
 @dataclass(frozen=True, eq=False)
 class _Level:
@@ -110,7 +121,31 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     layout : JointLayout
     u, y : (batch, K) complex
         At its bins.
+
+    Notes
+    -----
+    One step from start values the residuals are all but noise, unless the input's noise is far above
+    the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
+    its level is taken once more, from where the fit ended.
     """
+    fit = _fit(layout, u, y)
+    doubtful = np.full(u.shape[0], layout.other_bins.size > 0)
+    for _ in range(MOST_RETURNS):
+        doubtful &= (fit.suspect | (fit.kind != KINDS[0])) & fit.converged
+        doubtful &= np.isfinite(fit.theta).all(axis=-1)
+        if not doubtful.any():
+            break
+        before = fit.noise[:, 0]
+        again = _fit(layout, u[doubtful], y[doubtful], fit.theta[doubtful])
+        fit = fit.replaced(doubtful, again)
+        doubtful &= np.abs(fit.noise[:, 0] - before) > SAME_LEVEL * before
+    return fit
+
+
+def _fit(
+    layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
+) -> JointFit:
+    """The fit from coefficients (batch, n) that are near it, or from start values."""
     batch = u.shape[0]
     # finite as a whole only where every bin is
     usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
@@ -128,8 +163,8 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
         data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
         points = problem.points(data)
-        theta = _near(layout, points, data, u_o)
-        value = points.evaluate(theta)
+        theta = _near(layout, points, data, u_o) if start is None else start
+        value = points.evaluate(theta if start is None or batch > 1 else theta[0])
         theta = theta.reshape(batch, theta.shape[-1])
         noise = _noise(layout, value, theta, u_o)
         kind, data = noise.kind, _weighted(layout, data, noise)
@@ -212,6 +247,9 @@ def _level_from_others(
         limit = np.where(pieces, dof_e * mean + np.sqrt(dof_e) * std * quantile, limit)
     suspect = cost > limit
     dof = dof_e + dof_o
+    correction = _student_variance(dof)
+    if pieces.any():  # as `VarianceModel.information_correction` line by line
+        correction = np.where(pieces, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
     pooled = solution.group_cost.sum(axis=-1) / dof
     return _Level(
         np.where(suspect, level, pooled),
@@ -219,7 +257,7 @@ def _level_from_others(
         expected,
         suspect,
         noise.mean_variances * level[:, None],
-        _student_variance(dof),
+        correction,
     )
 
 
