@@ -18,8 +18,10 @@ def default_transient_terms(structure: ModelStructure) -> int:
 
     A transient of the model's own poles alone has `order` terms; every residual term beyond the
     constant stands for modes outside the band, whose transients are as smooth as their responses.
+    Several modes have two more at least, for they need not lie where `transient_basis` takes them.
     """
-    return structure.order + max(0, min(structure.numerator_order - structure.order, 4))
+    residual = min(structure.numerator_order - structure.order, 4)
+    return structure.order + max(residual, 2 if structure.order > 2 else 0)
 
 
 def transient_basis(
