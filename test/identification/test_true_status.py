@@ -27,6 +27,7 @@ from tactile_resonance.identification.identify import (
     identify_spectra,
 )
 from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.order_choice import choose_order
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
@@ -180,3 +181,33 @@ def test_spectra_without_any_covariance_are_fitted_and_said_so():
     assert result.status() is PolesStatus.NO_COVARIANCE
     assert abs(result.f0_hz[0] - 250) < 0.02
     assert np.isfinite(result.total_covariance).all()
+
+
+def test_orders_of_exact_data_are_compared():
+    """Modes too many leave nothing to determine them by: each candidate still has an answer."""
+    choice = choose_order(frf(g=G))
+    best = choice.poles[choice.chosen]
+    assert best.f0_hz[0] == pytest.approx(250, rel=1e-9)
+    assert len(choice.poles) == len(choice.mdl) == 15
+
+
+def test_two_modes_that_are_certain_only_together():
+    """Half a width apart, in noise that leaves neither residue alone beyond chance."""
+    lines_hz = np.linspace(240, 260, 81)
+    s = 2j * np.pi * lines_hz
+    g = np.zeros(81, complex)
+    for f0 in (250.0, 250.25):
+        w = 2 * np.pi * f0
+        g += 2e-3 * w**2 / (s**2 + 2e-3 * w * s + w**2)
+    rng = np.random.default_rng(6)
+    batch = identify_batch(
+        FRF(
+            lines_hz,
+            g + circular(rng, (40, 81), 1e-3),
+            variance_noise=np.full(81, 1e-3),
+            noise_dof=20,
+        ),
+        structure=ModelStructure(4, 4),
+    )
+    points = [single(batch, (k,)) for k in range(40)]
+    assert np.mean([p.status is PolesStatus.NO_RESONANCE for p in points]) < 0.1
