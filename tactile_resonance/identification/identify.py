@@ -138,7 +138,7 @@ def identify_batch(
         variance = selected.variance.reshape(flat_shape)
         weighted = usable & (variance > 0) & (variance < np.inf)
         if not weighted.all():
-            level_known = (usable & (variance > 0)).any(axis=-1)
+            level_known = np.asarray((usable & (variance > 0)).any(axis=-1))
             variance = np.where(level_known[:, None], variance, 1.0)
             usable = np.where(level_known[:, None], weighted, usable)
     if not usable.all():
@@ -195,11 +195,17 @@ def identify_spectra(
     band_hz, structure
         As for `identify_poles`.
     pooled : bool
-        Average the covariance over the band where a test finds both variances flat.
+        Take both variances, and the correlation, from the whole band where a test finds each flat
+        or sloped. A line on which one channel has no variance, where others have one, is left out.
 
     Returns
     -------
     PolesBatch
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
 
     References
     ----------
@@ -217,7 +223,7 @@ def identify_spectra(
     c = covariance[..., inside].reshape(points, 2, 2, lines)
     usable = np.isfinite(z).all(axis=-2) & np.isfinite(c).all(axis=(-3, -2))
     noise_y, noise_u = (usable & (c[:, k, k].real > 0) for k in (0, 1))
-    level_known = (noise_y | noise_u).any(axis=-1)
+    level_known = np.asarray((noise_y | noise_u).any(axis=-1))
     # lines of one channel without variance, beside others with one, are none of the noise's making
     usable &= noise_y | ~noise_y.any(axis=-1, keepdims=True)
     usable &= noise_u | ~noise_u.any(axis=-1, keepdims=True)
@@ -264,8 +270,8 @@ def _channel(
         return VarianceModel(variance, lines, max(dof, 1), np.full(lines.shape, 2))
     model = model_variance(np.where(usable, variance, np.nan), dof)
     # a channel without noise is as flat as any
-    nothing = (variance > 0).any(axis=-1)[:, None]
-    return replace(model, variance=np.where(nothing, model.variance, 0.0))
+    noisy = np.asarray((variance > 0).any(axis=-1))[:, None]
+    return replace(model, variance=np.where(noisy, model.variance, 0.0))
 
 
 def _power(values: ComplexArray, usable: npt.NDArray[np.bool_]) -> FloatArray:

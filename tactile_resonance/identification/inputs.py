@@ -31,9 +31,9 @@ def checked_frf(frf: FRF) -> FRF:
         raise ValueError(
             f"frf.g: shape {g.shape}, expected (..., {frequency_hz.size}), one for each line"
         )
-    variances = {}
+    variances: dict[str, FloatArray | None] = {}
     for name, dof_name in (("variance_noise", "noise_dof"), ("variance_total", "total_dof")):
-        variance = getattr(frf, name)
+        variance = variances[name] = getattr(frf, name)
         if variance is None:
             continue
         try:
@@ -43,7 +43,13 @@ def checked_frf(frf: FRF) -> FRF:
                 f"frf.{name}: shape {np.shape(variance)}, expected that of g, {g.shape}"
             ) from None
         _check_dof(getattr(frf, dof_name), f"frf.{dof_name}")
-    return replace(frf, frequency_hz=frequency_hz, g=g, **variances)
+    return replace(
+        frf,
+        frequency_hz=frequency_hz,
+        g=g,
+        variance_noise=variances["variance_noise"],
+        variance_total=variances["variance_total"],
+    )
 
 
 def checked_spectra(
@@ -64,21 +70,15 @@ def checked_spectra(
             f"spectra, covariance: shapes {z.shape}, {c.shape}, "
             f"expected (..., 2, {lines}) and (..., 2, 2, {lines}), one for each line"
         )
-    try:
-        c = np.broadcast_to(c, (*z.shape[:-2], 2, 2, lines))
-    except ValueError:
-        raise ValueError(
-            f"covariance: shape {c.shape}, expected {(*z.shape[:-2], 2, 2, lines)} as spectra"
-        ) from None
     _check_dof(dof, "dof")
     y, u, yu, uy = (c[..., i, j, :] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)))
     with np.errstate(over="ignore", invalid="ignore"):
         product = np.sqrt(np.abs(y.real)) * np.sqrt(np.abs(u.real))
-        largest = np.maximum(np.maximum(np.abs(y), np.abs(u)), np.maximum(product, np.abs(yu)))
-        # comparisons with NaN are false: such lines are left out later
-        real = (np.abs(y.imag) <= ROUNDING * largest) & (np.abs(u.imag) <= ROUNDING * largest)
-        alike = np.abs(yu - uy.conj()) <= ROUNDING * largest
+        real = np.abs(y.imag) <= ROUNDING * np.abs(y)
+        real &= np.abs(u.imag) <= ROUNDING * np.abs(u)
+        alike = np.abs(yu - uy.conj()) <= ROUNDING * product
         definite = (y.real >= 0) & (u.real >= 0) & (np.abs(yu) <= (1 + ROUNDING) * product)
+    # lines of NaN are left out later
     wrong = np.isfinite(c).all(axis=(-3, -2)) & ~(real & alike & definite)
     if wrong.any():
         *_, line = np.argwhere(wrong)[0]
@@ -87,6 +87,12 @@ def checked_spectra(
             f"covariance: {matrix} at {lines_hz[line]:g} Hz, expected a Hermitian matrix, "
             "[[E|dY|^2, E dY conj(dU)], [E dU conj(dY), E|dU|^2]], without negative variances"
         )
+    try:
+        c = np.broadcast_to(c, (*z.shape[:-2], 2, 2, lines))
+    except ValueError:
+        raise ValueError(
+            f"covariance: shape {c.shape}, expected {(*z.shape[:-2], 2, 2, lines)} as spectra"
+        ) from None
     return lines_hz, z, c
 
 

@@ -168,7 +168,7 @@ class JointLayout:
             value = getattr(self, name)
             if name == "transient_terms" and value is None:
                 continue
-            if not (isinstance(value, Integral) and value >= least):
+            if not (isinstance(value, Integral) and int(value) >= least):
                 raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
         rate_hz = _number(self.sample_rate_hz)
         if not 0 < rate_hz < np.inf:

@@ -66,11 +66,12 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         poles, residue = poles[real], residue[real]
         if not real.any():
             status, residue = PolesStatus.NO_RESONANCE, None
-            notes = [
-                f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
-                "noise makes"
-                for pole in found
-            ] + list(notes)
+        left_out = [
+            f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
+            "noise makes"
+            for pole in found[~real]
+        ]
+        notes = [*left_out, *notes]
 
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
