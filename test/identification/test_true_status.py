@@ -211,3 +211,88 @@ def test_two_modes_that_are_certain_only_together():
     )
     points = [single(batch, (k,)) for k in range(40)]
     assert np.mean([p.status is PolesStatus.NO_RESONANCE for p in points]) < 0.1
+
+
+def test_a_mode_that_noise_made_is_left_out_and_said_so():
+    """Of two modes asked for there is one; the other is somewhere, stable or not."""
+    rng = np.random.default_rng(7)
+    told = 0
+    for _ in range(20):
+        noisy = frf(g=G + circular(rng, (41,), 1e-6))
+        poles = identify_poles(noisy, None, ModelStructure(4, 4))
+        assert poles.f0_hz.size < 2 or "noise makes" not in poles.message
+        if poles.f0_hz.size == 1 and "noise makes" in poles.message:
+            told += 1
+            assert abs(poles.f0_hz[0] - 250) < 5 * np.sqrt(poles.covariance[0, 0, 0])
+    assert told > 5
+
+
+def test_noise_alone_has_no_resonance():
+    rng = np.random.default_rng(8)
+    for _ in range(50):
+        poles = identify_poles(frf(g=0.1 + circular(rng, (41,), 1e-6)), None, BARE)
+        assert poles.f0_hz.size == 0
+        assert poles.status is not PolesStatus.OK
+
+
+def test_a_response_of_the_wrong_sign_of_phase_is_unstable():
+    assert identify_poles(frf(g=NOISY.conj()), None, BARE).status is PolesStatus.UNSTABLE_POLE
+
+
+def test_a_constant_response_determines_no_pole():
+    poles = identify_poles(frf(g=np.full(41, 0.3 + 0j)), None, BARE)
+    assert poles.status is PolesStatus.ILL_CONDITIONED
+    assert poles.f0_hz.size == 0
+
+
+@pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
+def test_what_rounding_leaves_of_an_exact_record_is_no_model_error(structure):
+    u, y = record(noise=0.0)
+    poles = identify_poles_from_records(
+        u, y, sample_rate_hz=RATE_HZ, harmonics=HARMONICS, band_hz=(200, 300), structure=structure
+    )
+    assert poles.status is PolesStatus.OK
+    assert poles.f0_hz == pytest.approx([250], rel=1e-9)
+
+
+def test_near_modes_in_a_batch_are_as_exact_as_alone():
+    """Normal equations square the condition number: such points are solved by themselves."""
+    lines_hz = np.linspace(249, 251.25, 181)
+    s = 2j * np.pi * lines_hz
+    points = []
+    for second in (250.25, 250.3, 250.35):
+        w = 2 * np.pi * np.array([250.0, second])[:, None]
+        points.append(np.sum(w**2 / (s**2 + 0.02 * w * s + w**2), axis=0))
+    batch = identify_batch(FRF(lines_hz, np.stack(points)), structure=ModelStructure(4, 4))
+    assert batch.f0_hz[:, 0] == pytest.approx(250, rel=1e-7)
+    assert batch.f0_hz[:, 1] == pytest.approx([250.25, 250.3, 250.35], rel=1e-7)
+
+
+def test_delay_beside_correlated_noise_is_at_the_least_cost():
+    rng = np.random.default_rng(9)
+    u = np.exp(2j * np.pi * rng.random(41))
+    y = G * u * np.exp(-2e-3 * S)
+    correlation, variance = 0.8 * np.exp(0.7j), 1e-4
+    both = circular(rng, (41,), variance)
+    own = circular(rng, (41,), variance * (1 - 0.64))
+    z = np.stack([y + correlation * both + own, u + both])
+    covariance = np.zeros((2, 2, 41), complex)
+    covariance[0, 0] = covariance[1, 1] = variance
+    covariance[0, 1], covariance[1, 0] = correlation * variance, np.conj(correlation) * variance
+    structure = ModelStructure(2, 2, delay=True)
+    result = identify_spectra(LINES_HZ, z, covariance, 0, structure=structure)
+    model = result.fit.at(())
+
+    def cost(more_delay_s):
+        g = model.response(LINES_HZ) * np.exp(-more_delay_s * S)
+        spread = variance * (1 + np.abs(g) ** 2 - 2 * np.real(correlation * g.conj()))
+        return np.sum(np.abs(z[0] - g * z[1]) ** 2 / spread)
+
+    assert cost(0.0) == pytest.approx(float(result.cost), rel=1e-9)
+    step_s = 1e-7
+    slope, bend = (
+        (cost(step_s) - cost(-step_s)) / (2 * step_s),
+        (cost(step_s) - 2 * cost(0.0) + cost(-step_s)) / step_s**2,
+    )
+    # nearer to the minimum than a hundredth of the standard deviation at fixed coefficients
+    assert abs(slope / bend) < 0.01 * np.sqrt(2 / bend)

@@ -83,3 +83,20 @@ def test_noise_with_a_peak_at_the_resonance(periods):
     result = fits(plant, u, y)
     assert np.mean(result.variance_model == "per line") > 0.9
     assert_honest(result, 0.93)
+
+
+def test_a_level_from_few_lines_widens_the_ellipse():
+    """One period, nine lines: a level of 5.5 complex degrees of freedom; ignored it costs 3 % of coverage."""
+    plant, band_hz, runs = Plant(0.02, 40.0, 1), (240.0, 260.0), 4000
+    variance_y, variance_u = plant.noise
+    plan = JointPlan(
+        *(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 1, HARMONICS, band_hz),
+        ModelStructure(2, 2),
+        input_noise_ratio=variance_u / variance_y,
+    )
+    result = plan.from_bins(*plant.noisy(np.random.default_rng(4), runs, plan.bins))
+    errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
+    coverage = judge(errors, result.covariance[:, 0], np.eye(2))[1]
+    # of a Student distribution of that variance: 0.9395
+    assert stats.binom.cdf(coverage * runs, runs, 0.9395) > 0.0005
+    assert stats.binom.sf(coverage * runs - 1, runs, 0.9395) > 0.0005
