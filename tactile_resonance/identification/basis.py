@@ -140,7 +140,7 @@ class PolynomialBasis:
             return np.stack([large, np.where(large == 0, 0, other)], axis=-1)
         comrade = np.broadcast_to(h, (*last.shape[:-1], m, m)).copy()
         comrade[..., :, -1] -= last
-        finite = np.isfinite(last).all(axis=-1)
+        finite = np.isfinite(last).all(axis=-1) & np.isfinite(h).all()
         comrade[~finite] = 0.0
         roots = np.linalg.eigvals(comrade).astype(complex)
         roots[~finite] = np.nan

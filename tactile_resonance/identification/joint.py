@@ -58,6 +58,8 @@ class JointPlan(JointLayout):
     def transform(self, samples: npt.NDArray[np.floating], name: str = "samples") -> ComplexArray:
         """(..., K) bins of the band of records (..., P, N), scaled by 1 / (P N)."""
         samples = np.asarray(samples)
+        if samples.dtype.kind not in "iuf":
+            raise ValueError(f"{name}: values of type {samples.dtype}, expected real numbers")
         shape = (self.periods, self.samples_per_period)
         if samples.shape[-2:] != shape:
             raise ValueError(
@@ -65,7 +67,8 @@ class JointPlan(JointLayout):
             )
         record = samples.reshape(*samples.shape[:-2], shape[0] * shape[1])
         spectrum = scipy.fft.rfft(record, axis=-1)[..., self.bins[0] : self.bins[-1] + 1]
-        return np.asarray(spectrum / record.shape[-1], dtype=complex)
+        with np.errstate(invalid="ignore", over="ignore"):  # the status tells of such samples
+            return np.asarray(spectrum / record.shape[-1], dtype=complex)
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records.
@@ -85,6 +88,7 @@ class JointPlan(JointLayout):
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Bins of both channels, of one shape (..., K)."""
+        u, y = (np.asarray(values, complex) for values in (u, y))
         for name, values in (("u", u), ("y", y)):
             if values.shape[-1:] != self.bins.shape:
                 raise ValueError(
@@ -92,7 +96,12 @@ class JointPlan(JointLayout):
                 )
         if u.shape == y.shape:
             return u, y
-        shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+        try:
+            shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+        except ValueError:
+            raise ValueError(
+                f"y: shape {y.shape}, expected leading axes like those of u, {u.shape}"
+            ) from None
         whole = (*shape, self.bins.size)
         return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
 

@@ -17,7 +17,7 @@ from tactile_resonance.identification.joint_model_error import systematic_of
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
 from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
-from tactile_resonance.identification.noise_level import f_quantile
+from tactile_resonance.identification.noise_level import KINDS, f_quantile
 from tactile_resonance.identification.solver import Solution, minimise, refine
 from tactile_resonance.identification.whiteness import are_smooth
 
@@ -27,6 +27,9 @@ ComplexArray = npt.NDArray[np.complex128]
 
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
+# How often the noise is taken anew, and the change of its variance below which it is the same.
+MOST_RETURNS = 4
+SAME_LEVEL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,14 @@ class JointFit:
         names = [f.name for f in fields(cls)]
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
+    def replaced(self, rows: BoolArray, fit: JointFit) -> JointFit:
+        """With some points of another batch."""
+        arrays = {}
+        for name in (f.name for f in fields(self)):
+            arrays[name] = getattr(self, name).copy()
+            arrays[name][rows] = getattr(fit, name)
+        return JointFit(**arrays)
+
 
 @dataclass(frozen=True, eq=False)
 class _Level:
@@ -108,7 +119,35 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     layout : JointLayout
     u, y : (batch, K) complex
         At its bins.
+
+    Notes
+    -----
+    One step from start values the residuals are all but noise, unless the input's noise is far above
+    the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
+    its level is taken once more, from where the fit ended.
     """
+    fit = _fit(layout, u, y)
+    doubtful = np.full(u.shape[0], layout.other_bins.size > 0)
+    for _ in range(MOST_RETURNS):
+        doubtful &= (fit.suspect | (fit.kind != KINDS[0])) & _may_return(fit)
+        if not doubtful.any():
+            break
+        before = fit.noise[:, 0]
+        again = _fit(layout, u[doubtful], y[doubtful], fit.theta[doubtful])
+        fit = fit.replaced(doubtful, again)
+        doubtful &= np.abs(fit.noise[:, 0] - before) > SAME_LEVEL * before
+    return fit
+
+
+def _may_return(fit: JointFit | Solution) -> BoolArray:
+    """(batch,) whether a fit ended where another one may begin."""
+    return np.asarray(fit.converged & np.isfinite(fit.theta).all(axis=-1))
+
+
+def _fit(
+    layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
+) -> JointFit:
+    """The fit from coefficients (batch, n) that are near it, or from start values."""
     batch = u.shape[0]
     # finite as a whole only where every bin is
     usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
@@ -126,9 +165,13 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
         u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
         data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
         points = problem.points(data)
-        theta = step_near(points, problem.start(points, data), data, u_o)
-        value = points.evaluate(theta)
-        theta = theta.reshape(batch, -1)
+        if start is None:
+            theta = step_near(points, problem.start(points, data), data, u_o)
+            value = points.evaluate(theta)
+        else:
+            theta = start
+            value = points.evaluate(theta if batch > 1 else theta[0])
+        theta = theta.reshape(batch, theta.shape[-1])
         noise = noise_of(layout, value.error_of(0), theta, u_o, layout.noise_bands)
         kind, data = noise.kind, weighted(data, noise, layout.noise_bands)
         if noise.through_input is None:
@@ -143,14 +186,16 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     else:
         level = _level_from_others(layout, solution, inverse, noise)
     residual = data[-1].turned(solution.residual) / np.sqrt(level.scale)[:, None]
-    suspect = are_smooth(residual, layout.structure.parameters)
+    suspect = are_smooth(residual, layout.structure.parameters) | level.suspect
     if suspect.any():  # what rounding leaves of exact data says nothing
         suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * mean_power(y_e)
-    suspect |= level.suspect
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
-    if suspect.any():
-        part = [values.rows(suspect) for values in data]
-        systematic[suspect] = systematic_of(layout, part, solution.theta[suspect])
+    wrong = suspect
+    if start is None and layout.other_bins.size > 0:  # others are fitted once more
+        wrong = suspect & ~_may_return(solution)
+    if wrong.any():
+        part = [values.rows(wrong) for values in data]
+        systematic[wrong] = systematic_of(layout, part, solution.theta[wrong])
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
     unknown = np.full_like(covariance, np.nan)
@@ -215,6 +260,9 @@ def _level_from_others(
         limit = np.where(pieces, dof_e * mean + np.sqrt(dof_e) * std * quantile, limit)
     suspect = cost > limit
     dof = dof_e + dof_o
+    correction = student_variance(dof)
+    if pieces.any():  # as `VarianceModel.information_correction` line by line
+        correction = np.where(pieces, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
     pooled = solution.group_cost.sum(axis=-1) / dof
     return _Level(
         np.where(suspect, level, pooled),
@@ -222,7 +270,7 @@ def _level_from_others(
         expected,
         suspect,
         noise.mean_variances * level[:, None],
-        student_variance(dof),
+        correction,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral, Real
 
 import numpy as np
 import numpy.typing as npt
@@ -93,7 +94,7 @@ class JointLayout:
         bins = np.arange(first, last + 1)
         excited = np.ones(bins.size, bool)
         if self.harmonics is not None:
-            excited = np.isin(bins, np.asarray(self.harmonics) * self.periods)
+            excited = np.isin(bins, whole_harmonics(self.harmonics) * self.periods)
         parameters = self.structure.parameters
         if excited.sum() <= self.structure.fewest_lines:
             raise ValueError(
@@ -173,14 +174,58 @@ class JointLayout:
         return ~excited
 
     def _check(self) -> None:
-        for name in ("sample_rate_hz", "samples_per_period", "periods"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: {getattr(self, name)}, expected above 0")
-        low, high = self.band_hz
-        if not 0 <= low < high:
-            raise ValueError(f"band_hz: {self.band_hz}, expected 0 <= low < high")
+        for name, least in (("samples_per_period", 1), ("periods", 1), ("transient_terms", 1)):
+            value = getattr(self, name)
+            if name == "transient_terms" and value is None:
+                continue
+            if not (isinstance(value, Integral) and int(value) >= least):
+                raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
+        rate_hz = _number(self.sample_rate_hz)
+        if not 0 < rate_hz < np.inf:
+            raise ValueError(f"sample_rate_hz: {self.sample_rate_hz!r}, expected above 0, finite")
+        try:
+            low, high = (_number(edge) for edge in self.band_hz)
+        except (TypeError, ValueError):
+            low = high = np.nan
+        if not 0 <= low < high <= rate_hz / 2 * (1 + 1e-9):
+            raise ValueError(
+                f"band_hz: {self.band_hz!r}, expected (low, high) with 0 <= low < high <= "
+                f"{rate_hz / 2:g} Hz, half the sample rate"
+            )
+        if not isinstance(self.structure, ModelStructure):
+            raise ValueError(f"structure: {self.structure!r}, expected a ModelStructure")
+        if self.structure.domain == "z" and self.structure.sample_rate_hz != rate_hz:
+            raise ValueError(
+                f"structure.sample_rate_hz: {self.structure.sample_rate_hz:g}, expected that of "
+                f"the record, {rate_hz:g} Hz"
+            )
         ratio = self.input_noise_ratio
-        if ratio is not None and not ratio >= 0:
-            raise ValueError(f"input_noise_ratio: {ratio}, expected 0 or above")
-        if self.transient_terms is not None and self.transient_terms < 1:
-            raise ValueError(f"transient_terms: {self.transient_terms}, expected at least 1")
+        if ratio is not None and not 0 <= _number(ratio) < np.inf:
+            raise ValueError(f"input_noise_ratio: {ratio!r}, expected 0 or above, finite")
+
+
+def _number(value: object) -> float:
+    """NaN where it is none."""
+    return float(value) if isinstance(value, Real) else float("nan")
+
+
+def whole_harmonics(harmonics: npt.ArrayLike) -> IntArray:
+    """(F,) int.
+
+    Raises
+    ------
+    ValueError
+        If they are no whole numbers.
+    """
+    values = np.asarray(harmonics).ravel()
+    if values.size == 0:
+        return values.astype(np.int64)
+    whole = values.dtype.kind in "iu"
+    if values.dtype.kind == "f":
+        whole = bool(np.isfinite(values).all() and (values % 1 == 0).all())
+    if not whole:
+        raise ValueError(
+            f"harmonics: {values[:5].tolist()}... of type {values.dtype}, expected whole multiples "
+            "of the sample rate over the samples per period"
+        )
+    return values.astype(np.int64)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.joint_layout import whole_harmonics
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.identification.single_point import single
@@ -91,7 +92,7 @@ def identify_poles_from_bins(
         bins.sample_rate_hz,
         bins.samples_per_period,
         bins.periods,
-        np.ascontiguousarray(bins.harmonics, np.int64).tobytes(),
+        whole_harmonics(bins.harmonics).tobytes(),
         (float(band_hz[0]), float(band_hz[1])),
         structure or ModelStructure(),
         input_noise_ratio,

@@ -42,7 +42,7 @@ class Evidence:
     covariance, total_covariance : (batch, n, n) float
         Of the coefficients; NaN where it cannot be told.
     variance_model : (batch,) str
-    level_known : bool
+    level_known : bool or (batch,) bool
         Whether the variance is known otherwise than from the residuals.
     noise_variance : (batch, 2) float or None
         See `PolesBatch`.
@@ -57,7 +57,7 @@ class Evidence:
     covariance: FloatArray
     total_covariance: FloatArray
     variance_model: npt.NDArray[np.str_]
-    level_known: bool
+    level_known: bool | BoolArray
     noise_variance: FloatArray | None = None
 
     @classmethod
@@ -130,7 +130,8 @@ def assemble(
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
         for where, status in (
-            (not evidence.level_known, PolesStatus.NO_COVARIANCE),
+            (~np.asarray(evidence.level_known), PolesStatus.NO_COVARIANCE),
+            (~np.isfinite(covariance[:, 0, 0]), PolesStatus.NO_COVARIANCE),
             (evidence.suspect, PolesStatus.MODEL_ERROR),
             ((poles.real >= 0).any(axis=-1), PolesStatus.UNSTABLE_POLE),
             (~np.isfinite(poles).any(axis=-1), PolesStatus.NO_RESONANCE),

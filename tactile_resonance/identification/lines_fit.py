@@ -146,6 +146,8 @@ class LinesPlan:
             numerator = PolynomialBasis.on_lines(
                 x, self.structure.numerator_order, weight_u / mean_u
             )
+            if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
+                break
             problem = Problem((BinGroup(denominator.values, numerator.values),))
             plan = LinesPlan(
                 self.frequency_hz, self.structure, problem, self.variable, denominator, numerator

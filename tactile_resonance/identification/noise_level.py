@@ -105,7 +105,8 @@ def f_quantile(probability: float, dof_1: FloatArray, dof_2: FloatArray) -> Floa
     approximation ends.
     """
     normal = _normal_quantile(probability)
-    a, b = 2 / (9 * np.asarray(dof_1)), 2 / (9 * np.asarray(dof_2))
+    with np.errstate(divide="ignore"):
+        a, b = 2 / (9 * np.asarray(dof_1)), 2 / (9 * np.asarray(dof_2))
     if a.size == b.size == 1:  # numbers are faster than arrays of one
         a, b = a.reshape(())[()], b.reshape(())[()]
     bottom = (1 - b) ** 2 - normal**2 * b
@@ -217,7 +218,8 @@ def two_channels(
     whole = bool(usable.all())
     scale = variance.sum(axis=-1, keepdims=True) / lines[:, None]
     level = gain if whole else np.where(usable, gain, 0.0)
-    level = level / np.maximum(level.mean(axis=-1, keepdims=True), np.finfo(float).tiny)
+    mean = level.sum(axis=-1, keepdims=True) / lines[:, None]
+    level = level / np.maximum(mean, np.finfo(float).tiny)
     sample = variance / scale
     weight = usable.astype(float)
     for _ in range(REWEIGHTINGS):

@@ -75,6 +75,8 @@ def choose_order(
             for order in (2, 4, 6)
             for terms in (1, 2, 4, 6, 8)
         ]
+    if not candidates:
+        raise ValueError("candidates: none given, expected one structure at least")
     poles = tuple(identify_poles(frf, band_hz, structure) for structure in candidates)
     mdl = tuple(_description_length(p) for p in poles)
     chosen = int(np.argmin(mdl))

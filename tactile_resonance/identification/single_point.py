@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import comb
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance.identification.covariance import real_covariance
 from tactile_resonance.identification.result import (
@@ -54,24 +56,22 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
 
     found = poles
     if known and residue is not None:
-        real = _significant(batch.residues[index][there], residue, int(batch.lines[index]))
+        residues, lines = batch.residues[index][there], int(batch.lines[index])
+        real = _significant(residues, residue, lines)
+        if not real.any() and poles.size > 1:
+            # neighbours nearer than their widths: neither is certain alone, both together are
+            sensitivity = model.residue_sensitivity(poles)
+            real[:] = _significant_together(residues, sensitivity, coefficients, lines)
         there[there] = real
         poles, residue = poles[real], residue[real]
         if not real.any():
             status, residue = PolesStatus.NO_RESONANCE, None
-            notes = [
-                f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
-                "noise makes"
-                for pole in found
-            ] + list(notes)
-
-    if status is PolesStatus.OK and poles.size and not known:
-        status = PolesStatus.NO_COVARIANCE
-        notes = [
-            "the variance of each line has too few degrees of freedom to tell the uncertainty: "
-            "record more periods or realisations",
-            *notes,
+        left_out = [
+            f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
+            "noise makes"
+            for pole in found[~real]
         ]
+        notes = [*left_out, *notes]
 
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
@@ -125,11 +125,28 @@ def _significant(
     return kept
 
 
+def _significant_together(
+    residues: ComplexArray, sensitivity: ComplexArray, coefficients: FloatArray, lines: int
+) -> bool:
+    """Whether noise alone would not make all of them: as `_significant`, over the choices of lines."""
+    stacked = np.concatenate([sensitivity.real, sensitivity.imag])  # (2 n, p)
+    p = stacked.shape[-1]
+    covariance = stacked @ coefficients[:p, :p] @ stacked.T
+    vector = np.concatenate([residues.real, residues.imag])
+    try:
+        distance = vector @ np.linalg.solve(covariance, vector)
+    except np.linalg.LinAlgError:
+        return True
+    chance = NOISE_PASSES_FOR_A_MODE / comb(max(lines, residues.size), residues.size)
+    return not distance < special.chdtri(vector.size, chance)
+
+
 def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:
     low_hz, high_hz = batch.band_hz
     structure = batch.structure
     sentences = {
-        PolesStatus.TOO_FEW_LINES: f"{int(batch.lines[index])} lines in {low_hz:g}-{high_hz:g} Hz, "
+        PolesStatus.TOO_FEW_LINES: f"{int(batch.lines[index])} lines with finite values in "
+        f"{low_hz:g}-{high_hz:g} Hz, "
         f"{structure.parameters} parameters need at least {structure.fewest_lines}",
         PolesStatus.NOT_CONVERGED: "the iterations found no minimum",
         PolesStatus.ILL_CONDITIONED: f"condition number {batch.condition_number[index]:.2g}: the "
@@ -137,12 +154,27 @@ def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) ->
         PolesStatus.NO_RESONANCE: f"no complex pole pair in {low_hz:g}-{high_hz:g} Hz",
         PolesStatus.UNSTABLE_POLE: "a pole in the right half plane: the sensor is passive, so the "
         "model is wrong",
-        PolesStatus.NO_COVARIANCE: "the variance is not known independently of the fit: a model "
-        "error would not show",
-        PolesStatus.MODEL_ERROR: f"{_contradiction(batch, index)}: the model leaves something out, "
-        "rely on the total covariance",
+        PolesStatus.NO_COVARIANCE: _without_covariance(batch, index),
+        PolesStatus.MODEL_ERROR: f"{_contradiction(batch, index)}: the model leaves something out"
+        + (", rely on the total covariance" if _has_total(batch, index) else ""),
     }
     return sentences.get(status, "")
+
+
+def _has_total(batch: PolesBatch, index: tuple[int, ...]) -> bool:
+    return bool(np.isfinite(batch.total_covariance[index]).any())
+
+
+def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
+    """Why there is none."""
+    if np.isfinite(batch.cost[index]):
+        return (
+            "the variance of each line has too few degrees of freedom to tell the uncertainty: "
+            "record more periods or realisations"
+        )
+    return "the variance is not known independently of the fit: a model error would not show" + (
+        " unless it is smooth" if _has_total(batch, index) else ""
+    )
 
 
 def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
+from numbers import Integral
 
 DEFAULT_RESIDUAL_TERMS = 6
 
@@ -42,13 +44,14 @@ class ModelStructure:
     delay: bool = False
 
     def __post_init__(self) -> None:
-        if self.order < 1:
-            raise ValueError(f"order: {self.order}, expected at least 1")
-        if self.numerator_order < 0:
-            raise ValueError(f"numerator_order: {self.numerator_order}, expected at least 0")
+        for name, least in (("order", 1), ("numerator_order", 0)):
+            value = getattr(self, name)
+            whole = isinstance(value, Integral) and not isinstance(value, bool)
+            if not (whole and value >= least):
+                raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
         if self.domain not in ("s", "z"):
             raise ValueError(f"domain: {self.domain!r}, accepted are 's' and 'z'")
-        if self.domain == "z" and not (self.sample_rate_hz and self.sample_rate_hz > 0):
+        if self.domain == "z" and not (self.sample_rate_hz and 0 < self.sample_rate_hz < inf):
             raise ValueError(
                 f"sample_rate_hz: {self.sample_rate_hz}, the z-domain needs a rate above 0"
             )

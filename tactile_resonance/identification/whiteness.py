@@ -69,7 +69,7 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     `noise_level.f_quantile`.
     """
     score, levels = _best_level(residual, parameters)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         among = -np.expm1(levels * np.log1p(-special.ndtr(-score)))
     return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
 
@@ -87,6 +87,7 @@ def _limit(levels: int) -> float:
     return float(-special.ndtri(each))
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, int]:
     """(...) normal score of the most significant level, and how many levels there are."""
     lines = residual.shape[-1]
@@ -101,9 +102,8 @@ def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, in
         ratio, a, b = _whole(lines, parameters)
     else:
         ratio, a, b = _terms(counts, np.count_nonzero(residual, axis=-1)[..., None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.cbrt(smooth / (total - smooth) * ratio)
-        score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
+    root = np.cbrt(smooth / (total - smooth) * ratio)
+    score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
     return score, counts.size
 
 

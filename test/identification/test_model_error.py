@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 import scipy.io
+import scipy.signal
 from scipy import stats
 
 from benchmarks.poles_plant import (
@@ -17,6 +18,7 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.model_error import correlation_length, model_error_factor
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
@@ -134,6 +136,21 @@ def test_one_realisation_of_a_nonlinear_circuit(shared_data, band):
         # the best linear approximation of ten realisations
         assert abs(poles.f0_hz[0] - 69.536) < 3 * std[0]
         assert abs(poles.damping_ratio[0] - 0.04877) < 3 * std[1]
+        # of which it is a few thousandths, and a few hundredths
+        assert std[0] < 0.3
+        assert std[1] < 0.004
+
+
+def test_correlation_of_residuals_has_its_length():
+    """``1 + 2 sum rho**k`` of a first-order process; 1 for white ones."""
+    rng = np.random.default_rng(10)
+    for rho in (0.0, 0.5, 0.9):
+        white = rng.standard_normal((400, 2000, 2)).view(complex)[..., 0]
+        residual = scipy.signal.lfilter([1.0], [1.0, -rho], white)
+        length = np.median(correlation_length(residual))
+        assert length == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+        factor = model_error_factor(residual, np.full(400, 6.0), np.full(400, 2.0))
+        assert np.median(factor) == pytest.approx(3 * length)
 
 
 @pytest.mark.parametrize("distance_hz", [2.0, 5.0, 20.0])
@@ -159,5 +176,6 @@ def test_two_modes_taken_for_one_are_within_the_total_covariance(distance_hz, sh
     estimate = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
     truths = np.array([[250.0, 0.02], [250.0 + distance_hz, 0.02]])
     error = np.abs(estimate - truths[:, None]) / std  # (2 modes, runs, 2)
-    within = error.max(axis=-1).min(axis=0) < 3
-    assert within.mean() > 0.8
+    nearest = error.max(axis=-1).min(axis=0)
+    assert np.mean(nearest < 3) > 0.8
+    assert np.median(nearest) > 0.3  # nor is everything within it

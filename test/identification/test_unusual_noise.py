@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that start values show badly: far louder at the input, the same in both channels, peaked."""
+
+from functools import cached_property
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks.poles_plant import (
+    BAND_HZ,
+    HARMONICS,
+    SAMPLE_RATE_HZ,
+    SAMPLES_PER_PERIOD,
+    Plant,
+    judge,
+)
+from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.result import PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+
+RUNS = 2000
+
+
+class LoudInput(Plant):
+    """Noise of the input 40 dB above that of the output [V^2]."""
+
+    @cached_property
+    def noise(self):
+        return super().noise[0], 1e4 * super().noise[0]
+
+
+def fits(plant, u, y):
+    plan = JointPlan(
+        *(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, plant.periods, HARMONICS, BAND_HZ),
+        ModelStructure(2, 2),
+    )
+    return plan.from_bins(u, y)
+
+
+def assert_honest(result, lowest, plant=None):
+    """Coverage of the ellipse, alarms, and where a bound is known the distance to it."""
+    errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
+    bound = np.eye(2) if plant is None else plant.bound()
+    ratio, coverage = judge(errors, result.covariance[:, 0], bound)
+    assert stats.binom.cdf(coverage * RUNS, RUNS, lowest) > 0.0005
+    assert stats.binom.sf(coverage * RUNS - 1, RUNS, 0.97) > 0.0005
+    if plant is not None:
+        assert np.all(ratio * RUNS / stats.chi2.ppf(0.9995, RUNS) <= 1.10)
+    alarms = result.has_status(PolesStatus.MODEL_ERROR).sum()
+    assert stats.binom.sf(alarms - 1, RUNS, 1e-2) > 0.0005
+
+
+def circular(rng, size, variance):
+    return np.sqrt(variance / 2) * rng.standard_normal((RUNS, size, 2)).view(complex)[..., 0]
+
+
+@pytest.mark.parametrize("periods", [2, 8])
+def test_input_noise_far_above_that_of_the_output(periods):
+    plant = LoudInput(0.02, 60.0, periods)
+    u, y = plant.noisy(np.random.default_rng(1), RUNS, plant.bins())
+    assert_honest(fits(plant, u, y), 0.94, plant)
+
+
+@pytest.mark.parametrize("periods", [2, 8])
+def test_nine_tenths_of_both_noises_are_one(periods):
+    """The input's ten times as large [V]."""
+    plant = Plant(0.02, 40.0, periods)
+    bins, rng = plant.bins(), np.random.default_rng(2)
+    size, variance = bins.size, plant.noise[0]
+    both = circular(rng, size, variance)
+    y = plant.output(bins) + 0.9 * both + np.sqrt(0.19) * circular(rng, size, variance)
+    assert_honest(fits(plant, plant.input(bins) + 10 * both, y), 0.93)
+
+
+@pytest.mark.parametrize("periods", [3, 8])
+def test_noise_with_a_peak_at_the_resonance(periods):
+    plant = Plant(0.02, 40.0, periods)
+    bins, rng = plant.bins(), np.random.default_rng(3)
+    peak = 1 + 30 * np.exp(-((np.linspace(-5, 5, bins.size)) ** 2))
+    y = plant.output(bins) + circular(rng, bins.size, plant.noise[0] * peak)
+    u = plant.input(bins) + circular(rng, bins.size, plant.noise[1])
+    result = fits(plant, u, y)
+    assert np.mean(result.variance_model == "per line") > 0.9
+    assert_honest(result, 0.93)
+
+
+def test_a_level_from_few_lines_widens_the_ellipse():
+    """One period, nine lines: a level of 5.5 complex degrees of freedom; ignored it costs 3 % of coverage."""
+    plant, band_hz, runs = Plant(0.02, 40.0, 1), (240.0, 260.0), 4000
+    variance_y, variance_u = plant.noise
+    plan = JointPlan(
+        *(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 1, HARMONICS, band_hz),
+        ModelStructure(2, 2),
+        input_noise_ratio=variance_u / variance_y,
+    )
+    result = plan.from_bins(*plant.noisy(np.random.default_rng(4), runs, plan.bins))
+    errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
+    coverage = judge(errors, result.covariance[:, 0], np.eye(2))[1]
+    # of a Student distribution of that variance: 0.9395
+    assert stats.binom.cdf(coverage * runs, runs, 0.9395) > 0.0005
+    assert stats.binom.sf(coverage * runs - 1, runs, 0.9395) > 0.0005
