@@ -360,14 +360,13 @@ def _systematic(
     for parity in (0, 1):
         left_out = np.arange(usable.shape[1]) % 2 == parity
         half = replace(part, variance_y=np.where(left_out, np.inf, part.variance_y))
-        poles.append(modes_in_band(plan.fit(half).model.poles_rad_s(), band_hz))
+        poles.append(modes_in_band(plan.compared(half), band_hz))
     systematic = difference_of_halves(*poles)
     structure = richer(plan.structure)
     if usable[rows].sum(axis=-1).min() > structure.fewest_lines:
-        model = LinesPlan.on_lines(plan.frequency_hz, structure).fit(part).model
+        found = LinesPlan.on_lines(plan.frequency_hz, structure).compared(part)
         systematic = systematic + difference_of_models(
-            modes_in_band(fit.model.poles_rad_s()[rows], band_hz),
-            modes_in_band(model.poles_rad_s(), band_hz),
+            modes_in_band(fit.model.poles_rad_s()[rows], band_hz), modes_in_band(found, band_hz)
         )
     return systematic
 

@@ -81,7 +81,7 @@ class JointPlan(JointLayout):
         u, y = self._checked(u, y)
         shape = y.shape[:-1]
         flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
-        chunk = self.problem.chunk
+        chunk = self.problem.chunk_of(flat_u.shape[0])
         starts = range(0, max(flat_u.shape[0], 1), chunk)
         parts = [fit_bins(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts]
         return result_of(self, JointFit.joined(parts), shape, METHOD, self.level_known)

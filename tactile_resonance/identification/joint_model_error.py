@@ -11,6 +11,7 @@ import numpy.typing as npt
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.model_error import (
+    COMPARISON_ITERATIONS,
     difference_of_halves,
     difference_of_models,
 )
@@ -74,5 +75,5 @@ def _fit(
 ) -> FloatArray:
     """(batch, n) coefficients; of several realisations those of the first."""
     if len(shape) == 2:
-        return minimise(problem, data, start).theta
-    return minimise_shared(problem, data, shape[1], start).theta[:, 0]
+        return minimise(problem, data, start, COMPARISON_ITERATIONS).theta
+    return minimise_shared(problem, data, shape[1], start, COMPARISON_ITERATIONS).theta[:, 0]

@@ -23,6 +23,7 @@ from tactile_resonance.identification.dense import (
     minimise_dense,
 )
 from tactile_resonance.identification.model import RationalModel, Variable
+from tactile_resonance.identification.model_error import COMPARISON_ITERATIONS
 from tactile_resonance.identification.problem import START_ITERATIONS, Problem
 from tactile_resonance.identification.solver import minimise
 from tactile_resonance.identification.structure import ModelStructure
@@ -115,6 +116,16 @@ class LinesPlan:
         return LinesFit(
             self._model(theta), cost, parameters, condition, converged, data.turned(residual)
         )
+
+    def compared(self, data: BinData) -> ComplexArray:
+        """(batch, order) poles [rad/s] of a fit that others are compared with.
+
+        Of the batched solver alone where it is that of `fit`, and of few iterations.
+        """
+        if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
+            return self.fit(data).model.poles_rad_s()
+        theta = minimise(self.problem, [data], None, COMPARISON_ITERATIONS).theta
+        return self._model(theta).poles_rad_s()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:

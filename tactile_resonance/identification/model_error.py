@@ -16,6 +16,9 @@ from tactile_resonance.identification.structure import ModelStructure
 
 # A cost that noise alone exceeds once in a thousand fits counts as model error.
 MODEL_ERROR_PROBABILITY = 1e-3
+# Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
+# in particular.
+COMPARISON_ITERATIONS = 8
 
 
 def model_error_factor(

@@ -29,6 +29,8 @@ FloatArray = npt.NDArray[np.float64]
 START_ITERATIONS = 2
 # Values in a chunk's arrays: few enough for the cache, enough to make little of the calls.
 CHUNK_VALUES = 65536
+# Up to so many points are faster one by one: `OnePoint` makes fewer calls than a batch needs.
+FEW = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +77,12 @@ class Problem:
 
     @property
     def chunk(self) -> int:
-        """Points that are computed together."""
+        """Most points that are computed together."""
         return max(1, CHUNK_VALUES // max(1, sum(group.size for group in self.groups)))
+
+    def chunk_of(self, batch: int) -> int:
+        """Points of a batch that are computed together."""
+        return 1 if batch <= FEW else self.chunk
 
     def points(self, data: Sequence[BinData]) -> Any:
         """`OnePoint` or `ManyPoints` of these data: the same methods, on coefficients (n,) or (batch, n)."""

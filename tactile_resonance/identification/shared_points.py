@@ -18,7 +18,7 @@ from tactile_resonance.identification.bins import BinData, BinGroup
 from tactile_resonance.identification.dense import minimise_dense
 from tactile_resonance.identification.many_points import ManyPoints, ManyValues
 from tactile_resonance.identification.problem import START_ITERATIONS, Problem
-from tactile_resonance.identification.solver import Solution, refine
+from tactile_resonance.identification.solver import MAX_ITERATIONS, Solution, refine
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -150,7 +150,11 @@ def start_shared(problem: Problem, data: Sequence[BinData], records: int) -> Flo
 
 
 def minimise_shared(
-    problem: Problem, data: Sequence[BinData], records: int, start: FloatArray | None = None
+    problem: Problem,
+    data: Sequence[BinData],
+    records: int,
+    start: FloatArray | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Solution:
     """Minimise the cost of each point of a batch that is computed together; see `solver.minimise`.
 
@@ -161,7 +165,8 @@ def minimise_shared(
         that did not converge are fitted again by the dense solver.
     """
     begin = start_shared(problem, data, records) if start is None else start
-    return refine_shared(problem, SharedPoints(problem, data, records), data, begin)
+    points = SharedPoints(problem, data, records)
+    return refine_shared(problem, points, data, begin, None, max_iterations)
 
 
 def refine_shared(
@@ -170,10 +175,11 @@ def refine_shared(
     data: Sequence[BinData],
     start: FloatArray,
     value: SharedValues | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Solution:
     """From start values (batch, M, n); see `minimise_shared`."""
     records = start.shape[1]
-    solution = refine(points, start, value)
+    solution = refine(points, start, value, max_iterations)
     for k in np.flatnonzero(~solution.converged):
         row = [values.rows(rows_of(np.array([k]), records)) for values in data]
         _refit(problem, solution, int(k), row)

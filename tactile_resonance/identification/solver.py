@@ -71,7 +71,7 @@ def minimise(
         Evaluations of the model after the first one.
     """
     batch = data[0].y.shape[0]
-    chunk = problem.chunk
+    chunk = problem.chunk_of(batch)
     parts = []
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for first in range(0, max(batch, 1), chunk):
@@ -167,8 +167,7 @@ def _refine_many(points: Any, theta: FloatArray, value: Any, max_iterations: int
     for _ in range(max_iterations):
         now = slice(None) if active.size == batch else active
         step, decrement = points.step(normal[now], gradient[now], damping[now])
-        tolerance = np.maximum(limit * cost[now], floor[now])
-        done = (decrement <= tolerance) & (damping[now] == 0)
+        done = (decrement <= np.maximum(limit * cost[now], floor[now])) & (damping[now] == 0)
         theta[active[done]] -= step[done]
         cost[active[done]] -= decrement[done]
         converged[active[done]] = True

@@ -158,7 +158,7 @@ def test_leading_axes_that_do_not_fit_are_named():
 
 def test_harmonics_kept_with_bins_are_whole_too():
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
-    u, y = (plan.transform(x) for x in record())
+    u, y = (plan.transform(x)[None] for x in record())
     bins = BandBins(int(plan.bins[0]), u, y, HARMONICS + 0.5, RATE_HZ, SAMPLES, PERIODS)
     with pytest.raises(ValueError, match="harmonics: "):
         identify_poles_from_bins(bins, (200, 300), BARE)
