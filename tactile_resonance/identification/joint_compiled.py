@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -19,11 +18,11 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.identification import one_mode
-from tactile_resonance.identification.bins import BinGroup
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
 from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
+from tactile_resonance.identification.kernel_tables import GroupTable
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
@@ -53,7 +52,7 @@ class CompiledJointPlan(JointPlan):
         Without numba.
     ValueError
         As `JointPlan`, and for structures other than one mode in the s-domain, and where there are
-        no bins between harmonics.
+        no bins between harmonics or more than fit the kernel's memory.
     """
 
     def __post_init__(self) -> None:
@@ -68,15 +67,18 @@ class CompiledJointPlan(JointPlan):
                 f"periods: {self.periods} without bins between harmonics, compiled needs at least 2 "
                 "periods of a periodic input"
             )
-        _kernel()
+        most = _kernel().MOST_BINS
+        if max(self.other_bins.size, self.excited_bins.size) > most:
+            raise ValueError(
+                f"periods: {self.periods} make {self.other_bins.size} bins between harmonics of "
+                f"{self.band_hz} Hz, compiled takes up to {most}"
+            )
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records; see `JointPlan.from_bins`."""
-        fits = u.shape[-1:] == self.bins.shape and y.shape[-1:] == self.bins.shape
-        if not fits or self.problem.driven is self.problem:
-            return super().from_bins(u, y)  # which says what is wrong, or takes few lines
-        if u.shape != y.shape:
-            u, y = np.broadcast_arrays(u, y)
+        u, y = self._checked(u, y)
+        if self.problem.driven is self.problem:
+            return super().from_bins(u, y)  # which takes few lines
         kernel = _kernel()
         shape = y.shape[:-1]
         flat_u, flat_y = (
@@ -166,35 +168,11 @@ class CompiledJointPlan(JointPlan):
         )
         return (
             (self.others_at, self.excited_at),
-            tuple(_constants_of(group) for group in self.problem.groups),
+            tuple(GroupTable.of(group, self.problem.sizes) for group in self.problem.groups),
             (bands.starts, bands.counts),
             (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),
             limits,
         )
-
-
-def _constants_of(group: BinGroup) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-    """Bases of a group and their products, as `kernel_model` takes them."""
-    empty = np.empty((group.size, 0), complex)
-    numerator, transient = (
-        empty if basis is None else basis for basis in (group.numerator, group.transient)
-    )
-    blocks = (group.denominator[:, :-1], numerator, transient)
-    bases = [part for basis in (group.denominator, *blocks[1:]) for part in _parts(basis)]
-    products: list[FloatArray] = []
-    for i, j in combinations_with_replacement(range(3), 2):
-        product = blocks[i].conj()[:, :, None] * blocks[j][:, None, :]  # (K, n_i, n_j)
-        if i == j:
-            row, column = np.triu_indices(blocks[i].shape[1])
-            products.append(_parts(product[:, row, column])[0])
-        else:
-            products += _parts(product.reshape(group.size, -1))
-    return tuple(bases), tuple(products)
-
-
-def _parts(columns: ComplexArray) -> list[FloatArray]:
-    """Real and imaginary parts, (n, K), of (K, n)."""
-    return [np.ascontiguousarray(part.T) for part in (columns.real, columns.imag)]
 
 
 def _kernel() -> Any:
@@ -216,7 +194,7 @@ def _replaced(result: PolesBatch, rows: npt.NDArray, other: PolesBatch) -> Poles
     """With other results in some rows."""
 
     def merged(values: npt.NDArray, new: npt.NDArray) -> npt.NDArray:
-        values = values.astype(np.result_type(values, new))
+        values = values.astype(np.result_type(values, new), copy=False)
         values[rows] = new
         return values
 

@@ -1,209 +1,82 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops over bins and small matrices, compiled by numba for `joint_kernel`.
-
-Complex numbers are pairs of arrays, and loops touch few of them: so they become vector instructions.
-"""
+"""Small matrices of the compiled kernels: normal equations as `kernel_bins.add_up` leaves them."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
 
-# Sums may be reordered, NaN and infinity keep their meaning.
-OPTIONS: dict[str, Any] = {
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
-    "error_model": "numpy",
-}
-compiled = njit(**OPTIONS)
+from tactile_resonance.identification.kernel_bins import compiled
 
 
 @compiled
-def dot(x, y):
-    """Sum of products."""
-    total = 0.0
-    for k in range(x.size):
-        total += x[k] * y[k]
-    return total
+def eliminate(normal, step):
+    """Solve normal equations (n, n + 1, flat, the gradient in the last column); whether they have a solution.
 
-
-@compiled
-def real_dot(x_re, x_im, y_re, y_im):
-    """Real part of the sum of products of complex numbers."""
-    total = 0.0
-    for k in range(x_re.size):
-        total += x_re[k] * y_re[k] - x_im[k] * y_im[k]
-    return total
-
-
-@compiled
-def real_dot_row(rows_re, rows_im, row, y_re, y_im):
-    """`real_dot` with a row of (n, K) arrays: no view is made of it, which would be counted."""
-    total = 0.0
-    for k in range(y_re.size):
-        total += rows_re[row, k] * y_re[k] - rows_im[row, k] * y_im[k]
-    return total
-
-
-@compiled
-def dot_row(rows, row, y):
-    """`dot` with a row of an (n, K) array."""
-    total = 0.0
-    for k in range(y.size):
-        total += rows[row, k] * y[k]
-    return total
-
-
-@compiled
-def add_row(out, rows, row, factor):
-    """Add ``factor`` times a row of an (n, K) array."""
-    for k in range(out.size):
-        out[k] += factor * rows[row, k]
-
-
-@compiled
-def combine(basis_re, basis_im, coefficients, re, im):
-    """Add ``sum_i coefficients[i] basis[i]`` to (K,) arrays."""
-    for i in range(coefficients.size):
-        add_row(re, basis_re, i, coefficients[i])
-        add_row(im, basis_im, i, coefficients[i])
-
-
-@compiled
-def add_scaled(out, x, factor):
-    """Add ``factor x``."""
-    for k in range(x.size):
-        out[k] += factor * x[k]
-
-
-@compiled
-def scale(out, x, y, factor):
-    """``factor x y``."""
-    for k in range(x.size):
-        out[k] = factor * x[k] * y[k]
-
-
-@compiled
-def difference(out, x, y):
-    """``x - y``."""
-    for k in range(x.size):
-        out[k] = x[k] - y[k]
-
-
-@compiled
-def two_products(out, x, p, y, q, factor):
-    """``x p + factor y q``."""
-    for k in range(x.size):
-        out[k] = x[k] * p[k] + factor * y[k] * q[k]
-
-
-@compiled
-def weighted_power(out, weight, re, im):
-    """``weight |x|^2``."""
-    for k in range(re.size):
-        out[k] = weight[k] * (re[k] * re[k] + im[k] * im[k])
-
-
-@compiled
-def invert(re, im, squared):
-    """``1 / x`` in place, and its squared modulus."""
-    for k in range(re.size):
-        p, q = re[k], im[k]
-        factor = 1 / (p * p + q * q)
-        re[k], im[k], squared[k] = p * factor, -q * factor, factor
-
-
-@compiled
-def multiply(re, im, by_re, by_im):
-    """``x by`` in place."""
-    for k in range(re.size):
-        p, q = re[k], im[k]
-        re[k], im[k] = p * by_re[k] - q * by_im[k], p * by_im[k] + q * by_re[k]
-
-
-@compiled
-def square_block(normal, first, size, products, weight):
-    """Set the block of one kind of coefficient: `products` are of its upper triangle."""
-    row = 0
-    for i in range(first, first + size):
-        for j in range(i, first + size):
-            total = dot_row(products, row, weight)
-            normal[i, j] = total
-            normal[j, i] = total
-            row += 1
-
-
-@compiled
-def cross_block(normal, first, size, products_re, products_im, w_re, w_im):
-    """Set the block of two kinds of coefficients, from `first` and of `size`."""
-    row = 0
-    for i in range(first[0], first[0] + size[0]):
-        for j in range(first[1], first[1] + size[1]):
-            total = real_dot_row(products_re, products_im, row, w_re, w_im)
-            normal[i, j] = total
-            normal[j, i] = total
-            row += 1
-
-
-@compiled
-def factorise(normal, unit, lower, trace):
-    """Cholesky factor of the normal matrix with unit diagonal; whether there is one."""
-    n = unit.size
-    for i in range(n):
-        if not normal[i, i] > 0:
+    Without pivoting, see `normal_equations.solve_positive`; `normal` is not kept.
+    """
+    n = step.size
+    width = n + 1
+    for j in range(n):
+        row = j * width
+        pivot = normal[row + j] * (1 + 1e-15)
+        if not pivot > 0:
             return False
-        unit[i] = 1 / np.sqrt(normal[i, i])
-    for i in range(n):
-        for j in range(i + 1):
-            total = normal[i, j] * unit[i] * unit[j] if i != j else 1.0 + trace
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            if i == j:
-                if not total > 0:
-                    return False
-                lower[i, i] = np.sqrt(total)
-            else:
-                lower[i, j] = total / lower[j, j]
+        inverse = 1 / pivot
+        normal[row + j] = inverse
+        for i in range(j + 1, n):
+            other = i * width
+            factor = normal[row + i] * inverse
+            for k in range(i, width):
+                normal[other + k] -= factor * normal[row + k]
+    for j in range(n - 1, -1, -1):
+        row = j * width
+        total = normal[row + n]
+        for k in range(j + 1, n):
+            total -= normal[row + k] * step[k]
+        step[j] = total * normal[row + j]
     return True
 
 
 @compiled
-def solve(lower, unit, right, step):
-    """Solution of the normal equations by that factor, in `step`."""
-    n = unit.size
-    for i in range(n):
-        total = right[i] * unit[i]
-        for k in range(i):
-            total -= lower[i, k] * step[k]
-        step[i] = total / lower[i, i]
-    for i in range(n - 1, -1, -1):
-        total = step[i]
-        for k in range(i + 1, n):
-            total -= lower[k, i] * step[k]
-        step[i] = total / lower[i, i]
-    for i in range(n):
-        step[i] *= unit[i]
+def invert(normal, inverse):
+    """Inverse (n, n) of a flat normal matrix, by sweeps, and its condition number.
 
-
-@compiled
-def spread_of_pieces(starts, counts, re, im):
-    """``log mean - mean log`` of the mean powers of pieces."""
-    pieces = starts.size
-    total, logs, product = 0.0, 0.0, 1.0
-    overall = (dot(re, re) + dot(im, im)) / re.size
-    for p in range(pieces):
-        part = 0.0
-        for k in range(starts[p], starts[p] + counts[p]):
-            part += re[k] * re[k] + im[k] * im[k]
-        part /= counts[p] * overall
-        total += part
-        product *= part  # few enough at a time to stay in range
-        if p % 8 == 7:
-            logs += np.log(product)
-            product = 1.0
-    logs += np.log(product)
-    return np.log(total / pieces) - logs / pieces
+    Infinite where there is none; see `covariance.invert_normal`.
+    """
+    n = inverse.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            value = normal[i * (n + 1) + j]
+            inverse[i, j] = value
+            inverse[j, i] = value
+    for k in range(n):
+        pivot = inverse[k, k]
+        if not pivot > 0:
+            return np.inf
+        factor = 1 / pivot
+        for i in range(n):
+            if i != k:
+                scale = inverse[i, k] * factor
+                for j in range(n):
+                    inverse[i, j] -= scale * inverse[k, j]
+                inverse[i, k] = scale
+        for j in range(n):
+            inverse[k, j] *= factor
+        inverse[k, k] = -factor
+    for i in range(n):
+        for j in range(i + 1):  # both halves: rounding made them differ
+            value = -0.5 * (inverse[i, j] + inverse[j, i])
+            inverse[i, j] = value
+            inverse[j, i] = value
+    before, after = 0.0, 0.0
+    for i in range(n):
+        if not inverse[i, i] > 0:
+            return np.inf
+        for j in range(i, n):
+            scale = normal[i * (n + 2)] * normal[j * (n + 2)] * (1 if i == j else 0.5)
+            before += normal[i * (n + 1) + j] ** 2 / scale
+            after += inverse[i, j] ** 2 * scale * (1 if i == j else 4)
+    return (before * after) ** 0.25
 
 
 @compiled

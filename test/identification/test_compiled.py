@@ -70,6 +70,27 @@ def test_one_point_and_more_axes():
     )
 
 
+def test_no_points_and_lists():
+    plain, compiled = plans(8, BARE)
+    u, y = points(Plant(0.02, 40.0, 8))
+    assert compiled.from_bins(u[:0], y[:0]).f0_hz.shape == plain.from_bins(u[:0], y[:0]).f0_hz.shape
+    assert_same(compiled.from_bins(u[:2].tolist(), y[:2].tolist()), plain.from_bins(u[:2], y[:2]))
+
+
+@pytest.mark.parametrize("terms", [1, 3, 4, 5])
+@pytest.mark.parametrize("numerator_order", [0, 1, 3, 4])
+def test_every_length_of_numerators(terms, numerator_order):
+    """Odd ones and even ones: the kernel takes terms in pairs."""
+    kind = (SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 8, HARMONICS, BAND_HZ)
+    structure = ModelStructure(2, numerator_order)
+    plain, compiled = (
+        kind_of(*kind, structure, transient_terms=terms)
+        for kind_of in (JointPlan, CompiledJointPlan)
+    )
+    u, y = points(Plant(0.02, 10.0, 8))
+    assert_same(compiled.from_bins(u, y), plain.from_bins(u, y))
+
+
 def test_one_input_for_many_outputs_and_wrong_shapes():
     plain, compiled = plans(8, BARE)
     u, y = points(Plant(0.02, 40.0, 8))
@@ -117,6 +138,8 @@ def test_what_is_not_compiled_is_refused():
         plans(8, ModelStructure(4, 4))
     with pytest.raises(ValueError, match="periods: 1 without bins between harmonics"):
         plans(1, BARE)
+    with pytest.raises(ValueError, match="periods: 120 make 4760 bins between harmonics"):
+        plans(120, BARE)
 
 
 def test_without_numba_it_says_what_to_install():
