@@ -26,16 +26,17 @@ class ForceHistory:
     def __init__(self, length_s: float = 60.0) -> None:
         self._length_ns = round(length_s * 1e9)
         self._samples: deque[tuple[int, float]] = deque()
-        self._lock = threading.Lock()
+        self._changed = threading.Condition(threading.RLock())
 
     def add(self, time_ns: int, force_n: float) -> None:
         """Take one force [N]; one older than the newest is of a clock set back: all before is forgotten."""
-        with self._lock:
+        with self._changed:
             if self._samples and time_ns < self._samples[-1][0]:
                 self._samples.clear()
             self._samples.append((time_ns, force_n))
             while self._samples[0][0] < time_ns - self._length_ns:
                 self._samples.popleft()
+            self._changed.notify_all()
 
     def mean(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Mean force from `start_ns` to `end_ns` [N] and its standard deviation.
@@ -50,7 +51,7 @@ class ForceHistory:
             NaN, NaN where nothing was heard in that time; a standard deviation of NaN where fewer than
             32 samples were.
         """
-        with self._lock:
+        with self._changed:
             forces = np.array([f for t, f in self._samples if start_ns <= t <= end_ns])
         if forces.size == 0:
             return float("nan"), float("nan")
@@ -59,15 +60,21 @@ class ForceHistory:
         means = np.array([batch.mean() for batch in np.array_split(forces, BATCHES)])
         return float(forces.mean()), float(means.std(ddof=1) / np.sqrt(BATCHES))
 
+    def wait(self, start_ns: int, end_ns: int, timeout_s: float) -> None:
+        """Until a source that streams is heard up to `end_ns`, where nothing since `start_ns` was yet."""
+        with self._changed:
+            if self.streams and self.newest()[0] < start_ns:
+                self._changed.wait_for(lambda: self.newest()[0] >= end_ns, timeout_s)
+
     @property
     def streams(self) -> bool:
         """Whether forces come again and again: then one that is not there is late, not unchanged."""
-        with self._lock:
+        with self._changed:
             if len(self._samples) < STREAM_SAMPLES:
                 return False
             return self._samples[-1][0] - self._samples[-STREAM_SAMPLES][0] < STREAM_SPAN_NS
 
     def newest(self) -> tuple[int, float]:
         """Time [ns] and force [N] heard last; 0 and NaN before the first."""
-        with self._lock:
+        with self._changed:
             return self._samples[-1] if self._samples else (0, float("nan"))

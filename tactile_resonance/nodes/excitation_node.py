@@ -40,6 +40,8 @@ PARAMETERS = (
 
 # How long a client may take to fetch a result.
 RESULT_TIMEOUT_S = 900
+# A stream of forces that is late for a block: less than what a device's buffer holds.
+LATE_FORCES_S = 2.0
 
 
 class NotReady(DeviceError):
@@ -258,10 +260,12 @@ class ExcitationNode(ManagedNode):
         """Force while the block was taken.
 
         Where none was heard then: the last one, of unknown accuracy, from a source that tells changes
-        only; unknown from one that streams, for its forces are late and the last may be from before the
-        contact.
+        only; one that streams is late, on a busy machine by seconds, and waited for; if it is silent the
+        force is unknown, for the last one may be from before the contact.
         """
-        force_n, std_n = self._forces.mean(start_ns, start_ns + round(length_s * 1e9))
+        end_ns = start_ns + round(length_s * 1e9)
+        self._forces.wait(start_ns, end_ns, LATE_FORCES_S)
+        force_n, std_n = self._forces.mean(start_ns, end_ns)
         if np.isnan(force_n) and not self._forces.streams:
             force_n = self._forces.newest()[1]
         return contact_from_message(self._pose, force_n, std_n)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The force of a block and its stated uncertainty against known noise."""
 
+import threading
+import time
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -54,6 +57,49 @@ def test_a_source_that_tells_changes_only_is_no_stream():
     for k in range(200):
         history.add(31 * 10**9 + k * 10_000_000, 0.01)
     assert history.streams
+
+
+def late_stream(begin_ns: int) -> tuple[ForceHistory, threading.Thread]:
+    """Forces of 10 mN, and a thread that brings a second of 12 mN more, late and at once."""
+    history = filled([0.01] * 301)
+
+    def bring():
+        time.sleep(0.2)
+        for k in range(101):
+            history.add(begin_ns + k * 10_000_000, 0.012)
+
+    return history, threading.Thread(target=bring)
+
+
+def test_a_late_stream_is_waited_for_until_the_end_of_the_block():
+    begin_ns = 3_500_000_000
+    history, thread = late_stream(begin_ns)
+    assert np.isnan(history.mean(begin_ns, begin_ns + 10**9)).all()
+    thread.start()
+    history.wait(begin_ns, begin_ns + 10**9, 30.0)
+    mean, std = history.mean(begin_ns, begin_ns + 10**9)
+    thread.join()
+    assert mean == pytest.approx(0.012)
+    assert std == pytest.approx(0, abs=1e-9)
+
+
+def test_a_stream_that_stays_silent_is_not_waited_for_for_ever():
+    silent = filled([0.01] * 301)
+    silent.wait(10**10, 2 * 10**10, 0.05)
+    assert np.isnan(silent.mean(10**10, 2 * 10**10)).all()
+
+
+@pytest.mark.parametrize(
+    ("heard", "begin_ns"),
+    [(5, 10**10), (301, 500_000_000)],
+    ids=["a source that tells changes only", "a block whose forces began to come"],
+)
+def test_nothing_is_waited_for_where_nothing_is_missing(heard, begin_ns):
+    history = filled([0.01] * heard)
+    waiting = threading.Thread(target=history.wait, args=(begin_ns, 2 * 10**10, 1e6), daemon=True)
+    waiting.start()
+    waiting.join(timeout=20.0)
+    assert not waiting.is_alive()
 
 
 def test_a_clock_set_back_forgets_what_was_before():
