@@ -18,6 +18,7 @@ from scipy import stats
 from benchmarks.poles_bias import tissue_bias
 from benchmarks.poles_methods import (
     BARE,
+    BATCH,
     Method,
     compare_methods,
     estimates_of,
@@ -204,9 +205,9 @@ def _against_scipy(methods: list[Method]) -> list[str]:
         ]
     single = time_s["joint, 2nd order, single"] / methods[0].time_s
     return [
-        "Times as fast as scipy.optimize.least_squares on the same cost (goal: 100): "
-        f"{'; '.join(figures)}. One fit in a thousand or two is suspected of a model error by chance, "
-        "and what is then fitted for comparison, by the plain estimator, takes as long as hundreds of "
+        "Times as fast as scipy.optimize.least_squares on the same cost (goal: 100), in batches of "
+        f"{BATCH} points: {'; '.join(figures)}. One fit in a thousand or two is suspected of a model "
+        "error by chance; what it is then compared with takes the plain estimator as long as dozens of "
         f"compiled fits. Single joint fit: {single:.2f} of the Fourier transform (goal: 0.3)."
     ]
 

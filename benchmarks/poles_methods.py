@@ -26,11 +26,12 @@ from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_batch, identify_poles
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_compiled import CompiledJointPlan
-from tactile_resonance.identification.result import PolesBatch, PolesStatus
+from tactile_resonance.identification.result import PolesBatch
 from tactile_resonance.identification.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)
-UNSUSPECTED = "joint compiled, but points that tests suspect"
+# Points of a batch: a whole set of scans, whose few suspects are compared with other models together.
+BATCH = 20000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,9 @@ def compare_methods(quick: bool) -> list[Method]:
     ]
     missing = []
     few_frfs = [_row(frf, k) for k in range(50)]
-    batch = _repeated(frf, max(1, 5000 // runs))
+    times = BATCH // 10 // runs if quick else BATCH // runs
+    batch = _repeated(frf, times)
+    many_u, many_y = (np.tile(values, (times, 1)) for values in (joint_u, joint_y))
     for structure, model in ((BARE, "2nd order"), (ModelStructure(), "mode + 6 residual terms")):
         for kind, name in ((JointPlan, "joint"), (CompiledJointPlan, "joint compiled")):
             try:
@@ -132,9 +135,9 @@ def compare_methods(quick: bool) -> list[Method]:
             contestants += [
                 Contestant(
                     f"{name}, {model}, batched",
-                    lambda p=plan: p.from_bins(joint_u, joint_y),
-                    runs,
-                    estimates_of,
+                    lambda p=plan: p.from_bins(many_u, many_y),
+                    len(many_y),
+                    lambda result: estimates_of(result)[:runs],
                 ),
                 Contestant(
                     f"{name}, {model}, single",
@@ -142,17 +145,6 @@ def compare_methods(quick: bool) -> list[Method]:
                     50,
                 ),
             ]
-            if kind is CompiledJointPlan:
-                good = plan.from_bins(joint_u, joint_y).has_status(PolesStatus.OK)
-                good_u, good_y = joint_u[good], joint_y[good]
-                contestants.append(
-                    Contestant(
-                        f"{UNSUSPECTED}, {model}, batched",
-                        lambda p=plan, u=good_u, y=good_y: p.from_bins(u, y),
-                        int(good.sum()),
-                        estimates_of,
-                    )
-                )
         contestants += [
             Contestant(
                 f"FRF, {model}, batched",
@@ -166,6 +158,19 @@ def compare_methods(quick: bool) -> list[Method]:
                 50,
             ),
         ]
+        try:
+            identify_batch(batch, structure=structure, compiled=True)
+        except ImportError as error:
+            missing.append(_missing(f"FRF compiled, {model}", error))
+            continue
+        contestants.append(
+            Contestant(
+                f"FRF compiled, {model}, batched",
+                lambda s=structure: identify_batch(batch, structure=s, compiled=True),
+                batch.g.shape[0],
+                lambda result: estimates_of(result)[:runs],
+            )
+        )
     few = 40 if quick else 200
     wide_hz, wide_spectra, _, _ = local_polynomial_spectra(
         plant, u[:few], y[:few], wide, (20.0, 1000.0)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.identification import one_mode
+from tactile_resonance.identification.compiled import kernel
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
@@ -33,6 +34,9 @@ from tactile_resonance.identification.result import (
 )
 from tactile_resonance.identification.solver import MAX_ITERATIONS, ROUNDING, STEP_TOLERANCE
 from tactile_resonance.identification.whiteness import are_smooth
+
+# Points whose residuals still are in the cache when they are judged.
+CHUNK = 2000
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -67,7 +71,7 @@ class CompiledJointPlan(JointPlan):
                 f"periods: {self.periods} without bins between harmonics, compiled needs at least 2 "
                 "periods of a periodic input"
             )
-        most = _kernel().MOST_BINS
+        most = kernel("joint_kernel").MOST_BINS
         if max(self.other_bins.size, self.excited_bins.size) > most:
             raise ValueError(
                 f"periods: {self.periods} make {self.other_bins.size} bins between harmonics of "
@@ -79,7 +83,7 @@ class CompiledJointPlan(JointPlan):
         u, y = self._checked(u, y)
         if self.problem.driven is self.problem:
             return super().from_bins(u, y)  # which takes few lines
-        kernel = _kernel()
+        code = kernel("joint_kernel")
         shape = y.shape[:-1]
         flat_u, flat_y = (
             np.ascontiguousarray(v, complex).reshape(-1, self.bins.size) for v in (u, y)
@@ -92,12 +96,15 @@ class CompiledJointPlan(JointPlan):
         residual = np.zeros((batch, self.excited_bins.size), complex)
         figures = np.empty((batch, one_mode.FIGURES))
         out = (ordinary, theta, covariance, residual, figures)
-        kernel.fit_points(flat_u, flat_y, *self._constants, out)
+        for first in range(0, batch, CHUNK):
+            rows = slice(first, first + CHUNK)
+            part = tuple(values[rows] for values in out)
+            code.fit_points(flat_u[rows], flat_y[rows], *self._constants, part)
+            ordinary[rows] &= ~are_smooth(residual[rows], self.structure.parameters)
         result = self._ordinary(theta, covariance, residual, figures)
-        ordinary &= ~are_smooth(residual, self.structure.parameters)
         if not ordinary.all():
-            rows = np.flatnonzero(~ordinary)
-            result = _replaced(result, rows, super().from_bins(flat_u[rows], flat_y[rows]))
+            rest = np.flatnonzero(~ordinary)
+            result = _replaced(result, rest, super().from_bins(flat_u[rest], flat_y[rest]))
         return result if shape == (batch,) else _reshaped(result, shape)
 
     def _ordinary(
@@ -173,16 +180,6 @@ class CompiledJointPlan(JointPlan):
             (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),
             limits,
         )
-
-
-def _kernel() -> Any:
-    try:
-        from tactile_resonance.identification import joint_kernel
-    except ImportError as error:
-        raise ImportError(
-            f"{error}: the compiled estimator needs numba (pip install tactile_resonance[compiled])"
-        ) from error
-    return joint_kernel
 
 
 def _arrays(result: PolesBatch) -> dict[str, Any]:

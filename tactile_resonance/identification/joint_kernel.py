@@ -9,9 +9,7 @@ it is asked for.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numba import njit
@@ -31,7 +29,9 @@ from tactile_resonance.identification.kernel_bins import (
     IM,
     MOST_BINS,
     OPTIONS,
+    S_ROW,
     U_ROW,
+    V_ROW,
     Y_ROW,
     U,
     Y,
@@ -39,6 +39,9 @@ from tactile_resonance.identification.kernel_bins import (
     add_up_undriven,
     combine,
     error_with_input,
+    fill,
+    fingerprint,
+    inlined,
     linearise_driven,
     linearise_undriven,
     power,
@@ -51,8 +54,6 @@ from tactile_resonance.identification.kernel_judgement import level, pole_in_ban
 __all__ = ["MOST_BINS", "fit_points"]
 
 TINY = float(np.finfo(float).tiny)
-# Counting who holds an array would take as long as some of the sums: not in calls that are no calls.
-inlined = njit(forceinline=True, **OPTIONS)
 
 
 @inlined
@@ -71,17 +72,18 @@ def _gather(u, y, where, flat):
 def _start(theta, tables, groups, normals):
     """Start values in theta; see `Problem.start`. Whether there are any."""
     others, driven = tables
-    total, of_others, step = normals
+    total, of_others, work, step = normals
+    fill(groups[1][0], V_ROW, 1.0, driven.products.shape[1])
     weigh_start(groups[1][1], 0.0, 0.0, True, True, driven.products.shape[1])
     add_up_driven(groups[1][0], driven, total)
-    if not eliminate(total, theta):
+    if not eliminate(total, work, theta):
         return False
     weigh_start(groups[0][1], theta[0], theta[1], False, False, others.transient.shape[1])
     add_up_undriven(groups[0][0], others.transient, theta.size, of_others)
     weigh_start(groups[1][1], theta[0], theta[1], False, True, driven.products.shape[1])
     add_up_driven(groups[1][0], driven, total)
     total += of_others
-    if not eliminate(total, step):
+    if not eliminate(total, work, step):
         return False
     theta[:] = step
     return True
@@ -109,13 +111,14 @@ def _driven(theta, variances, table, group):
     combine(group[0], B_ROW, table.numerator, theta, 2)
     combine(group[0], C_ROW, table.transient, theta, theta.size - table.transient.shape[0] // 2)
     bins = table.products.shape[1]
-    return linearise_driven(group[1], theta[0], theta[1], variances[0], variances[1], bins)
+    fill(group[0], S_ROW, variances[0], bins)
+    return linearise_driven(group[1], theta[0], theta[1], variances[1], bins)
 
 
 @inlined
 def _near(theta, tables, groups, normals, power_u, limits):
     """One step on from start values; whether there is one."""
-    total, of_others, step = normals
+    total, of_others, work, step = normals
     size = tables[0].size
     power_y = _others(theta, tables[0], groups[0], of_others)
     squared = error_with_input(groups[0][1], size) / max(power_y * power_u, TINY)
@@ -127,7 +130,7 @@ def _near(theta, tables, groups, normals, power_u, limits):
     _driven(theta, variances, tables[1], groups[1])
     add_up_driven(groups[1][0], tables[1], total)
     _add(total, of_others, 1 / variances[0])
-    if not eliminate(total, step):
+    if not eliminate(total, work, step):
         return False
     theta -= step
     return True
@@ -150,12 +153,12 @@ def _noise(power_y, power_u, table, group, pieces, limits):
 
 
 @inlined
-def _refine(theta, tables, groups, normals, power_y, variances, limits, last):
+def _refine(theta, tables, groups, normals, power_y, variances, limits):
     """Costs of both groups at the last but one theta; negative where steps need damping.
 
-    The normal equations of the bins between harmonics are there already; `last` keeps those of all.
+    The normal equations of the bins between harmonics are there already.
     """
-    total, of_others, step = normals
+    total, of_others, work, step = normals
     data_power = 0.0
     for g in range(2):
         data_power += power(groups[g][0], Y_ROW, tables[g].size)
@@ -173,12 +176,11 @@ def _refine(theta, tables, groups, normals, power_y, variances, limits, last):
         before = cost
         add_up_driven(groups[1][0], tables[1], total)
         _add(total, of_others, 1 / variances[0])
-        last[:] = total
-        if not eliminate(total, step):
+        if not eliminate(total, work, step):
             break
         decrement = 0.0
         for i in range(theta.size):
-            decrement += last[i * width + theta.size] * step[i]
+            decrement += total[i * width + theta.size] * step[i]
         theta -= step
         if decrement <= max(limits[4] * cost, floor):
             return others, excited
@@ -215,8 +217,7 @@ def _entry(sources: int) -> Any:
         memory = (prepared(tables[0]), prepared(tables[1]))
         groups = ((memory[0], memory[0].reshape(-1)), (memory[1], memory[1].reshape(-1)))
         entries = n * (n + 1) + 1
-        last = np.empty(entries)
-        normals = (np.empty(entries), np.empty(entries), np.empty(n))
+        normals = (np.empty(entries), np.empty(entries), np.empty(entries), np.empty(n))
         for point in range(y.shape[0]):
             at = theta[point]
             finite = _gather(u[point], y[point], where[0], groups[0][1])
@@ -231,14 +232,14 @@ def _entry(sources: int) -> Any:
             variances = _noise(power_y, power_u, tables[0], groups[0], pieces, limits)
             if not variances[0] > 0:
                 continue
-            costs = _refine(at, tables, groups, normals, power_y, variances, limits, last)
+            costs = _refine(at, tables, groups, normals, power_y, variances, limits)
             if not costs[0] >= 0:
                 continue
             _driven(at, variances, tables[1], groups[1])
             found = (covariance[point], residual[point], figures[point])
             sizes = (tables[0].size, tables[1].size)
             if not level(
-                groups[1][1], sizes, last, normals[1], variances, costs, limits, found
+                groups[1][1], sizes, normals[0], normals[1], variances, costs, limits, found
             ):  # fmt: skip
                 continue
             terms = bases[1].shape[0]
@@ -250,5 +251,6 @@ def _entry(sources: int) -> Any:
     return fit_points
 
 
-_MODULES = (kernel_algebra, kernel_bins, kernel_judgement, kernel_tables, one_mode)
-fit_points = _entry(crc32(b"".join(Path(str(m.__file__)).read_bytes() for m in _MODULES)))
+fit_points = _entry(
+    fingerprint(kernel_algebra, kernel_bins, kernel_judgement, kernel_tables, one_mode)
+)

@@ -66,7 +66,7 @@ class Evidence:
         batch, n = lines.size, plan.structure.parameters
         nan = np.full(batch, np.nan)
         a, b, _ = plan.problem.sizes
-        model = plan._model(np.full((batch, a + b), np.nan))
+        model = plan.model_of(np.full((batch, a + b), np.nan))
         no = np.zeros(batch, bool)
         residual = np.zeros((batch, 0), complex)
         matrix = np.full((batch, n, n), np.nan)

@@ -9,31 +9,42 @@ from tactile_resonance.identification.kernel_bins import compiled
 
 
 @compiled
-def eliminate(normal, step):
-    """Solve normal equations (n, n + 1, flat, the gradient in the last column); whether they have a solution.
+def eliminate(normal, work, step):
+    """Solve normal equations; whether they have a solution.
 
-    Without pivoting, see `normal_equations.solve_positive`; `normal` is not kept.
+    Without pivoting, see `normal_equations.solve_positive`.
+
+    Parameters
+    ----------
+    normal : (n (n + 1) + 1,) float
+        See `kernel_bins.add_up_driven`.
+    work : same shape
+        Overwritten.
+    step : (n,) float
+        Out.
     """
     n = step.size
     width = n + 1
+    for k in range(n * width):
+        work[k] = normal[k]
     for j in range(n):
         row = j * width
-        pivot = normal[row + j] * (1 + 1e-15)
+        pivot = work[row + j] * (1 + 1e-15)
         if not pivot > 0:
             return False
         inverse = 1 / pivot
-        normal[row + j] = inverse
+        work[row + j] = inverse
         for i in range(j + 1, n):
             other = i * width
-            factor = normal[row + i] * inverse
+            factor = work[row + i] * inverse
             for k in range(i, width):
-                normal[other + k] -= factor * normal[row + k]
+                work[other + k] -= factor * work[row + k]
     for j in range(n - 1, -1, -1):
         row = j * width
-        total = normal[row + n]
+        total = work[row + n]
         for k in range(j + 1, n):
-            total -= normal[row + k] * step[k]
-        step[j] = total * normal[row + j]
+            total -= work[row + k] * step[k]
+        step[j] = total * work[row + j]
     return True
 
 

@@ -8,7 +8,10 @@ pairs of rows.
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import ModuleType
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numba import njit
@@ -21,16 +24,18 @@ OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 compiled = njit(**OPTIONS)
+# Counting who holds an array would take as long as some of the sums: not in calls that are no calls.
+inlined = njit(forceinline=True, **OPTIONS)
 
 MOST_BINS = 4096
 # Not a power of two, but an odd number of cache lines beyond: rows do not share places in the cache.
 STRIDE = MOST_BINS + 37 * 8
-# Rows: polynomials of A; Y and U; B and C; the error and what it is weighted with; then the weights
-# of `kernel_tables`.
-FIRST_WEIGHT = 17
+# Rows: polynomials of A; Y and U; B and C; the error and what it is weighted with; the variance of Y;
+# then the weights of `kernel_tables`.
+FIRST_WEIGHT = 18
 ROWS = FIRST_WEIGHT + WEIGHTS
-Y_ROW, U_ROW, B_ROW, C_ROW, E_ROW = 6, 8, 10, 12, 14
-A0, A1, A2, Y, U, B, C, E, V = (k * STRIDE for k in (0, 2, 4, 6, 8, 10, 12, 14, 16))
+Y_ROW, U_ROW, B_ROW, C_ROW, E_ROW, V_ROW, S_ROW = 6, 8, 10, 12, 14, 16, 17
+A0, A1, A2, Y, U, B, C, E, V, S = (k * STRIDE for k in (0, 2, 4, 6, 8, 10, 12, 14, 16, 17))
 AA, AC, CC, OF_A, OF_C, AB, BB, BC, OF_B = (
     (FIRST_WEIGHT + k) * STRIDE for k in (0, 1, 3, 4, 6, 8, 10, 11, 13)
 )
@@ -38,16 +43,30 @@ AA_ROW, AC_ROW, CC_ROW, OF_A_ROW, OF_C_ROW = (FIRST_WEIGHT + k for k in (0, 1, 3
 IM = STRIDE
 
 
+def fingerprint(*modules: ModuleType) -> int:
+    """Of the sources of modules: numba's cache of a function watches its own file, and values like this."""
+    return crc32(b"".join(Path(str(m.__file__)).read_bytes() for m in modules))
+
+
 @compiled
 def prepared(table):
-    """Memory (ROWS, STRIDE) of a group, with its constants, and no data on bins of no weight."""
+    """Memory (ROWS, STRIDE) of a group, with its constants, without data; weights and variances are 1."""
     memory = np.empty((ROWS, STRIDE))
     bins = table.denominator.shape[1]
     for row in range(6):
         memory[row, :bins] = table.denominator[row]
-    for row in range(6, 10):
+    for row in range(Y_ROW, E_ROW):
         memory[row, :bins] = 0.0
+    for row in (V_ROW, S_ROW):
+        memory[row, :bins] = 1.0
     return memory
+
+
+@compiled
+def fill(memory, row, value, bins):
+    """Set a row."""
+    for k in range(bins):
+        memory[row, k] = value
 
 
 @compiled
@@ -102,8 +121,8 @@ def linearise_undriven(flat, a_0, a_1, bins):
 
 
 @compiled
-def linearise_driven(flat, a_0, a_1, variance_y, variance_u, bins):
-    """Error and weights of bins with an input, whose B and C are there; the cost.
+def linearise_driven(flat, a_0, a_1, variance_u, bins):
+    """Error and weights of bins with an input, whose B, C and variances are there; the cost.
 
     The variance of the residual depends on the response: the gradient has its derivative too.
     """
@@ -120,7 +139,7 @@ def linearise_driven(flat, a_0, a_1, variance_y, variance_u, bins):
         m_re = c_re * i_re - c_im * i_im + g_re * u_re - g_im * u_im
         m_im = c_re * i_im + c_im * i_re + g_re * u_im + g_im * u_re
         e_re, e_im = flat[Y + k] - m_re, flat[Y + IM + k] - m_im
-        v = 1 / (variance_y + variance_u * (g_re * g_re + g_im * g_im))
+        v = 1 / (flat[S + k] + variance_u * (g_re * g_re + g_im * g_im))
         squared = v * (e_re * e_re + e_im * e_im)
         cost += squared
         w = v * i_2
@@ -145,12 +164,12 @@ def linearise_driven(flat, a_0, a_1, variance_y, variance_u, bins):
 
 @compiled
 def weigh_start(flat, a_0, a_1, first, driven, bins):
-    """Weights of a Sanathanan-Koerner iteration: 1 in the first one, else ``1 / |A|^2``."""
+    """Weights of a Sanathanan-Koerner iteration: those there in the first one, else over ``|A|^2``."""
     for k in range(bins):
         l_re, l_im = flat[A2 + k], flat[A2 + IM + k]
         re = l_re + a_0 * flat[A0 + k] + a_1 * flat[A1 + k]
         im = l_im + a_0 * flat[A0 + IM + k] + a_1 * flat[A1 + IM + k]
-        w = 1.0 if first else 1 / (re * re + im * im)
+        w = flat[V + k] if first else flat[V + k] / (re * re + im * im)
         y_re, y_im = flat[Y + k], flat[Y + IM + k]
         z_re, z_im = -w * (y_re * l_re - y_im * l_im), w * (y_re * l_im + y_im * l_re)
         flat[AA + k] = w * (y_re * y_re + y_im * y_im)

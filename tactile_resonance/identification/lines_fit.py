@@ -114,7 +114,7 @@ class LinesPlan:
                 half, condition[k] = jacobian_covariance(dense.jacobian)
                 parameters[k] = 0.5 * half
         return LinesFit(
-            self._model(theta), cost, parameters, condition, converged, data.turned(residual)
+            self.model_of(theta), cost, parameters, condition, converged, data.turned(residual)
         )
 
     def compared(self, data: BinData) -> ComplexArray:
@@ -125,7 +125,7 @@ class LinesPlan:
         if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
             return self.fit(data).model.poles_rad_s()
         theta = minimise(self.problem, [data], None, COMPARISON_ITERATIONS).theta
-        return self._model(theta).poles_rad_s()
+        return self.model_of(theta).poles_rad_s()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
@@ -182,7 +182,8 @@ class LinesPlan:
         """(batch, n) free coefficients of a model of this plan."""
         return np.concatenate([model.denominator[:, :-1], model.numerator], axis=1)
 
-    def _model(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
+    def model_of(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
+        """The model with coefficients (batch, n), those of A first."""
         a, b, _ = self.problem.sizes
         return RationalModel(
             denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
@@ -210,7 +211,7 @@ class LinesPlan:
         )
         delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
         return LinesFit(
-            self._model(theta, delay_s),
+            self.model_of(theta, delay_s),
             np.array([s.group_cost[0] for s in solutions]),
             0.5 * np.stack(covariances),
             np.array(conditions),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled joint estimator against the plain one: same answers, whatever the point."""
+"""The compiled estimators against the plain ones: same answers, whatever the point."""
 
 import dataclasses
 import subprocess
@@ -8,7 +8,11 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.poles_methods import local_polynomial_spectra
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ratio_variance
+from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.result import PolesBatch, PolesStatus
@@ -152,3 +156,40 @@ def test_without_numba_it_says_what_to_install():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert run.returncode != 0
     assert "needs numba (pip install tactile_resonance[compiled])" in run.stderr
+
+
+def frfs(rng, count=200):
+    """Noisy FRFs of one mode, by the local polynomial method, with a variance of each line."""
+    plant = Plant(0.02, 40.0, 8)
+    wide = plant.bins(150.0, 350.0)
+    u, y = plant.noisy(rng, count, wide)
+    frequency_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
+    variance = ratio_variance(spectra, covariance)
+    return FRF(frequency_hz, spectra[:, 0] / spectra[:, 1], variance_noise=variance, noise_dof=dof)
+
+
+@pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
+def test_frfs(structure):
+    frf = frfs(np.random.default_rng(2))
+    assert_same(
+        identify_batch(frf, structure=structure, compiled=True),
+        identify_batch(frf, structure=structure),
+    )
+
+
+def test_frfs_that_are_not_ordinary_come_out_as_ever():
+    rng = np.random.default_rng(4)
+    frf = frfs(rng, 12)
+    frf.g[1, 7] = np.nan
+    frf.g[2, 20] += 1.0  # a wild line
+    frf.variance_noise[3] *= np.geomspace(1, 1e4, frf.g.shape[1])
+    frf.variance_noise[4, 5] = 0.0
+    frf.g[5] = rng.standard_normal(82).view(complex)  # no resonance
+    frf.g[6] = 0.0
+    frf.g[7] *= np.linspace(1, 1.5, frf.g.shape[1])  # no second-order system
+    frf.g[8] = np.nan
+    found = identify_batch(frf, structure=BARE, compiled=True)
+    assert_same(found, identify_batch(frf, structure=BARE))
+    assert found.status(7) is PolesStatus.MODEL_ERROR
+    with pytest.raises(ValueError, match="structure: .* compiled is order 2 in s without delay"):
+        identify_batch(frf, structure=ModelStructure(4, 4), compiled=True)
