@@ -15,6 +15,7 @@ from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_compiled import CompiledJointPlan
+from tactile_resonance.identification.lines_fit import LinesPlan
 from tactile_resonance.identification.result import PolesBatch, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -193,3 +194,20 @@ def test_frfs_that_are_not_ordinary_come_out_as_ever():
     assert found.status(7) is PolesStatus.MODEL_ERROR
     with pytest.raises(ValueError, match="structure: .* compiled is order 2 in s without delay"):
         identify_batch(frf, structure=ModelStructure(4, 4), compiled=True)
+
+
+def not_called(*_):
+    raise AssertionError("an ordinary point was left to the plain estimator")
+
+
+@pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
+def test_ordinary_points_are_fitted_by_compiled_code_alone(structure, monkeypatch):
+    """Else all that is compared above would be the plain estimator with itself."""
+    _, compiled = plans(8, structure)
+    u, y = points(Plant(0.02, 40.0, 8))
+    frf = frfs(np.random.default_rng(2), 20)
+    monkeypatch.setattr(JointPlan, "from_bins", not_called)
+    monkeypatch.setattr(LinesPlan, "fit", not_called)
+    assert compiled.from_bins(u, y).has_status(PolesStatus.OK).all()
+    result = identify_batch(frf, structure=structure, compiled=True)
+    assert result.has_status(PolesStatus.OK).all()
