@@ -68,7 +68,7 @@ class ContactClient(NodeClient):
 
         self.wait(there, timeout_s, "contact_node to be idle")
 
-    def back(self, timeout_s=60.0):
+    def back(self, timeout_s=30.0):
         """Ask for a retraction while a fault stands, until nothing is under way."""
         deadline = time.monotonic() + timeout_s
         self.state = None

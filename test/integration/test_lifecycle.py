@@ -47,7 +47,7 @@ class Watcher:
                 **{v.key: v.value for v in status.values},
             }
 
-    def wait(self, done, timeout_s=60.0):
+    def wait(self, done, timeout_s=30.0):
         deadline = time.monotonic() + timeout_s
         while not done():
             assert time.monotonic() < deadline, self.heard
