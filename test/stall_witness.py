@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that does nothing but sleep, and notes when the machine let it sleep too long.
+"""A process that does nothing but sleep, on every processor, and notes when one let it sleep too long.
 
 Tests in which processes meet on the wall clock say nothing about the code while the machine stands still.
-This witness tells such runs from failures: it has no part in what is tested.
+This witness tells such runs from failures: it has no part in what is tested. A shared machine takes away one
+processor at a time, and with it whoever runs there: so each is watched by a thread that does not leave it.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -43,8 +46,10 @@ class StallWitness:
         self._notes.close()
 
 
-def watch(path: Path) -> None:
-    """Note end and length of every stall, for ever."""
+def watch(path: Path, processor: int | None) -> None:
+    """Note end and length of every stall of a processor (None: of any), for ever."""
+    if processor is not None:
+        os.sched_setaffinity(0, {processor})  # of this thread
     with path.open("a", buffering=1) as notes:
         last_s = time.monotonic()
         while True:
@@ -55,5 +60,12 @@ def watch(path: Path) -> None:
             last_s = now_s
 
 
+def main() -> None:
+    """Watch every processor that this process may use."""
+    places = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [None]
+    for place in places:
+        threading.Thread(target=watch, args=(Path(sys.argv[1]), place)).start()
+
+
 if __name__ == "__main__":
-    watch(Path(sys.argv[1]))
+    main()

@@ -16,7 +16,7 @@ import pytest
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.processes import end_with_parent
+from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 from tactile_resonance.simulation.robot.control_port import order
 
@@ -27,17 +27,7 @@ from arms import LAG_S, connect_again, keep, keep_for
 RUN = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}"
 
 
-def may_take_priority():
-    """Whether this process may run under SCHED_FIFO: then the simulation keeps its pace on busy cores."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    except (AttributeError, OSError):
-        return False
-    return True
-
-
-PRIORITY = 2 if may_take_priority() else 0
+PRIORITY = 2 if may_take_priority(2) else 0
 
 
 def need_ur_rtde():
