@@ -51,6 +51,7 @@ def client(bench):
     """Of the contact_node of `bench`, which has nothing under way."""
     from contact_rig import ContactClient
 
+    bench.complete()
     with ContactClient(bench.nodes.check) as made:
         made.back()
         yield made

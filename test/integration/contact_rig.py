@@ -169,6 +169,12 @@ class Bench:
         self.nodes = NodeProcesses(log)
         self.nodes.bring_up(["contact_node"], {"contact_node": self.parameters})
 
+    def complete(self):
+        """Start contact_node again where a test that failed left it ended."""
+        process = self.nodes._processes.get("contact_node")
+        if process is None or process.poll() is not None:
+            self.nodes.start("contact_node", self.parameters)
+
     def order(self, command, **fields):
         return order(HOST, command, **fields)
 
