@@ -125,6 +125,8 @@ class Session:
         """From now on no program but the one that runs counts as ours. Raises `ArmError`."""
         if not self.states.guard():
             raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program ended as soon as it ran")
+        # its watchdog counts since it was set, and no state told until now that it listens
+        self.feed()
 
     def feed(self) -> None:
         """Keep the robot's watchdog quiet, where it listens."""
@@ -148,7 +150,6 @@ class Session:
             raise ArmError(ArmFault.COMMAND_REFUSED, f"setPayload {config.payload_kg} was refused")
         if not control.setWatchdog(config.watchdog_hz):
             raise ArmError(ArmFault.COMMAND_REFUSED, "setWatchdog was refused")
-        self.feed()
 
     def _check_modes(self) -> None:
         state = self.states.state()

@@ -104,7 +104,7 @@ class StateReader:
     def guard(self) -> bool:
         """Watch the program that was started; False where none runs within a second."""
         deadline = time.monotonic() + 1.0
-        while self._runtime != PROGRAM_PLAYING:
+        while self.state().runtime_state != PROGRAM_PLAYING:
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.001)
