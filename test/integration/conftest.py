@@ -51,7 +51,10 @@ def client(bench):
     """Of the contact_node of `bench`, which has nothing under way."""
     from contact_rig import ContactClient
 
-    bench.complete()
+    bench.recover()
     with ContactClient(bench.nodes.check) as made:
         made.back()
+        if bench.order("state")["runtime_state"] != "PLAYING":  # a stop while nothing was under way
+            made.wait(lambda: made.retract().success, 5.0, "the arm's program to be started again")
+            made.idle()
         yield made

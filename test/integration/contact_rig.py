@@ -4,7 +4,6 @@
 import contextlib
 import os
 import select
-import socket
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.action import ActionClient
+from robot_at_hand import RobotAtHand
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
@@ -25,7 +25,6 @@ from tactile_resonance.nodes.client import NoAnswer, NodeClient
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses, end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
-from tactile_resonance.simulation.robot.control_port import order
 
 PRIORITY = 20
 HOST = f"127.0.13.{1 + os.getpid() % 250}"
@@ -147,10 +146,11 @@ def goal_message(xy_m=(0.0, 0.0), **fields):
     return goal
 
 
-class Bench:
+class Bench(RobotAtHand):
     """The plant's process and the nodes."""
 
     def __init__(self, log, tissue="gel10", parameters=None):
+        super().__init__(HOST)
         self.parameters = {"robot_host": HOST, "force_host": HOST, **(parameters or {})}
         priority = PRIORITY if may_take_priority(PRIORITY) else 0
         self.plant = subprocess.Popen(
@@ -169,14 +169,12 @@ class Bench:
         self.nodes = NodeProcesses(log)
         self.nodes.bring_up(["contact_node"], {"contact_node": self.parameters})
 
-    def complete(self):
-        """Start contact_node again where a test that failed left it ended."""
+    def recover(self):
+        """End what a test that failed may have left: a robot that is stopped, contact_node ended."""
+        super().recover()
         process = self.nodes._processes.get("contact_node")
         if process is None or process.poll() is not None:
             self.nodes.start("contact_node", self.parameters)
-
-    def order(self, command, **fields):
-        return order(HOST, command, **fields)
 
     def until_touching(self, ended=lambda: False, timeout_s=20.0):
         """The plant's time [s] as soon as the tissue is touched anew; None where it ended before."""
@@ -202,30 +200,6 @@ class Bench:
             np.concatenate([p[name] for p in parts])
             for name in ("time_s", "tip_m", "normal_force_n")
         )
-
-    def dashboard(self, line):
-        with socket.create_connection((HOST, 29999), 5) as channel:
-            lines = channel.makefile()
-            lines.readline()
-            channel.sendall(line.encode() + b"\n")
-            return lines.readline().strip()
-
-    def release(self):
-        """Release a protective stop, as soon as the robot takes it."""
-        deadline = time.monotonic() + 10.0
-        while self.dashboard("unlock protective stop") != "Protective stop releasing":
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-
-    def power_up(self):
-        """Release an emergency stop and bring the robot up again."""
-        self.order("release_emergency_stop")
-        for line, mode in (("power on", "IDLE"), ("brake release", "RUNNING")):
-            self.dashboard(line)
-            deadline = time.monotonic() + 10.0
-            while self.order("state")["robot_mode"] != mode:
-                assert time.monotonic() < deadline, self.order("state")
-                time.sleep(0.05)
 
     def close(self):
         self.nodes.stop()

@@ -103,6 +103,7 @@ def pressed_then(bench, client, inject, end=lambda bench: None):
         if in_time:
             break
         end(bench)
+        bench.recover()
         client.retract()
         time.sleep(1.5)
         client.back()
@@ -148,7 +149,7 @@ def test_lost_arm_is_stopped_by_its_watchdog_where_it_is(bench, client, name):
 
 
 ROBOT_STOPS = {
-    "protective_stop": lambda bench: bench.release(),
+    "protective_stop": lambda bench: bench.unlock(),
     "emergency_stop": lambda bench: bench.power_up(),
 }
 

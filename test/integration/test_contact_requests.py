@@ -133,7 +133,7 @@ def test_stop_of_the_robot_in_any_state_is_named_and_moves_nothing_later(
         assert max(force_n) < LIMITS.hard_force_n
         assert last_way_down_s(time_s, tip_m) - at_s < 0.2
         place = bench.order("truth")["tip_m"]
-        bench.release() if stop == "protective_stop" else bench.power_up()
+        bench.unlock() if stop == "protective_stop" else bench.power_up()
         time.sleep(1.0)
         assert np.linalg.norm(np.subtract(bench.order("truth")["tip_m"], place)) < 5e-5
         client.wait(lambda: client.retract().success, 3.0, "a retraction to be taken")

@@ -4,21 +4,19 @@
 import os
 import select
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from robot_at_hand import RobotAtHand
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
-from tactile_resonance.simulation.robot.control_port import order
 
 sys.path.insert(0, str(Path(__file__).parent))
 from arms import LAG_S, connect_again, keep, keep_for
@@ -34,11 +32,11 @@ def need_ur_rtde():
     pytest.importorskip("rtde_control", reason="ur_rtde is not here (no wheel for Python 3.13)")
 
 
-class Robot:
+class Robot(RobotAtHand):
     """A simulated robot's process and its control port."""
 
     def __init__(self, host, *options):
-        self.host = host
+        super().__init__(host)
         self.process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
@@ -55,46 +53,6 @@ class Robot:
         assert ready, "the simulated robot says nothing for 60 s"
         line = self.process.stdout.readline()
         assert "ready at" in line, line
-
-    def order(self, command, **fields):
-        return order(self.host, command, **fields)
-
-    def dashboard(self, line):
-        with socket.create_connection((self.host, 29999), 5) as channel:
-            lines = channel.makefile()
-            lines.readline()
-            channel.sendall(line.encode() + b"\n")
-            return lines.readline().strip()
-
-    def until(self, **wanted):
-        """Wait until the control port's state is as wanted."""
-        end = time.monotonic() + 10
-        while any(self.order("state")[name] != value for name, value in wanted.items()):
-            assert time.monotonic() < end, f"{self.order('state')} is never {wanted}"
-            time.sleep(0.02)
-
-    def unlock(self):
-        end = time.monotonic() + 10
-        while self.dashboard("unlock protective stop") != "Protective stop releasing":
-            assert time.monotonic() < end
-            time.sleep(0.1)
-
-    def power_up(self):
-        self.dashboard("power on")
-        self.until(robot_mode="IDLE")
-        self.dashboard("brake release")
-        self.until(robot_mode="RUNNING")
-
-    def recover(self):
-        """End every fault that a failed test may have left."""
-        self.order("release_emergency_stop")
-        for name, value in (("remote_control", True), ("script_starts", True)):
-            self.order(name, value=value)
-        self.order("registers_in_use", value=False)
-        if self.order("state")["safety_mode"] == "PROTECTIVE_STOP":
-            self.unlock()
-        if self.order("state")["robot_mode"] != "RUNNING":
-            self.power_up()
 
     def end(self):
         if self.process.poll() is None:

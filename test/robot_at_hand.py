@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What whoever stands beside a simulated robot can do: its pendant, its emergency stop, its settings."""
+
+import socket
+import time
+
+from tactile_resonance.simulation.robot.control_port import order
+
+
+class RobotAtHand:
+    """A simulated robot, by its address."""
+
+    def __init__(self, host):
+        self.host = host
+
+    def order(self, command, **fields):
+        return order(self.host, command, **fields)
+
+    def dashboard(self, line):
+        with socket.create_connection((self.host, 29999), 5) as channel:
+            lines = channel.makefile()
+            lines.readline()
+            channel.sendall(line.encode() + b"\n")
+            return lines.readline().strip()
+
+    def until(self, **wanted):
+        """Wait until the control port's state is as wanted."""
+        end = time.monotonic() + 10
+        while any(self.order("state")[name] != value for name, value in wanted.items()):
+            assert time.monotonic() < end, f"{self.order('state')} is never {wanted}"
+            time.sleep(0.02)
+
+    def unlock(self):
+        """Release a protective stop, as soon as the robot takes it."""
+        end = time.monotonic() + 10
+        while self.dashboard("unlock protective stop") != "Protective stop releasing":
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
+    def power_up(self):
+        """Release the emergency stop and bring the robot up again."""
+        self.order("release_emergency_stop")
+        self.dashboard("power on")
+        self.until(robot_mode="IDLE")
+        self.dashboard("brake release")
+        self.until(robot_mode="RUNNING")
+
+    def recover(self):
+        """End every fault that a test which failed may have left."""
+        self.order("release_emergency_stop")
+        for name, value in (("remote_control", True), ("script_starts", True)):
+            self.order(name, value=value)
+        self.order("registers_in_use", value=False)
+        if self.order("state")["safety_mode"] == "PROTECTIVE_STOP":
+            self.unlock()
+        if self.order("state")["robot_mode"] != "RUNNING":
+            self.power_up()
