@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small matrices of the compiled kernels: normal equations as `kernel_bins.add_up` leaves them."""
+"""Small matrices of the compiled kernels: normal equations as `kernel_driven.add_up_driven` leaves them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tactile_resonance.identification.kernel_bins import compiled
+from tactile_resonance.identification.kernel_memory import compiled
 
 
 @compiled
@@ -17,7 +17,7 @@ def eliminate(normal, work, step):
     Parameters
     ----------
     normal : (n (n + 1) + 1,) float
-        See `kernel_bins.add_up_driven`.
+        See `kernel_driven.add_up_driven`.
     work : same shape
         Overwritten.
     step : (n,) float

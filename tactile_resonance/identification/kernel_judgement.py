@@ -7,7 +7,8 @@ import numpy as np
 
 from tactile_resonance.identification import one_mode
 from tactile_resonance.identification.kernel_algebra import f_quantile, invert
-from tactile_resonance.identification.kernel_bins import compiled, turned_residual
+from tactile_resonance.identification.kernel_driven import turned_residual
+from tactile_resonance.identification.kernel_memory import compiled
 from tactile_resonance.identification.one_mode import (
     CONDITION,
     COST,
@@ -44,7 +45,10 @@ def level(flat, sizes, total, of_others, variances, costs, limits, out):
     if not (cost <= dof_e * f_quantile(limits[6], 2 * dof_e, 2 * dof_o) and dof > 1):
         return False
     pooled = (costs[0] + costs[1]) / dof
-    covariance *= 0.5 * pooled * dof / (dof - 1)
+    scaling = 0.5 * pooled * dof / (dof - 1)
+    for i in range(n):
+        for j in range(n):
+            covariance[i, j] *= scaling
     figures[COST], figures[EXPECTED] = cost, dof_e * dof_o / (dof_o - 1)
     figures[CONDITION] = condition
     figures[NOISE_Y], figures[NOISE_U] = variances[0] * scale, variances[1] * scale
