@@ -180,7 +180,10 @@ class CompiledJointPlan(JointPlan):
             GroupTable.of(self.problem.groups[1], sizes),
         )
         return (
-            (self.others_at[others_in_turn], self.excited_at),
+            (
+                (self.others_at, np.argsort(others_in_turn)),
+                (self.excited_at, np.arange(self.excited_at.size)),
+            ),
             tables,
             bands.counts,
             (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),

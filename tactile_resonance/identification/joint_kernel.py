@@ -73,11 +73,12 @@ def workspace(tables, n):
 @inlined
 def _gather(u, y, where, flat):
     """Bins of a point, real and imaginary parts, in the memory of a group; whether all are finite."""
+    sources, places = where
     finite = 0.0
-    for k in range(where.size):
-        value, source = y[where[k]], u[where[k]]
-        flat[Y + k], flat[Y + IM + k] = value.real, value.imag
-        flat[U + k], flat[U + IM + k] = source.real, source.imag
+    for k in range(sources.size):
+        value, source, at = y[sources[k]], u[sources[k]], places[k]
+        flat[Y + at], flat[Y + IM + at] = value.real, value.imag
+        flat[U + at], flat[U + IM + at] = source.real, source.imag
         finite += value.real + value.imag + source.real + source.imag
     return np.isfinite(finite)
 
@@ -111,13 +112,6 @@ def _start(theta, tables, groups, normals):
 
 
 @inlined
-def _others(theta, table, group, normal):
-    """Power of the error between harmonics, with normal equations in `normal`."""
-    combine(group[0], C_ROW, table.transient, theta, theta.size - table.transient.shape[0] // 2)
-    return add_up_undriven(group, table.transient, theta, False, normal)
-
-
-@inlined
 def _driven(theta, variances, table, group):
     """Cost of the bins with an input, with weights in the memory of the group."""
     combine(group[0], B_ROW, table.numerator, theta, 2)
@@ -132,7 +126,7 @@ def _near(theta, tables, groups, normals, power_u, limits):
     """One step on from start values; whether there is one."""
     total, of_others, work, step = normals
     size = tables[0].size
-    power_y = _others(theta, tables[0], groups[0], of_others)
+    power_y = add_up_undriven(groups[0], tables[0].transient, theta, False, of_others)
     squared = error_with_input(groups[0][1], size) / max(power_y * power_u, TINY)
     variance_y = power_y / size
     variances = (
@@ -179,7 +173,7 @@ def _refine(theta, tables, groups, normals, power_y, variances, limits):
     width = theta.size + 1
     for iteration in range(int(limits[5])):
         if iteration > 0:
-            power_y = _others(theta, tables[0], groups[0], of_others)
+            power_y = add_up_undriven(groups[0], tables[0].transient, theta, False, of_others)
         others = power_y / variances[0]
         excited = _driven(theta, variances, tables[1], groups[1])
         cost = others + excited
@@ -209,8 +203,8 @@ def _entry(sources: int) -> Any:
         Parameters
         ----------
         u, y : (batch, K) complex
-        where : two (K_g,) int arrays
-            Of the bins between harmonics, as `tables` has them, and of the excited ones.
+        where : two pairs of (K_g,) int arrays
+            Of the bins between harmonics and of the excited ones: places in a record, and in `tables`.
         tables : two GroupTable
         pieces : (pieces,) int
             Bins in each piece of the noise.
@@ -238,7 +232,7 @@ def _entry(sources: int) -> Any:
             power_u = power(groups[0][0], U_ROW, tables[0].size)
             if not _near(at, tables, groups, normals, power_u, limits):
                 continue
-            power_y = _others(at, tables[0], groups[0], normals[1])
+            power_y = add_up_undriven(groups[0], tables[0].transient, at, False, normals[1])
             variances = _noise(power_y, power_u, tables[0], groups[0], pieces, limits)
             if not variances[0] > 0:
                 continue
@@ -249,7 +243,7 @@ def _entry(sources: int) -> Any:
             found = (covariance[point], residual[point], figures[point])
             sizes = (tables[0].size, tables[1].size)
             if not level(
-                groups[1][1], sizes, normals[0], normals[1], variances, costs, limits, found
+                groups[1][1], sizes, normals[:3], variances, costs, limits, found
             ):  # fmt: skip
                 continue
             terms = bases[1].shape[0]

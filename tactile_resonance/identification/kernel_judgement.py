@@ -21,15 +21,16 @@ pole_in_band = compiled(one_mode.pole_in_band)
 
 
 @compiled
-def level(flat, sizes, total, of_others, variances, costs, limits, out):
+def level(flat, sizes, normals, variances, costs, limits, out):
     """Covariance, residual, cost and its expectation; whether they are those of noise.
 
-    Normal matrices are flat, of all bins and of those between harmonics, the latter without their
-    variance; the residual is that of the memory of the excited bins.
+    `normals` are flat, of all bins and of those between harmonics, the latter without their
+    variance, and one to be overwritten; the residual is that of the memory of the excited bins.
     """
     covariance, residual, figures = out
+    total, of_others, work = normals
     n = covariance.shape[0]
-    condition = invert(total, covariance)
+    condition = invert(total, work, covariance)
     if not condition < limits[7]:
         return False
     used = 0.0

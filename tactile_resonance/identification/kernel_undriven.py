@@ -13,6 +13,7 @@ import numpy as np
 
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND
 from tactile_resonance.identification.kernel_memory import (
+    C_ROW,
     FIRST_WEIGHT,
     IM,
     LAST,
@@ -23,6 +24,7 @@ from tactile_resonance.identification.kernel_memory import (
     E,
     U,
     Y,
+    combine,
     compiled,
     inlined,
 )
@@ -67,14 +69,15 @@ def _pass(start: bool, kept: bool) -> Any:
     start : bool
         Weights of a Sanathanan-Koerner iteration in place of the linearised error.
     kept : bool
-        Whether weights stay in the memory for further terms.
+        Whether there are further terms: C comes from the memory then, and weights stay there.
     """
 
     @compiled
-    def sums(flat, basis, a_0, a_1):
+    def sums(flat, basis, a_0, a_1, gamma):
         """Power of the error, which is in the memory then, and sums; the variance of Y counts as 1."""
         terms = basis.shape[0] // 2
         j = min(1, terms - 1)
+        c_0, c_1 = gamma[0], gamma[j] * j
         power = s_00 = s_11 = g_0 = g_1 = 0.0
         at_0 = av_0 = at_1 = av_1 = tt = tv = vv = g_t = g_v = 0.0
         for k in range(basis.shape[1]):
@@ -82,12 +85,17 @@ def _pass(start: bool, kept: bool) -> Any:
             re, im = last + a_0, a_1 * slope
             w = 1 / (re * re + im * im)
             y_re, y_im = flat[Y + k], flat[Y + IM + k]
+            t_re, t_im = basis[0, k], basis[terms, k]
+            v_re, v_im = basis[j, k], basis[terms + j, k]
             if start:
                 m_re, m_im = y_re, y_im
                 z_re, z_im = -w * last * y_re, w * last * y_im
             else:
                 i_re, i_im = re * w, -im * w
-                c_re, c_im = flat[C + k], flat[C + IM + k]
+                if kept:
+                    c_re, c_im = flat[C + k], flat[C + IM + k]
+                else:
+                    c_re, c_im = c_0 * t_re + c_1 * v_re, c_0 * t_im + c_1 * v_im
                 m_re, m_im = c_re * i_re - c_im * i_im, c_re * i_im + c_im * i_re
                 e_re, e_im = y_re - m_re, y_im - m_im
                 z_re, z_im = e_re * i_re + e_im * i_im, e_re * i_im - e_im * i_re
@@ -97,8 +105,6 @@ def _pass(start: bool, kept: bool) -> Any:
                 flat[AC_AT + k], flat[AC_AT + IM + k] = -w * m_re, w * m_im
                 flat[CC_AT + k] = w
                 flat[OF_C_AT + k], flat[OF_C_AT + IM + k] = -z_re, -z_im
-            t_re, t_im = basis[0, k], basis[terms, k]
-            v_re, v_im = basis[j, k], basis[terms + j, k]
             p = _products(w, m_re, m_im, z_re, z_im, slope, t_re, t_im, v_re, v_im)
             s_00, s_11, g_0, g_1 = s_00 + p[0], s_11 + p[1], g_0 + p[2], g_1 + p[3]
             at_0, av_0, at_1, av_1 = at_0 + p[4], av_0 + p[5], at_1 + p[6], av_1 + p[7]
@@ -115,7 +121,7 @@ _error, _error_kept, _start, _start_kept = (
 
 @compiled
 def add_up_undriven(group, basis, theta, start, normal):
-    """Normal equations at theta, whose C is in the memory; power of the error, which is there then.
+    """Normal equations at theta; power of the error, which is in the memory then.
 
     With `start` those of a Sanathanan-Koerner iteration. `normal` as for
     `kernel_driven.add_up_driven`.
@@ -125,15 +131,16 @@ def add_up_undriven(group, basis, theta, start, normal):
     width, first = n + 1, n - terms
     for k in range(normal.size):
         normal[k] = 0.0
-    if terms > 2:
-        if start:
-            found = _start_kept(flat, basis, theta[0], theta[1])
-        else:
-            found = _error_kept(flat, basis, theta[0], theta[1])
+    a_0, a_1, gamma = theta[0], theta[1], theta[first:]
+    if terms > 2 and start:
+        found = _start_kept(flat, basis, a_0, a_1, gamma)
+    elif terms > 2:
+        combine(memory, C_ROW, basis, theta, first)
+        found = _error_kept(flat, basis, a_0, a_1, gamma)
     elif start:
-        found = _start(flat, basis, theta[0], theta[1])
+        found = _start(flat, basis, a_0, a_1, gamma)
     else:
-        found = _error(flat, basis, theta[0], theta[1])
+        found = _error(flat, basis, a_0, a_1, gamma)
     power, of_a, pair = found
     normal[0], normal[width + 1], normal[n], normal[width + n] = of_a
     _place_pair(normal, width, n, first, first + min(1, terms - 1), pair)
@@ -230,9 +237,11 @@ def spread_of_pieces(memory, row, counts, mean_power):
             part += re * re + im * im
         total += part * scale
         product *= part * scale
-    part, last = 0.0, counts[pieces - 1]
-    for j in range(last):  # those that make it longer than the others are behind
-        k = (j + 1) * pieces - 1 if j < BINS_PER_BAND else BINS_PER_BAND * (pieces - 1) + j
+    part, last, behind = 0.0, counts[pieces - 1], BINS_PER_BAND * pieces
+    for j in range(BINS_PER_BAND):
+        re, im = memory[row, (j + 1) * pieces - 1], memory[row + 1, (j + 1) * pieces - 1]
+        part += re * re + im * im
+    for k in range(behind, behind + last - BINS_PER_BAND):
         part += memory[row, k] * memory[row, k] + memory[row + 1, k] * memory[row + 1, k]
     part /= last * mean_power
     return np.log((total + part) / pieces) - np.log(product * part) / pieces

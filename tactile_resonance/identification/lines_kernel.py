@@ -147,7 +147,7 @@ def _entry(sources: int) -> Any:
             cost[point] = _refine(at, table, memory, flat, normals, floor, limits[1], iterations)
             if not cost[point] >= 0:
                 continue
-            condition[point] = invert(normals[0], inverse[point])
+            condition[point] = invert(normals[0], normals[1], inverse[point])
             if not condition[point] < limits[3]:
                 continue
             _cost(at, table, memory, flat)
