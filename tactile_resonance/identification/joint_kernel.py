@@ -62,7 +62,10 @@ TINY = float(np.finfo(float).tiny)
 
 
 def workspace(tables, n):
-    """What `fit_points` computes in: each group's memory, as rows and flat, and four small arrays."""
+    """What `fit_points` computes in: memories of the groups, as rows and flat, and small arrays.
+
+    One call after another: `fit_points` holds the interpreter's lock.
+    """
     memory = [prepared(table) for table in tables]
     entries = n * (n + 1) + 1
     groups = tuple((rows, rows.reshape(-1)) for rows in memory)
