@@ -180,6 +180,7 @@ def _one_mode(
         parameters[0],
         (model.denominator_basis.hessenberg, model.numerator_basis.hessenberg),
         (variable.scale_rad_s, band_hz[0] - margin, band_hz[1] + margin),
+        np.empty(model.numerator.shape[-1], complex),
         figures,
     ):
         return None

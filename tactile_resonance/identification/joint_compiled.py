@@ -23,7 +23,7 @@ from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
 from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
-from tactile_resonance.identification.kernel_tables import GroupTable
+from tactile_resonance.identification.kernel_tables import GroupTable, interleaved
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
@@ -173,12 +173,22 @@ class CompiledJointPlan(JointPlan):
                 self.band_hz[1] + margin,
             ]
         )
+        others_in_turn = interleaved(bands.counts)
+        sizes = self.problem.sizes
+        tables = (
+            GroupTable.of(self.problem.groups[0], sizes, others_in_turn),
+            GroupTable.of(self.problem.groups[1], sizes),
+        )
         return (
-            (self.others_at, self.excited_at),
-            tuple(GroupTable.of(group, self.problem.sizes) for group in self.problem.groups),
-            (bands.starts, bands.counts),
+            (
+                (self.others_at, np.argsort(others_in_turn)),
+                (self.excited_at, np.arange(self.excited_at.size)),
+            ),
+            tables,
+            bands.counts,
             (self.denominator_basis.hessenberg, self.numerator_basis.hessenberg),
             limits,
+            kernel("joint_kernel").workspace(tables, a + b + c),
         )
 
 

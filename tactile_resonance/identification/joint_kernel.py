@@ -16,13 +16,21 @@ from numba import njit
 
 from tactile_resonance.identification import (
     kernel_algebra,
-    kernel_bins,
+    kernel_driven,
     kernel_judgement,
+    kernel_memory,
     kernel_tables,
+    kernel_undriven,
     one_mode,
 )
 from tactile_resonance.identification.kernel_algebra import eliminate
-from tactile_resonance.identification.kernel_bins import (
+from tactile_resonance.identification.kernel_driven import (
+    add_up_driven,
+    linearise_driven,
+    weigh_start,
+)
+from tactile_resonance.identification.kernel_judgement import level, pole_in_band
+from tactile_resonance.identification.kernel_memory import (
     B_ROW,
     C_ROW,
     E_ROW,
@@ -35,58 +43,47 @@ from tactile_resonance.identification.kernel_bins import (
     Y_ROW,
     U,
     Y,
-    add_up_driven,
-    add_up_undriven,
     combine,
-    error_with_input,
     fill,
     fingerprint,
     inlined,
-    linearise_driven,
-    linearise_undriven,
     power,
     prepared,
-    spread_of_pieces,
-    weigh_start,
 )
-from tactile_resonance.identification.kernel_judgement import level, pole_in_band
+from tactile_resonance.identification.kernel_undriven import (
+    add_up_undriven,
+    error_with_input,
+    spread_of_pieces,
+)
 
-__all__ = ["MOST_BINS", "fit_points"]
+__all__ = ["MOST_BINS", "fit_points", "workspace"]
 
 TINY = float(np.finfo(float).tiny)
+
+
+def workspace(tables, n):
+    """What `fit_points` computes in: memories of the groups, as rows and flat, and small arrays.
+
+    One call after another: `fit_points` holds the interpreter's lock.
+    """
+    memory = [prepared(table) for table in tables]
+    entries = n * (n + 1) + 1
+    groups = tuple((rows, rows.reshape(-1)) for rows in memory)
+    normals = (np.empty(entries), np.empty(entries), np.empty(entries), np.empty(n))
+    return groups, normals, np.empty(n, complex)
 
 
 @inlined
 def _gather(u, y, where, flat):
     """Bins of a point, real and imaginary parts, in the memory of a group; whether all are finite."""
+    sources, places = where
     finite = 0.0
-    for k in range(where.size):
-        value, source = y[where[k]], u[where[k]]
-        flat[Y + k], flat[Y + IM + k] = value.real, value.imag
-        flat[U + k], flat[U + IM + k] = source.real, source.imag
+    for k in range(sources.size):
+        value, source, at = y[sources[k]], u[sources[k]], places[k]
+        flat[Y + at], flat[Y + IM + at] = value.real, value.imag
+        flat[U + at], flat[U + IM + at] = source.real, source.imag
         finite += value.real + value.imag + source.real + source.imag
     return np.isfinite(finite)
-
-
-@inlined
-def _start(theta, tables, groups, normals):
-    """Start values in theta; see `Problem.start`. Whether there are any."""
-    others, driven = tables
-    total, of_others, work, step = normals
-    fill(groups[1][0], V_ROW, 1.0, driven.products.shape[1])
-    weigh_start(groups[1][1], 0.0, 0.0, True, True, driven.products.shape[1])
-    add_up_driven(groups[1][0], driven, total)
-    if not eliminate(total, work, theta):
-        return False
-    weigh_start(groups[0][1], theta[0], theta[1], False, False, others.transient.shape[1])
-    add_up_undriven(groups[0][0], others.transient, theta.size, of_others)
-    weigh_start(groups[1][1], theta[0], theta[1], False, True, driven.products.shape[1])
-    add_up_driven(groups[1][0], driven, total)
-    total += of_others
-    if not eliminate(total, work, step):
-        return False
-    theta[:] = step
-    return True
 
 
 @inlined
@@ -97,12 +94,24 @@ def _add(total, part, factor):
 
 
 @inlined
-def _others(theta, table, group, normal):
-    """Power of the error between harmonics, with normal equations in `normal`."""
-    combine(group[0], C_ROW, table.transient, theta, theta.size - table.transient.shape[0] // 2)
-    squared = linearise_undriven(group[1], theta[0], theta[1], table.transient.shape[1])
-    add_up_undriven(group[0], table.transient, theta.size, normal)
-    return squared
+def _start(theta, tables, groups, normals):
+    """Start values in theta; see `Problem.start`. Whether there are any."""
+    others, driven = tables
+    total, of_others, work, step = normals
+    fill(groups[1][0], V_ROW, 1.0, driven.products.shape[1])
+    weigh_start(groups[1][1], 0.0, 0.0, True, driven.products.shape[1])
+    add_up_driven(groups[1][0], driven, total)
+    if not eliminate(total, work, theta):
+        return False
+    add_up_undriven(groups[0], others.transient, theta, True, of_others)
+    weigh_start(groups[1][1], theta[0], theta[1], False, driven.products.shape[1])
+    add_up_driven(groups[1][0], driven, total)
+    _add(total, of_others, 1.0)
+    if not eliminate(total, work, step):
+        return False
+    for i in range(theta.size):
+        theta[i] = step[i]
+    return True
 
 
 @inlined
@@ -120,7 +129,7 @@ def _near(theta, tables, groups, normals, power_u, limits):
     """One step on from start values; whether there is one."""
     total, of_others, work, step = normals
     size = tables[0].size
-    power_y = _others(theta, tables[0], groups[0], of_others)
+    power_y = add_up_undriven(groups[0], tables[0].transient, theta, False, of_others)
     squared = error_with_input(groups[0][1], size) / max(power_y * power_u, TINY)
     variance_y = power_y / size
     variances = (
@@ -132,7 +141,7 @@ def _near(theta, tables, groups, normals, power_u, limits):
     _add(total, of_others, 1 / variances[0])
     if not eliminate(total, work, step):
         return False
-    theta -= step
+    _add(theta, step, -1.0)
     return True
 
 
@@ -144,8 +153,8 @@ def _noise(power_y, power_u, table, group, pieces, limits):
     if not error_with_input(flat, size) / max(power_y * power_u, TINY) <= limits[0]:
         return nothing
     if limits[1] > 0 and not (
-        spread_of_pieces(group[0], E_ROW, pieces[0], pieces[1], power_y / size) <= limits[1]
-        and spread_of_pieces(group[0], U_ROW, pieces[0], pieces[1], power_u / size) <= limits[1]
+        spread_of_pieces(group[0], E_ROW, pieces, power_y / size) <= limits[1]
+        and spread_of_pieces(group[0], U_ROW, pieces, power_u / size) <= limits[1]
     ):
         return nothing
     variance_y = power_y / size * limits[2]
@@ -167,7 +176,7 @@ def _refine(theta, tables, groups, normals, power_y, variances, limits):
     width = theta.size + 1
     for iteration in range(int(limits[5])):
         if iteration > 0:
-            power_y = _others(theta, tables[0], groups[0], of_others)
+            power_y = add_up_undriven(groups[0], tables[0].transient, theta, False, of_others)
         others = power_y / variances[0]
         excited = _driven(theta, variances, tables[1], groups[1])
         cost = others + excited
@@ -181,7 +190,7 @@ def _refine(theta, tables, groups, normals, power_y, variances, limits):
         decrement = 0.0
         for i in range(theta.size):
             decrement += total[i * width + theta.size] * step[i]
-        theta -= step
+        _add(theta, step, -1.0)
         if decrement <= max(limits[4] * cost, floor):
             return others, excited
     return -1.0, -1.0
@@ -191,21 +200,23 @@ def _entry(sources: int) -> Any:
     """`fit_points` of these sources: its cache on disk watches its own file, and values like this."""
 
     @njit(cache=True, **OPTIONS)
-    def fit_points(u, y, where, tables, pieces, bases, limits, out):
+    def fit_points(u, y, where, tables, pieces, bases, limits, space, out):
         """Fit of points.
 
         Parameters
         ----------
         u, y : (batch, K) complex
-        where : two (K_g,) int arrays
-            Of the bins between harmonics and of the excited ones.
+        where : two pairs of (K_g,) int arrays
+            Of the bins between harmonics and of the excited ones: places in a record, and in `tables`.
         tables : two GroupTable
-        pieces : two int arrays
-            Starts and counts of the pieces of the noise.
+        pieces : (pieces,) int
+            Bins in each piece of the noise.
         bases : two (m + 1, m) float
             Hessenberg matrices of denominator and numerator.
         limits : (11,) float
             See `CompiledJointPlan`.
+        space : tuple of arrays
+            See `workspace`.
         out : tuple of arrays
             ordinary (batch,) bool, theta (batch, n), covariance (batch, n, n), residual (batch, K_e)
             complex, figures (batch, FIGURES).
@@ -213,11 +224,7 @@ def _entry(sources: int) -> Any:
         ordinary, theta, covariance, residual, figures = out
         if sources < 0:
             return
-        n = theta.shape[1]
-        memory = (prepared(tables[0]), prepared(tables[1]))
-        groups = ((memory[0], memory[0].reshape(-1)), (memory[1], memory[1].reshape(-1)))
-        entries = n * (n + 1) + 1
-        normals = (np.empty(entries), np.empty(entries), np.empty(entries), np.empty(n))
+        groups, normals, values = space
         for point in range(y.shape[0]):
             at = theta[point]
             finite = _gather(u[point], y[point], where[0], groups[0][1])
@@ -228,7 +235,7 @@ def _entry(sources: int) -> Any:
             power_u = power(groups[0][0], U_ROW, tables[0].size)
             if not _near(at, tables, groups, normals, power_u, limits):
                 continue
-            power_y = _others(at, tables[0], groups[0], normals[1])
+            power_y = add_up_undriven(groups[0], tables[0].transient, at, False, normals[1])
             variances = _noise(power_y, power_u, tables[0], groups[0], pieces, limits)
             if not variances[0] > 0:
                 continue
@@ -239,18 +246,26 @@ def _entry(sources: int) -> Any:
             found = (covariance[point], residual[point], figures[point])
             sizes = (tables[0].size, tables[1].size)
             if not level(
-                groups[1][1], sizes, normals[0], normals[1], variances, costs, limits, found
+                groups[1][1], sizes, normals[:3], variances, costs, limits, found
             ):  # fmt: skip
                 continue
             terms = bases[1].shape[0]
             band = (limits[8], limits[9], limits[10])
             ordinary[point] = pole_in_band(
-                at[:2], at[2 : 2 + terms], covariance[point], bases, band, figures[point]
+                at[:2], at[2 : 2 + terms], covariance[point], bases, band, values, figures[point]
             )
 
     return fit_points
 
 
 fit_points = _entry(
-    fingerprint(kernel_algebra, kernel_bins, kernel_judgement, kernel_tables, one_mode)
+    fingerprint(
+        kernel_algebra,
+        kernel_driven,
+        kernel_judgement,
+        kernel_memory,
+        kernel_tables,
+        kernel_undriven,
+        one_mode,
+    )
 )

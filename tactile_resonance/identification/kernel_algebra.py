@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small matrices of the compiled kernels: normal equations as `kernel_bins.add_up` leaves them."""
+"""Small matrices of the compiled kernels: normal equations as `kernel_driven.add_up_driven` leaves them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tactile_resonance.identification.kernel_bins import compiled
+from tactile_resonance.identification.kernel_memory import compiled
 
 
 @compiled
@@ -17,7 +17,7 @@ def eliminate(normal, work, step):
     Parameters
     ----------
     normal : (n (n + 1) + 1,) float
-        See `kernel_bins.add_up_driven`.
+        See `kernel_driven.add_up_driven`.
     work : same shape
         Overwritten.
     step : (n,) float
@@ -49,10 +49,11 @@ def eliminate(normal, work, step):
 
 
 @compiled
-def invert(normal, inverse):
+def invert(normal, work, inverse):
     """Inverse (n, n) of a flat normal matrix, by sweeps, and its condition number.
 
-    Infinite where there is none; see `covariance.invert_normal`.
+    Infinite where there is none; see `covariance.invert_normal`. `work` (n or more,) is overwritten: a
+    row in an array of its own lets the compiler take several entries at once.
     """
     n = inverse.shape[0]
     for i in range(n):
@@ -65,11 +66,13 @@ def invert(normal, inverse):
         if not pivot > 0:
             return np.inf
         factor = 1 / pivot
+        for j in range(n):
+            work[j] = inverse[k, j]
         for i in range(n):
             if i != k:
-                scale = inverse[i, k] * factor
+                scale = work[i] * factor
                 for j in range(n):
-                    inverse[i, j] -= scale * inverse[k, j]
+                    inverse[i, j] -= scale * work[j]
                 inverse[i, k] = scale
         for j in range(n):
             inverse[k, j] *= factor
@@ -79,15 +82,19 @@ def invert(normal, inverse):
             value = -0.5 * (inverse[i, j] + inverse[j, i])
             inverse[i, j] = value
             inverse[j, i] = value
-    before, after = 0.0, 0.0
     for i in range(n):
         if not inverse[i, i] > 0:
             return np.inf
-        for j in range(i, n):
-            scale = normal[i * (n + 2)] * normal[j * (n + 2)] * (1 if i == j else 0.5)
-            before += normal[i * (n + 1) + j] ** 2 / scale
-            after += inverse[i, j] ** 2 * scale * (1 if i == j else 4)
-    return (before * after) ** 0.25
+        work[i] = normal[i * (n + 2)]
+    before, after = 0.0, 0.0
+    for i in range(n):
+        first = second = 0.0
+        for j in range(i + 1, n):
+            first += normal[i * (n + 1) + j] ** 2 / work[j]
+            second += inverse[i, j] ** 2 * work[j]
+        before += 1 + 2 * first / work[i]
+        after += (inverse[i, i] * work[i]) ** 2 + 2 * second * work[i]
+    return np.sqrt(np.sqrt(before * after))
 
 
 @compiled

@@ -32,6 +32,8 @@ AA, AC, CC, OF_A, OF_C = 0, 1, 3, 4, 6
 # With an input: -w conj(X) U; w |U|^2; w conj(U); minus gradient by B.
 AB, BB, BC, OF_B = 8, 10, 11, 13
 WEIGHTS = 15
+# Where there are no bins: so large that nothing is left of what is divided by A.
+FAR = 1e100
 
 
 class GroupTable(NamedTuple):
@@ -41,8 +43,9 @@ class GroupTable(NamedTuple):
     ----------
     size : int
         Bins that count.
-    denominator : (6, K) float
-        Real and imaginary part of each of the three polynomials of A; A is 1 on bins of no weight.
+    denominator : (2, K) float
+        The last polynomial of A, which is real, and the imaginary part of the one before; the first
+        is 1.
     numerator, transient : (2 terms, K) float
         Real parts, then imaginary ones.
     products : (rows, K) float
@@ -63,15 +66,31 @@ class GroupTable(NamedTuple):
     targets: IntArray
 
     @classmethod
-    def of(cls, group: BinGroup, sizes: tuple[int, int, int]) -> GroupTable:
-        """Of a group of a problem with so many free coefficients of A (two), B and C."""
+    def of(
+        cls, group: BinGroup, sizes: tuple[int, int, int], order: IntArray | None = None
+    ) -> GroupTable:
+        """Of a group of a problem with so many free coefficients of A (two), B and C.
+
+        Parameters
+        ----------
+        order : (size,) int, optional
+            In which its bins stand, when not in their own.
+        """
         size = group.size
         padded = -(-size // LANES) * LANES
+        order = np.arange(size) if order is None else order
         empty = np.empty((size, 0), complex)
-        numerator, transient = (
-            empty if basis is None else basis for basis in (group.numerator, group.transient)
+        polynomials, numerator, transient = (
+            empty if basis is None else basis[order]
+            for basis in (group.denominator, group.numerator, group.transient)
         )
-        blocks = (group.denominator[:, :-1], numerator, transient)
+        if (
+            np.any(polynomials[:, 0] != 1)
+            or polynomials[:, 1].real.any()
+            or polynomials[:, 2].imag.any()
+        ):
+            raise ValueError("denominator: not 1, an imaginary and a real polynomial")
+        blocks = (polynomials[:, :-1], numerator, transient)
         first = np.cumsum([0, *sizes])
         n = int(first[-1])
         by_weight: dict[int, list[tuple[int, FloatArray]]] = {}
@@ -85,11 +104,8 @@ class GroupTable(NamedTuple):
             targets += [target for target, _ in entries]
             rows += [values for _, values in entries]
             weights += [weight] * (len(entries) // BLOCK)
-        denominator = np.zeros((6, padded))
-        denominator[:, :size] = group.denominator.T.copy().view(float).reshape(3, size, 2).transpose(
-            0, 2, 1
-        ).reshape(6, size)  # fmt: skip
-        denominator[4, size:] = 1.0
+        denominator = _padded(np.stack([polynomials[:, 2].real, polynomials[:, 1].imag]), padded)
+        denominator[0, size:] = FAR
         return cls(
             size,
             denominator,
@@ -99,6 +115,16 @@ class GroupTable(NamedTuple):
             np.array(weights),
             np.array(targets),
         )
+
+
+def interleaved(counts: IntArray) -> IntArray:
+    """(sum counts,) places of values in pieces: the first ones of all pieces, then the second ones.
+
+    Those by which the last piece is longer than the others come at the end.
+    """
+    rounds, pieces = int(counts[0]), counts.size
+    whole = np.arange(rounds * pieces).reshape(pieces, rounds).T.ravel()
+    return np.append(whole, np.arange(whole.size, counts.sum()))
 
 
 def _products(

@@ -55,7 +55,8 @@ def fit_compiled(plan: LinesPlan, data: BinData) -> LinesFit:
         ]
     )
     out = (ordinary, theta, inverse, condition, cost, residual)
-    code.fit_points(response, variance, _table(plan), limits, out)
+    table = _table(plan)
+    code.fit_points(response, variance, table, limits, code.workspace(table, n), out)
     inverse *= 0.5
     fit = LinesFit(plan.model_of(theta), cost, inverse, condition, np.ones(batch, bool), residual)
     return fit if ordinary.all() else _replaced(fit, ~ordinary, plan.fit(data.rows(~ordinary)))

@@ -13,9 +13,20 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from tactile_resonance.identification import kernel_algebra, kernel_bins, kernel_tables
+from tactile_resonance.identification import (
+    kernel_algebra,
+    kernel_driven,
+    kernel_memory,
+    kernel_tables,
+)
 from tactile_resonance.identification.kernel_algebra import eliminate, invert
-from tactile_resonance.identification.kernel_bins import (
+from tactile_resonance.identification.kernel_driven import (
+    add_up_driven,
+    linearise_driven,
+    turned_residual,
+    weigh_start,
+)
+from tactile_resonance.identification.kernel_memory import (
     B_ROW,
     IM,
     MOST_BINS,
@@ -24,18 +35,21 @@ from tactile_resonance.identification.kernel_bins import (
     S,
     V,
     Y,
-    add_up_driven,
     combine,
-    fill,
     fingerprint,
     inlined,
-    linearise_driven,
     prepared,
-    turned_residual,
-    weigh_start,
 )
 
-__all__ = ["MOST_BINS", "fit_points"]
+__all__ = ["MOST_BINS", "fit_points", "workspace"]
+
+
+def workspace(table, n):
+    """What `fit_points` computes in: the group's memory, as rows and flat, and three small arrays."""
+    memory = prepared(table)
+    memory[U_ROW, : table.size] = 1.0
+    entries = n * (n + 1) + 1
+    return memory, memory.reshape(-1), (np.empty(entries), np.empty(entries), np.empty(n))
 
 
 @inlined
@@ -55,11 +69,11 @@ def _start(theta, table, memory, flat, normals):
     """Start values in theta; see `ManyPoints.start`. Whether there are any."""
     normal, work, _ = normals
     bins = table.products.shape[1]
-    weigh_start(flat, 0.0, 0.0, True, True, bins)
+    weigh_start(flat, 0.0, 0.0, True, bins)
     add_up_driven(memory, table, normal)
     if not eliminate(normal, work, theta):
         return False
-    weigh_start(flat, theta[0], theta[1], False, True, bins)
+    weigh_start(flat, theta[0], theta[1], False, bins)
     add_up_driven(memory, table, normal)
     return eliminate(normal, work, theta)
 
@@ -91,7 +105,8 @@ def _refine(theta, table, memory, flat, normals, floor, limit, iterations):
         decrement = 0.0
         for i in range(theta.size):
             decrement += normal[i * width + theta.size] * step[i]
-        theta -= step
+        for i in range(theta.size):
+            theta[i] -= step[i]
         if decrement <= max(limit * cost, floor):
             return cost - decrement
     return -1.0
@@ -101,7 +116,7 @@ def _entry(sources: int) -> Any:
     """`fit_points` of these sources."""
 
     @njit(cache=True, **OPTIONS)
-    def fit_points(response, variance, table, limits, out):
+    def fit_points(response, variance, table, limits, space, out):
         """Fit of points.
 
         Parameters
@@ -113,6 +128,8 @@ def _entry(sources: int) -> Any:
         limits : (4,) float
             Of rounding and of a last step, squared and relative to the cost; iterations; condition
             number.
+        space : tuple of arrays
+            See `workspace`.
         out : tuple of arrays
             ordinary (batch,) bool, theta (batch, n), inverse (batch, n, n) of the normal matrices,
             condition number (batch,), cost (batch,), residual (batch, F) complex.
@@ -120,12 +137,7 @@ def _entry(sources: int) -> Any:
         ordinary, theta, inverse, condition, cost, residual = out
         if sources < 0:
             return
-        n = theta.shape[1]
-        memory = prepared(table)
-        flat = memory.reshape(-1)
-        fill(memory, U_ROW, 1.0, table.size)
-        entries = n * (n + 1) + 1
-        normals = (np.empty(entries), np.empty(entries), np.empty(n))
+        memory, flat, normals = space
         for point in range(response.shape[0]):
             at = theta[point]
             power = _gather(response[point], variance[point], flat)
@@ -135,7 +147,7 @@ def _entry(sources: int) -> Any:
             cost[point] = _refine(at, table, memory, flat, normals, floor, limits[1], iterations)
             if not cost[point] >= 0:
                 continue
-            condition[point] = invert(normals[0], inverse[point])
+            condition[point] = invert(normals[0], normals[1], inverse[point])
             if not condition[point] < limits[3]:
                 continue
             _cost(at, table, memory, flat)
@@ -145,4 +157,4 @@ def _entry(sources: int) -> Any:
     return fit_points
 
 
-fit_points = _entry(fingerprint(kernel_algebra, kernel_bins, kernel_tables))
+fit_points = _entry(fingerprint(kernel_algebra, kernel_driven, kernel_memory, kernel_tables))

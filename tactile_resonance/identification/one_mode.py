@@ -16,7 +16,7 @@ COST, EXPECTED, CONDITION, NOISE_Y, NOISE_U, F0_HZ, DAMPING, POLE, RESIDUE = (
 POLE_COVARIANCE, COVARIANCE, FIGURES = 11, 15, 19
 
 
-def pole_in_band(alpha, beta, covariance, bases, band, figures):
+def pole_in_band(alpha, beta, covariance, bases, band, values, figures):
     """The pole, its residue and covariances in `figures`; whether it is one stable pair in the band.
 
     Parameters
@@ -29,6 +29,8 @@ def pole_in_band(alpha, beta, covariance, bases, band, figures):
         Hessenberg matrices of denominator and numerator.
     band : (3,) float
         Scale of the variable [rad/s], least and largest f0 [Hz].
+    values : (m + 1,) complex
+        Overwritten.
     figures : (FIGURES,) float
     """
     h, h_b = bases
@@ -50,7 +52,6 @@ def pole_in_band(alpha, beta, covariance, bases, band, figures):
     slope_2 = (p_1 + (x - h[1, 1]) * slope_1) / h[2, 1]
     ratio = scale / (alpha[1] * slope_1 + slope_2)
     terms = h_b.shape[0]
-    values = np.empty(terms, np.complex128)
     values[0] = 1.0
     b = complex(beta[0], 0.0)
     for k in range(terms - 1):

@@ -147,6 +147,26 @@ def test_what_is_not_compiled_is_refused():
         plans(120, BARE)
 
 
+@pytest.mark.parametrize("longer", [0, 1, 7])
+def test_spread_of_pieces_of_which_the_last_is_longer(longer):
+    """By its definition, of bins in the order of the kernel."""
+    from tactile_resonance.identification import kernel_memory, kernel_undriven
+    from tactile_resonance.identification.kernel_tables import interleaved
+
+    counts = np.array([8, 8, 8, 8, 8 + longer])
+    rng = np.random.default_rng(longer)
+    values = rng.standard_normal((counts.sum(), 2)).view(complex)[:, 0]
+    starts = np.cumsum(counts) - counts
+    values *= np.repeat([1, 2, 0.5, 1, 3], counts)
+    means = np.add.reduceat(np.abs(values) ** 2, starts) / counts
+    row = kernel_memory.E_ROW
+    memory = np.full((kernel_memory.ROWS, kernel_memory.STRIDE), np.nan)
+    turned = values[interleaved(counts)]
+    memory[row, : turned.size], memory[row + 1, : turned.size] = turned.real, turned.imag
+    found = kernel_undriven.spread_of_pieces(memory, row, counts, np.mean(np.abs(values) ** 2))
+    assert found == pytest.approx(np.log(means.mean()) - np.log(means).mean(), rel=1e-12)
+
+
 def test_without_numba_it_says_what_to_install():
     code = (
         "import sys; sys.modules['numba'] = None\n"
