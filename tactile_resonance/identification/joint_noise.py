@@ -142,13 +142,11 @@ def noise_between_harmonics(
         )
     by_g = response() * u
     explained_g = power_error - _mean_power(error - by_g)
-    generator = correlated & (explained_g > 0)
+    gain = cross / np.maximum(power_u, TINY)
+    explained_alike = power_error - _mean_power(error - gain * u)
+    generator = correlated & (explained_g >= 0.9 * explained_alike)
     common = correlated & ~generator
     if common.any():
-        gain = cross / np.maximum(power_u, TINY)
-        alike = power_error - _mean_power(error - gain * u)
-        generator &= explained_g >= 0.9 * alike
-        common = correlated & ~generator
         covariance = np.where(common, cross, 0.0)
         through = np.where(common, gain * u, 0.0)
     if generator.any():

@@ -72,12 +72,13 @@ def test_nine_tenths_of_both_noises_are_one(periods):
     assert_honest(fits(plant, plant.input(bins) + 10 * both, y), 0.93)
 
 
-@pytest.mark.parametrize("kind", ["generator", "both channels"])
-def test_disturbances_seen_at_the_input_are_no_noise_of_the_output(kind):
+@pytest.mark.parametrize("at_output", ["response", 2.0, -2.0, -2j])
+def test_disturbances_seen_at_the_input_are_no_noise_of_the_output(at_output):
     """40 dB above the output's own: what U shows of them between harmonics is taken from Y.
 
     What is left to tell the transient and the noise level by is the output's own noise. Of a generator
-    they are an input like any other; alike in both channels, they stay in the lines that are excited.
+    they are an input like any other; alike in both channels, whatever the gain and its phase, they stay in
+    the lines that are excited, as noise of both.
     """
     plant = Plant(0.02, 60.0, 8)
     bins, rng = plant.bins(), np.random.default_rng(5)
@@ -85,17 +86,18 @@ def test_disturbances_seen_at_the_input_are_no_noise_of_the_output(kind):
     s, w0 = 2j * np.pi * bins * SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD / 8, 2 * np.pi * 250
     g = 0.1 + 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
     disturbance = circular(rng, bins.size, 1e4 * variance_y)
-    at_output = g if kind == "generator" else -2j  # a quarter of a turn late, as behind a filter
-    y = plant.output(bins) + at_output * disturbance + circular(rng, bins.size, variance_y)
+    generator = at_output == "response"
+    gain = g if generator else at_output
+    y = plant.output(bins) + gain * disturbance + circular(rng, bins.size, variance_y)
     result = fits(plant, plant.input(bins) + disturbance, y)
     jacobian, _ = plant.derivatives()
     excited = bins % 8 == 0
-    variance = variance_y * (1 + 1e4 * excited * np.abs(at_output - g) ** 2)
+    variance = variance_y * (1 + 1e4 * excited * np.abs(gain - g) ** 2)
     information = 2 * np.real((jacobian.conj().T / variance) @ jacobian)
     assert_honest(result, 0.94, np.linalg.inv(information)[:2, :2])
     assert np.mean(result.variance_model == "flat") > 0.98
     assert np.median(result.noise_variance[:, 0]) == pytest.approx(variance_y, rel=0.02)
-    at_input = 0.0 if kind == "generator" else 1e4 * variance_y
+    at_input = 0.0 if generator else 1e4 * variance_y
     assert np.median(result.noise_variance[:, 1]) == pytest.approx(at_input, rel=0.1)
 
 
@@ -107,8 +109,12 @@ def test_noise_with_a_peak_at_the_resonance(periods):
     y = plant.output(bins) + circular(rng, bins.size, plant.noise[0] * peak)
     u = plant.input(bins) + circular(rng, bins.size, plant.noise[1])
     result = fits(plant, u, y)
-    assert np.mean(result.variance_model == "per line") > 0.9
+    by_piece = result.variance_model == "per line"
+    assert np.mean(by_piece) > 0.9
     assert_honest(result, 0.93)
+    # levels of eight bins each: by F(2, 16)
+    cost = result.cost[by_piece].mean()
+    assert cost == pytest.approx(result.expected_cost[by_piece].mean(), rel=0.04)
 
 
 def test_a_level_from_few_lines_widens_the_ellipse():
@@ -126,3 +132,19 @@ def test_a_level_from_few_lines_widens_the_ellipse():
     # of a Student distribution of that variance: 0.9395
     assert stats.binom.cdf(coverage * runs, runs, 0.9395) > 0.0005
     assert stats.binom.sf(coverage * runs - 1, runs, 0.9395) > 0.0005
+
+
+def test_levels_from_few_bins_are_unbiased():
+    """Two periods, nine lines and eight bins between: what parameters take of either is no small part."""
+    plant, band_hz, runs = Plant(0.02, 60.0, 2), (240.0, 260.0), 6000
+    plan = JointPlan(
+        *(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 2, HARMONICS, band_hz), ModelStructure(2, 2)
+    )
+    result = plan.from_bins(*plant.noisy(np.random.default_rng(6), runs, plan.bins))
+    level = result.noise_variance[:, 0] / plant.noise[0]
+    assert level.mean() == pytest.approx(1, abs=4 * level.std() / np.sqrt(runs))
+    # residuals of both kinds share a transient, so that their costs are not quite independent
+    assert result.cost.mean() == pytest.approx(result.expected_cost.mean(), rel=0.1)
+    errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
+    squared = errors**2 / np.diagonal(result.covariance[:, 0], axis1=-2, axis2=-1)
+    assert squared.mean() == pytest.approx(1, abs=4 * np.sqrt(2.5 / squared.size))
