@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from identification.mode_at_250_hz import circular
 from scipy import stats
 
 from benchmarks.poles_bias import tissue_bias
@@ -190,10 +191,6 @@ def test_bad_input_is_named(options, field):
 def spread_of(result):
     errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
     return judge(errors, result.covariance[:, 0], np.eye(2))[1]
-
-
-def circular(rng, shape, variance):
-    return np.sqrt(variance / 2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
 
 
 @pytest.mark.parametrize("kind", ["generator", "sloped", "sloped input", "steps", "common"])
