@@ -97,6 +97,7 @@ def test_disturbances_seen_at_the_input_are_no_noise_of_the_output(at_output):
     assert_honest(result, 0.94, np.linalg.inv(information)[:2, :2])
     assert np.mean(result.variance_model == "flat") > 0.98
     assert np.median(result.noise_variance[:, 0]) == pytest.approx(variance_y, rel=0.02)
+    assert result.cost.mean() == pytest.approx(result.expected_cost.mean(), rel=0.08)
     at_input = 0.0 if generator else 1e4 * variance_y
     assert np.median(result.noise_variance[:, 1]) == pytest.approx(at_input, rel=0.1)
 
