@@ -184,6 +184,30 @@ def test_every_method_agrees_with_the_truth(options, domain, tmp_path, capsys):
     assert std[0] < 0.05
 
 
+@pytest.mark.parametrize(
+    ("options", "realisations", "estimator"),
+    [
+        ((), 1, "joint maximum likelihood of poles and transient"),
+        ((), 2, "joint maximum likelihood of poles and transients, 2 realisations"),
+        (("--method", "frf"), 1, "weighted least squares"),
+        (("--channel-delay", "1e-6"), 1, "weighted least squares"),
+    ],
+)
+def test_the_estimator_is_named(options, realisations, estimator, tmp_path, capsys):
+    """To a reader as in the JSON: which one it was is the program's choice where nobody made it."""
+    parts = [record(periods=2, seed=seed) for seed in range(realisations)]
+    channels = {
+        name: np.stack([part[name] for part in parts]).reshape(realisations, 2, N) for name in "uy"
+    }
+    path, out = tmp_path / "a.npz", tmp_path / "out.json"
+    np.savez(path, **{**parts[0], **channels})
+    arguments = ["analyze", str(path), "--band", "200", "300", "--json", str(out), *options]
+    assert cli.main(arguments) == 0
+    (fit,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("fit: "))
+    assert fit.startswith(f"fit: {estimator}, 41 lines, 200-300 Hz, orders 7/2, cost ")
+    assert json.loads(out.read_text())["method"] == estimator
+
+
 @pytest.mark.parametrize("periods", [1, 3])
 def test_transients_of_several_realisations_do_no_harm(periods, tmp_path, capsys):
     """Each begins with a decay of its own, far above the noise, of which their mean FRF keeps some."""

@@ -204,8 +204,8 @@ def as_text(analysis: Analysis) -> str:
     lines = [
         f"FRF: {frf.frequency_hz.size} lines, {frf.frequency_hz[0]:g}-{frf.frequency_hz[-1]:g} Hz, "
         f"{frf.realisations} x {frf.periods} periods, {frf.method}",
-        f"fit: {poles.lines} lines, {poles.band_hz[0]:g}-{poles.band_hz[1]:g} Hz, orders "
-        f"{poles.structure.numerator_order}/{poles.structure.order}, cost {poles.cost:.4g} "
+        f"fit: {poles.method}, {poles.lines} lines, {poles.band_hz[0]:g}-{poles.band_hz[1]:g} Hz, "
+        f"orders {poles.structure.numerator_order}/{poles.structure.order}, cost {poles.cost:.4g} "
         f"(expected {poles.expected_cost:.4g}), variance {poles.variance_model}",
     ]
     for k, pole in enumerate(poles.poles_rad_s):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import modes_in_band
 from tactile_resonance.identification.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.identification.judgement import Evidence, assemble
+from tactile_resonance.identification.line_weights import lines_of_frf, lines_of_spectra
 from tactile_resonance.identification.lines_compiled import fit_compiled
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
 from tactile_resonance.identification.model_error import (
@@ -22,7 +22,7 @@ from tactile_resonance.identification.model_error import (
     difference_of_models,
     richer,
 )
-from tactile_resonance.identification.noise_level import KINDS, VarianceModel, model_variance
+from tactile_resonance.identification.noise_level import KINDS, VarianceModel
 from tactile_resonance.identification.result import (
     ComplexArray,
     FloatArray,
@@ -35,10 +35,6 @@ from tactile_resonance.identification.whiteness import are_smooth
 
 # Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
 FEWEST_BINS = 16
-# Degrees of freedom that stand for a covariance known exactly.
-EXACT = 10**6
-# Of the input's noise seen at the output.
-LEAST_OUTPUT_NOISE = 1e-12
 # Mean square of the residuals over that of the data, below which they are rounding.
 ROUNDED = 1e-22
 
@@ -137,45 +133,19 @@ def identify_batch(
     frf = checked_frf(frf)
     band_hz = checked_band(frf.frequency_hz, band_hz)
     selected = frf.band(*band_hz)
-    shape = frf.g.shape[:-1]
-    flat_shape = math.prod(shape), selected.frequency_hz.size
-    g = selected.g.reshape(flat_shape)
-    usable = np.isfinite(g)
-    level_known = np.full(flat_shape[0], selected.variance is not None and selected.dof > 0)
-    variance = np.ones(flat_shape)
-    if selected.variance is not None and selected.dof > 0:
-        variance = selected.variance.reshape(flat_shape)
-        weighted = usable & (variance > 0) & (variance < np.inf)
-        if not weighted.all():
-            level_known = np.asarray((usable & (variance > 0)).any(axis=-1))
-            variance = np.where(level_known[:, None], variance, 1.0)
-            usable = np.where(level_known[:, None], weighted, usable)
-    if not usable.all():
-        g = np.where(usable, g, 0.0)
-        variance = np.where(usable, variance, np.nan)
-    known = model_variance(variance, max(selected.dof, 1), g.real**2 + g.imag**2)
-    weights = known.variance
-    if not level_known.all():
-        power = np.where(usable, _power(g, usable), np.inf)
-        weights = np.where(level_known[:, None], weights, power)
-    if frf.variance_total is None and frf.periods > 1:
-        # noise is from bins between lines: neighbours share them where periods are few
-        bins = (frf.periods - 1) * frf.realisations
-        known = replace(known, independent_dof=min(selected.dof, bins))
-    total_known = selected.variance_total is not None
-    noise = selected.variance_noise
+    lines = lines_of_frf(selected)
     return _identify(
         selected.frequency_hz,
-        BinData(g, None, weights),
-        known,
-        usable,
+        lines.data,
+        lines.known,
+        lines.usable,
         structure,
         band_hz,
-        shape=shape,
+        shape=frf.g.shape[:-1],
         method="weighted least squares",
-        level_known=level_known,
-        noise=noise.reshape(flat_shape) if noise is not None and total_known else None,
-        total_known=total_known,
+        level_known=lines.level_known,
+        noise=lines.noise,
+        total_known=selected.variance_total is not None,
         compiled=compiled,
     )
 
@@ -226,72 +196,18 @@ def identify_spectra(
     frequency_hz, spectra, covariance = checked_spectra(frequency_hz, spectra, covariance, dof)
     band_hz = checked_band(frequency_hz, band_hz)
     inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
-    lines = int(inside.sum())
-    shape = spectra.shape[:-2]
-    points = math.prod(shape)
-    z = spectra[..., inside].reshape(points, 2, lines)
-    c = covariance[..., inside].reshape(points, 2, 2, lines)
-    usable = np.isfinite(z).all(axis=-2) & np.isfinite(c).all(axis=(-3, -2))
-    noise_y, noise_u = (usable & (c[:, k, k].real > 0) for k in (0, 1))
-    level_known = np.asarray((noise_y | noise_u).any(axis=-1))
-    # lines of one channel without variance, beside others with one, are none of the noise's making
-    usable &= noise_y | ~noise_y.any(axis=-1, keepdims=True)
-    usable &= noise_u | ~noise_u.any(axis=-1, keepdims=True)
-    z = np.where(usable[:, None], z, 0.0)
-    c_yy, c_uu = (np.where(usable, c[:, k, k].real, 0.0) for k in (0, 1))
-    c_yu = np.where(usable, c[:, 0, 1], 0.0)
-    model_y, model_u = (_channel(x, usable, dof, pooled) for x in (c_yy, c_uu))
-    known = replace(
-        model_y,
-        lines=usable.sum(axis=-1),
-        dof=dof if dof > 0 else EXACT,
-        kind=np.maximum(model_y.kind, model_u.kind),
-    )
-    together = known.kind[:, None] < 2
-    smooth_y, smooth_u = (np.where(usable, m.variance, 0.0) for m in (model_y, model_u))
-    both = np.sqrt(smooth_y * smooth_u)
-    correlation = (c_yu / _or_one(both)).sum(axis=-1, keepdims=True)
-    correlation /= np.maximum(known.lines[:, None], np.abs(correlation))  # 1 at most
-    c_yu = np.where(together, correlation * both, c_yu)
-    c_yy, c_uu = (np.where(together, *pair) for pair in ((smooth_y, c_yy), (smooth_u, c_uu)))
-    power_y, power_u = (_power(x, usable) for x in (z[:, 0], z[:, 1]))
-    # all the noise may be in the input, but weights of start values are from the output's
-    c_yy = np.maximum(c_yy, LEAST_OUTPUT_NOISE * c_uu * power_y / power_u)
-    c_yy = np.where(level_known[:, None], c_yy, power_y)
+    lines = lines_of_spectra(spectra[..., inside], covariance[..., inside], dof, pooled)
     return _identify(
         frequency_hz[inside],
-        BinData(z[:, 0], z[:, 1], np.where(usable, c_yy, np.inf), c_uu, c_yu),
-        known,
-        usable,
+        lines.data,
+        lines.known,
+        lines.usable,
         structure,
         band_hz,
-        shape=shape,
+        shape=spectra.shape[:-2],
         method="sample maximum likelihood, errors in variables",
-        level_known=level_known,
+        level_known=lines.level_known,
     )
-
-
-def _channel(
-    variance: FloatArray, usable: npt.NDArray[np.bool_], dof: int, pooled: bool
-) -> VarianceModel:
-    """Of one channel: pooled over the band where a test allows it; exact ones line by line."""
-    lines = usable.sum(axis=-1)
-    if dof <= 0 or not pooled:
-        return VarianceModel(variance, lines, max(dof, 1), np.full(lines.shape, 2))
-    model = model_variance(np.where(usable, variance, np.nan), dof)
-    # a channel without noise is as flat as any
-    noisy = np.asarray((variance > 0).any(axis=-1))[:, None]
-    return replace(model, variance=np.where(noisy, model.variance, 0.0))
-
-
-def _power(values: ComplexArray, usable: npt.NDArray[np.bool_]) -> FloatArray:
-    """(batch, 1) mean square of the usable lines; 1 where there is none above 0."""
-    power = np.where(usable, values.real**2 + values.imag**2, 0.0).sum(axis=-1, keepdims=True)
-    return _or_one(power / np.maximum(usable.sum(axis=-1, keepdims=True), 1))
-
-
-def _or_one(values: FloatArray) -> FloatArray:
-    return np.where(values > 0, values, 1.0)
 
 
 def _identify(

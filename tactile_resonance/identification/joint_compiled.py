@@ -134,6 +134,7 @@ class CompiledJointPlan(JointPlan):
             condition_number=figures[:, one_mode.CONDITION],
             residual=residual,
             lines=np.full(batch, self.excited_bins.size),
+            suspect=np.zeros(batch, bool),
             status_code=np.full(batch, STATUS_CODE[PolesStatus.OK], np.uint8),
             noise_variance=figures[:, one_mode.NOISE_Y : one_mode.NOISE_Y + 2],
             fit=RationalModel(

@@ -19,6 +19,9 @@ IntArray = npt.NDArray[np.int64]
 BINS_PER_BAND = 8
 # Fewer are not tested for being equal.
 FEWEST_PIECES = 4
+# Disturbances that the response explains somewhat are taken for the generator's, unless one gain for all
+# bins leaves so much less of the error.
+MUCH_MORE = 1.5
 TINY = float(np.finfo(float).tiny)
 NAMES = np.array(KINDS)
 
@@ -121,7 +124,8 @@ def noise_between_harmonics(
     -----
     Noise of the two voltmeters is independent. Where U and Y are correlated beyond chance the
     disturbance either went through the system (noise of the generator: then it is a known input, no
-    measurement noise) or into both channels alike; taken is what explains more of Y.
+    measurement noise) or into both channels alike; the first is taken where it explains some of Y and
+    the second not much more.
     """
     size = error.shape[1]
     dof = max(size - terms / 2, 1.0)
@@ -141,14 +145,11 @@ def noise_between_harmonics(
             variance_y, input_power, variance_y, None, None, np.concatenate(means, -1), kind
         )
     by_g = response() * u
-    explained_g = power_error - _mean_power(error - by_g)
-    generator = correlated & (explained_g > 0)
+    gain = cross / np.maximum(power_u, TINY)
+    rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
+    generator = correlated & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
     common = correlated & ~generator
     if common.any():
-        gain = cross / np.maximum(power_u, TINY)
-        alike = power_error - _mean_power(error - gain * u)
-        generator &= explained_g >= 0.9 * alike
-        common = correlated & ~generator
         covariance = np.where(common, cross, 0.0)
         through = np.where(common, gain * u, 0.0)
     if generator.any():

@@ -158,6 +158,7 @@ def assemble(
         condition_number=batch(fit.condition_number),
         residual=batch(fit.residual),
         lines=batch(evidence.lines),
+        suspect=batch(evidence.suspect),
         status_code=batch(code),
         noise_variance=batch(noise),
         fit=replace(

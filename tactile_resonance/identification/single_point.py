@@ -66,6 +66,9 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         poles, residue = poles[real], residue[real]
         if not real.any():
             status, residue = PolesStatus.NO_RESONANCE, None
+        elif status is PolesStatus.UNSTABLE_POLE and (poles.real < 0).all():
+            # of the modes that are left none is; the covariance is known, or none were left out
+            status = PolesStatus.MODEL_ERROR if batch.suspect[index] else PolesStatus.OK
         left_out = [
             f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
             "noise makes"

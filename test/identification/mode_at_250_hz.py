@@ -4,6 +4,7 @@
 import numpy as np
 
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)
@@ -50,4 +51,12 @@ def record(noise=1e-3):
     return (
         u + noise / 10 * rng.standard_normal(shape),
         y + noise * rng.standard_normal(shape),
+    )
+
+
+def from_record(**changes):
+    u, y = record()
+    good = {"u": u, "y": y, "sample_rate_hz": RATE_HZ, "harmonics": HARMONICS}
+    return identify_poles_from_records(
+        **{**good, "band_hz": (200.0, 300.0), "structure": BARE, **changes}
     )

@@ -12,6 +12,7 @@ from identification.mode_at_250_hz import (
     RATE_HZ,
     SAMPLES,
     frf,
+    from_record,
     record,
     spectra,
 )
@@ -27,7 +28,6 @@ from tactile_resonance.identification.identify import (
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import (
     identify_poles_from_bins,
-    identify_poles_from_records,
 )
 from tactile_resonance.identification.order_choice import choose_order
 from tactile_resonance.identification.result import PolesStatus
@@ -96,14 +96,6 @@ def test_bad_spectra_are_named(changes, said):
 def test_a_bad_structure_is_named(options, field):
     with pytest.raises(ValueError, match=field):
         ModelStructure(**options)
-
-
-def from_record(**changes):
-    u, y = record()
-    good = {"u": u, "y": y, "sample_rate_hz": RATE_HZ, "harmonics": HARMONICS}
-    return identify_poles_from_records(
-        **{**good, "band_hz": (200.0, 300.0), "structure": BARE, **changes}
-    )
 
 
 @pytest.mark.parametrize(

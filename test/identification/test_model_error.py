@@ -179,3 +179,17 @@ def test_two_modes_taken_for_one_are_within_the_total_covariance(distance_hz, sh
     nearest = error.max(axis=-1).min(axis=0)
     assert np.mean(nearest < 3) > 0.8
     assert np.median(nearest) > 0.3  # nor is everything within it
+
+
+def test_one_wild_line_is_within_the_total_covariance():
+    """Any one line of the band, three thousand deviations off: a cost beyond noise widens the ellipse."""
+    plant = Plant(0.02, 60.0, 2)
+    bins = plant.bins()
+    wild = np.flatnonzero(bins % 2 == 0)
+    u, y = plant.noisy(np.random.default_rng(4), wild.size, bins)
+    y[np.arange(wild.size), wild] += 3000 * np.sqrt(plant.noise[0])
+    result = plan_for(plant, BARE).from_bins(u, y)
+    assert result.has_status(PolesStatus.MODEL_ERROR).all()
+    std = np.sqrt(np.diagonal(result.total_covariance[:, 0], axis1=-2, axis2=-1))
+    off = np.abs(np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1))
+    assert np.all(off < 3 * std)

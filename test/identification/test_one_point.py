@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """One point by itself, and the same point in a batch: two ways of computing, one answer."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tactile_resonance.identification.basis import PolynomialBasis
 from tactile_resonance.identification.bins import BinData, BinGroup
 from tactile_resonance.identification.covariance import invert_normal
+from tactile_resonance.identification.dense import refit_failed
 from tactile_resonance.identification.normal_equations import MANY, solve_one, solve_scaled
 from tactile_resonance.identification.problem import Problem
+from tactile_resonance.identification.shared_points import minimise_shared
 from tactile_resonance.identification.solver import minimise
 
 RNG = np.random.default_rng(4)
@@ -67,6 +71,37 @@ def test_equal_the_batch(errors_in_variables, transient):
         assert alone.theta[0] == pytest.approx(fitted.theta[k], rel=1e-7, abs=1e-9)
         assert alone.cost[0] == pytest.approx(fitted.cost[k], rel=1e-10)
         assert np.abs(alone.residual[0] - fitted.residual[k]).max() < 1e-3
+
+
+def test_points_that_a_batch_lost_are_found_by_the_dense_solver():
+    """Searches ended at once, all or some of a batch: what comes back is what they would have found."""
+    problem, data = problem_and_data(5, False, True)
+    found = minimise(problem, data)
+    lost = minimise(problem, data, max_iterations=0)
+    assert found.converged.all()
+    assert not lost.converged.any()
+    assert_same(refit_failed(problem, lost, data), found)
+    some = replace(found, converged=np.arange(5) != 2, theta=found.theta.copy())
+    some.theta[2] = lost.theta[2]
+    assert_same(refit_failed(problem, some, data), found)
+    # and a point that is several records
+    shared = minimise_shared(problem, data, 5)
+    assert shared.converged.all()
+    assert_same(minimise_shared(problem, data, 5, max_iterations=0), shared)
+
+
+def assert_same(solution, other):
+    """To a hundredth of a standard deviation; sums and residuals accordingly."""
+    assert solution.converged.all()
+    square = other.normal.sum(axis=-3)
+    moved = solution.theta - other.theta
+    assert np.einsum("...i,...ij,...j->...", moved, square, moved).max() < 1e-4
+    size = np.sqrt(np.einsum("...ii->...i", square))
+    scale = size[..., None, :, None] * size[..., None, None, :]
+    assert np.abs((solution.normal - other.normal) / scale).max() < 1e-2
+    assert solution.cost == pytest.approx(other.cost, rel=1e-5)
+    assert solution.group_cost == pytest.approx(other.group_cost, rel=1e-3)
+    assert np.abs(solution.residual - other.residual).max() < 1e-2
 
 
 def test_gradient_is_that_of_the_cost():

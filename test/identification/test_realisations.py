@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from identification.mode_at_250_hz import circular
 from scipy import stats
 
 from benchmarks.poles_plant import (
@@ -32,10 +33,6 @@ RUNS = 600
 
 def plants(damping_ratio, snr_db, periods, realisations):
     return [Plant(damping_ratio, snr_db, periods, seed=10 + m) for m in range(realisations)]
-
-
-def circular(rng, shape, variance):
-    return np.sqrt(variance / 2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
 
 
 def spectra(plants, rng, runs, distortion=0.0):

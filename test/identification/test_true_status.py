@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from identification.mode_at_250_hz import (
     BARE,
-    HARMONICS,
     LINES_HZ,
     NOISY,
-    RATE_HZ,
     G,
     S,
     circular,
     frf,
+    from_record,
     record,
     spectra,
 )
@@ -26,7 +25,6 @@ from tactile_resonance.identification.identify import (
     identify_poles,
     identify_spectra,
 )
-from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.order_choice import choose_order
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.single_point import single
@@ -52,9 +50,7 @@ def test_beyond_double_precision_is_right_or_told(scale, variance):
     right = poles.f0_hz.size == 1 and abs(poles.f0_hz[0] - 250) < 0.02
     assert right or (poles.status is not PolesStatus.OK and poles.covariance is None)
     u, y = record()
-    poles = identify_poles_from_records(
-        u * scale, y * scale, sample_rate_hz=RATE_HZ, harmonics=HARMONICS, band_hz=(200, 300)
-    )
+    poles = from_record(u=u * scale, y=y * scale, structure=None)
     right = poles.f0_hz.size == 1 and abs(poles.f0_hz[0] - 250) < 0.02
     assert right or (poles.status is not PolesStatus.OK and poles.covariance is None)
 
@@ -78,9 +74,7 @@ def test_more_parameters_than_smooth_residuals_have_room_for():
 def test_samples_without_a_value_are_told(where, value):
     channels = dict(zip("uy", record(), strict=True))
     channels[where][1, 5] = value
-    poles = identify_poles_from_records(
-        **channels, sample_rate_hz=RATE_HZ, harmonics=HARMONICS, band_hz=(200, 300)
-    )
+    poles = from_record(**channels)
     assert poles.status is PolesStatus.TOO_FEW_LINES
     assert "0 lines with finite values" in poles.message
 
@@ -248,9 +242,7 @@ def test_a_constant_response_determines_no_pole():
 @pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
 def test_what_rounding_leaves_of_an_exact_record_is_no_model_error(structure):
     u, y = record(noise=0.0)
-    poles = identify_poles_from_records(
-        u, y, sample_rate_hz=RATE_HZ, harmonics=HARMONICS, band_hz=(200, 300), structure=structure
-    )
+    poles = from_record(u=u, y=y, structure=structure)
     assert poles.status is PolesStatus.OK
     assert poles.f0_hz == pytest.approx([250], rel=1e-9)
 
