@@ -15,6 +15,9 @@ GAP_DB = 15.0
 
 _FALSE_ALARM = 1e-4  # probability that any pure-noise line of a record passes for a signal
 _NOISE_BINS = 16  # bins wanted for the noise level at a line
+_FEWEST_BELOW = (
+    4  # lines of noise whose weakest four are 15 dB below the next: once in 31^4 records
+)
 _STRAY_SHARE = 0.03  # even lines, relative to the odd ones, up to which a grid is called odd
 
 
@@ -49,8 +52,10 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     Notes
     -----
     For P >= 2 the noise level is that of the bins between harmonics, taken locally (coloured
-    noise). For P = 1 there are none: the noise level is that of the weaker half of the lines, so
-    that fewer than half of the lines up to the Nyquist frequency may be excited.
+    noise). For P = 1 there are none: the noise level is that of the weaker half of the lines. Where
+    more than half are excited nothing stands above that; then a step of `gap_db` must part them from
+    at least four lines of noise, which noise alone does in less than one record of a hundred
+    thousand.
     """
     u = np.asarray(u)
     if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:
@@ -74,9 +79,13 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
         else _noise_threshold_between(power, harmonics, periods, records)
     )
     candidate = line_power > threshold
-    if not np.any(candidate):
-        raise ValueError("u: no line stands above the noise, expected a multisine; give the lines")
     level_db = 10 * np.log10(np.maximum(line_power, np.finfo(float).tiny))
+    if periods == 1 and not np.any(candidate):
+        candidate = _above_a_step(level_db, gap_db)
+    if not np.any(candidate):
+        raise ValueError(
+            "u: no line stands above the noise, expected a multisine; give excited_harmonics"
+        )
     odd = harmonics % 2 == 1
     # an odd grid is looked for first, so that hum on an even line cannot pass for excitation
     cut_db = _cut_level(level_db, candidate, odd, gap_db, needs_step=periods == 1)
@@ -91,6 +100,16 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
             "give the excited harmonics"
         )
     return harmonics[candidate & (level_db > cut_db)].astype(np.int64)
+
+
+def _above_a_step(level_db: FloatArray, gap_db: float) -> npt.NDArray[np.bool_]:
+    """(H,) lines above the last step of `gap_db` that has `_FEWEST_BELOW` lines or more below it."""
+    order = np.argsort(level_db)
+    steps = np.flatnonzero(np.diff(level_db[order]) >= gap_db)
+    above = np.zeros(level_db.size, bool)
+    if steps.size and steps[-1] + 1 >= _FEWEST_BELOW:
+        above[order[steps[-1] + 1 :]] = True
+    return above
 
 
 def _cut_level(

@@ -201,7 +201,10 @@ def _clipped(record: Samples, periods: int) -> int:
     some = record[:GRID_SAMPLES]
     some = some[(some < largest) & (some > record.min())]
     if np.unique(some).size > FEW_ALIKE * some.size:
-        return top if top >= 4 else 0  # not quantised: equal values are no chance
+        # not quantised: equal values are no chance, unless a period without noise is repeated
+        spans = record.reshape(periods, -1)
+        repeated = periods if np.array_equal(spans[1:], spans[:-1]) else 1
+        return top if top >= 4 * repeated else 0
     # probability of so many or more out of both; periods repeat each other, one counts
     one, next_one = top // periods, -(-following // periods)
     chance = special.bdtrc(one - 1, one + next_one, SHARE_AT_TOP) if one else 1.0

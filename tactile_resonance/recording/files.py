@@ -111,6 +111,7 @@ def _read_csv(path: Path) -> Mapping[str, np.ndarray]:
             dialect = csv.Sniffer().sniff(file.readline(), delimiters=",;\t")
             file.seek(0)
             names = [name.strip() for name in next(csv.reader(file, dialect))]
+            names[0] = names[0].removeprefix("#").strip()  # as numpy.savetxt marks a header
             rows = [line for line in file if line.strip()]
         if not rows:
             raise ValueError("no numbers under the header")

@@ -150,7 +150,8 @@ def _period_length(
             return shape[-1]
         if periods is None:
             raise ValueError(
-                f"samples_per_period: missing, needed because {name} has shape {shape}"
+                f"samples_per_period: missing, expected how many of the {shape[-1]} samples of "
+                f"{name} are one period"
             )
         if periods < 1 or shape[-1] % periods:
             raise ValueError(f"periods: {periods}, expected a divisor of {shape[-1]} samples")

@@ -176,3 +176,14 @@ def test_a_coarse_converter_is_no_saturation(seed, periods):
     assert record_checks.saturation(x, "actuator", None) == []
     (fault,) = record_checks.saturation(np.clip(x, -0.3, 0.3), "actuator", None)
     assert "flat tops" in fault.message
+
+
+def test_a_repeated_period_without_noise_is_not_saturated():
+    # what a generator was told to play: every period has its one peak, on the same sample
+    rng = np.random.default_rng(0)
+    spectrum = np.zeros(2049, complex)
+    spectrum[10:900] = np.exp(2j * np.pi * rng.random(890))
+    x = np.tile(np.fft.irfft(spectrum), (6, 1))
+    assert record_checks.saturation(x, "actuator", None) == []
+    (fault,) = record_checks.saturation(np.clip(x, -0.6 * x.max(), None), "actuator", None)
+    assert "flat tops" in fault.message

@@ -48,7 +48,7 @@ def test_single_precision_is_not_copied():
         ({"sample_rate_hz": float("nan")}, "sample_rate_hz: nan"),
         ({"samples_per_period": 5}, "u: 24 samples, expected a multiple of the period of 5"),
         ({"samples_per_period": 0}, "samples_per_period: 0"),
-        ({"samples_per_period": None}, "samples_per_period: missing"),
+        ({"samples_per_period": None}, "missing, expected how many of the 24 samples of u"),
         ({"samples_per_period": 24}, "periods: 1 period of 1 realisation"),
         ({"samples_per_period": None, "periods": 7}, "periods: 7, expected a divisor"),
         ({"periods": 9}, r"periods: 9, accepted is 1\.\.4"),
@@ -81,7 +81,8 @@ def test_npz_mat_and_csv_hold_the_same(tmp_path, fields):
     scipy.io.savemat(tmp_path / "a.mat", fields)
     table = np.column_stack([np.arange(24) / 10.0, U, Y])
     np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,u,y", comments="")
-    for name in ("a.npz", "a.mat", "a.csv"):
+    np.savetxt(tmp_path / "numpy.csv", table, delimiter=",", header="time_s,u,y")  # "# time_s,u,y"
+    for name in ("a.npz", "a.mat", "a.csv", "numpy.csv"):
         recording = read_recording(tmp_path / name, samples_per_period=6)
         assert recording.sample_rate_hz == pytest.approx(10.0)
         np.testing.assert_allclose(recording.u.ravel(), U, rtol=1e-15)
