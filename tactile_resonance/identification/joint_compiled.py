@@ -32,6 +32,7 @@ from tactile_resonance.identification.result import (
     PolesBatch,
     PolesStatus,
 )
+from tactile_resonance.identification.significance import significant_modes
 from tactile_resonance.identification.solver import MAX_ITERATIONS, ROUNDING, STEP_TOLERANCE
 from tactile_resonance.identification.whiteness import are_smooth
 
@@ -120,31 +121,40 @@ class CompiledJointPlan(JointPlan):
         denominator[:, :a] = theta[:, :a]
         pole, of_pole, of_f0 = one_mode.POLE, one_mode.POLE_COVARIANCE, one_mode.COVARIANCE
         places = figures[:, pole : pole + 4].copy().view(complex)
+        quantities = {
+            "poles_rad_s": places[:, :1],
+            "f0_hz": figures[:, one_mode.F0_HZ, None],
+            "damping_ratio": figures[:, one_mode.DAMPING, None],
+            "residues": places[:, 1:],
+            "pole_covariance": figures[:, of_pole : of_pole + 4].reshape(batch, 1, 2, 2),
+            "covariance": figures[:, of_f0 : of_f0 + 4].reshape(batch, 1, 2, 2),
+        }
+        model = RationalModel(
+            denominator,
+            theta[:, a : a + b],
+            self.variable,
+            self.denominator_basis,
+            self.numerator_basis,
+            theta[:, a + b :],
+        )
+        lines = np.full(batch, self.excited_bins.size)
+        significant = significant_modes(model, quantities, covariance, lines)
+        code = np.where(
+            significant[:, 0], STATUS_CODE[PolesStatus.OK], STATUS_CODE[PolesStatus.NO_RESONANCE]
+        )
         return PolesBatch(
-            poles_rad_s=places[:, :1],
-            f0_hz=figures[:, one_mode.F0_HZ, None],
-            damping_ratio=figures[:, one_mode.DAMPING, None],
-            residues=places[:, 1:],
-            covariance=figures[:, of_f0 : of_f0 + 4].reshape(batch, 1, 2, 2),
+            **quantities,
             total_covariance=np.full((batch, 1, 2, 2), np.nan),
-            pole_covariance=figures[:, of_pole : of_pole + 4].reshape(batch, 1, 2, 2),
             coefficient_covariance=covariance,
             cost=figures[:, one_mode.COST],
             expected_cost=figures[:, one_mode.EXPECTED],
             condition_number=figures[:, one_mode.CONDITION],
             residual=residual,
-            lines=np.full(batch, self.excited_bins.size),
-            suspect=np.zeros(batch, bool),
-            status_code=np.full(batch, STATUS_CODE[PolesStatus.OK], np.uint8),
+            lines=lines,
+            significant=significant,
+            status_code=code.astype(np.uint8),
             noise_variance=figures[:, one_mode.NOISE_Y : one_mode.NOISE_Y + 2],
-            fit=RationalModel(
-                denominator,
-                theta[:, a : a + b],
-                self.variable,
-                self.denominator_basis,
-                self.numerator_basis,
-                theta[:, a + b :],
-            ),
+            fit=model,
             structure=self.structure,
             band_hz=self.band_hz,
             variance_model=np.full(batch, "flat", "U8"),

@@ -17,6 +17,7 @@ from tactile_resonance.identification.result import (
     PolesBatch,
     PolesStatus,
 )
+from tactile_resonance.identification.significance import significant_modes
 from tactile_resonance.identification.structure import ModelStructure
 
 BoolArray = npt.NDArray[np.bool_]
@@ -118,11 +119,12 @@ def assemble(
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
+    significant = significant_modes(fit.model, quantities, covariance, evidence.lines)
     total_f0_damping = np.full_like(quantities["covariance"], np.nan)
     rows = np.flatnonzero(np.isfinite(total[:, 0, 0]))
     if rows.size:
         total_f0_damping[rows] = pole_quantities(
-            fit.model if rows.size == total.shape[0] else _rows(fit.model, rows),
+            fit.model if rows.size == total.shape[0] else fit.model.at((rows,)),
             band_hz,
             total[rows],
         )["covariance"]
@@ -133,8 +135,8 @@ def assemble(
             (~np.asarray(evidence.level_known), PolesStatus.NO_COVARIANCE),
             (~np.isfinite(covariance[:, 0, 0]), PolesStatus.NO_COVARIANCE),
             (evidence.suspect, PolesStatus.MODEL_ERROR),
-            ((poles.real >= 0).any(axis=-1), PolesStatus.UNSTABLE_POLE),
-            (~np.isfinite(poles).any(axis=-1), PolesStatus.NO_RESONANCE),
+            ((significant & (poles.real >= 0)).any(axis=-1), PolesStatus.UNSTABLE_POLE),
+            (~significant.any(axis=-1), PolesStatus.NO_RESONANCE),
             (~conditioned, PolesStatus.ILL_CONDITIONED),
             (~fit.converged, PolesStatus.NOT_CONVERGED),
             (~evidence.enough, PolesStatus.TOO_FEW_LINES),
@@ -158,7 +160,7 @@ def assemble(
         condition_number=batch(fit.condition_number),
         residual=batch(fit.residual),
         lines=batch(evidence.lines),
-        suspect=batch(evidence.suspect),
+        significant=batch(significant),
         status_code=batch(code),
         noise_variance=batch(noise),
         fit=replace(
@@ -172,15 +174,4 @@ def assemble(
         band_hz=band_hz,
         variance_model=batch(evidence.variance_model),
         method=method,
-    )
-
-
-def _rows(model, rows):
-    delay = model.delay_s
-    return replace(
-        model,
-        denominator=model.denominator[rows],
-        numerator=model.numerator[rows],
-        transient=model.transient[rows] if model.transient.ndim > 1 else model.transient,
-        delay_s=np.asarray(delay)[rows] if np.ndim(delay) else delay,
     )

@@ -76,8 +76,8 @@ class RationalModel:
     transient: FloatArray = field(default_factory=lambda: np.empty(0))
     delay_s: FloatArray | float = 0.0
 
-    def at(self, index: tuple[int, ...]) -> RationalModel:
-        """The model of one point of a batch."""
+    def at(self, index: tuple[int, ...] | tuple[npt.NDArray[np.intp]]) -> RationalModel:
+        """The model of one point of a batch, or of some of them."""
         delay = self.delay_s if np.ndim(self.delay_s) == 0 else np.asarray(self.delay_s)[index]
         transient = self.transient[index] if self.transient.ndim > 1 else self.transient
         return replace(

@@ -130,11 +130,11 @@ class PolesBatch:
         Weighted residuals on the (excited) lines; 0 on those left out. Those of spectra are turned
         by the phase of the input, to be as smooth as an error of the response.
     lines : (...) int
-    suspect : (...) bool
-        Whether cost or residuals contradict the model, whatever graver the status says.
+    significant : (..., n) bool
+        Modes that noise alone would not make (one in ten thousand); the status speaks of these. Those
+        whose covariance is not known count.
     status_code : (...) uint8
-        Index into `STATUSES`; of all the modes here, those that noise alone could have made among
-        them.
+        Index into `STATUSES`.
     noise_variance : (..., 2) float
         Estimated variance of a bin of Y and of U [V^2]; NaN where the data brought their own.
     fit : RationalModel
@@ -158,7 +158,7 @@ class PolesBatch:
     condition_number: FloatArray
     residual: ComplexArray
     lines: npt.NDArray[np.int64]
-    suspect: npt.NDArray[np.bool_]
+    significant: npt.NDArray[np.bool_]
     status_code: npt.NDArray[np.uint8]
     noise_variance: FloatArray
     fit: RationalModel

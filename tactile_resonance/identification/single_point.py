@@ -4,24 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import comb
 
 import numpy as np
-import numpy.typing as npt
-from scipy import special
 
 from tactile_resonance.identification.covariance import real_covariance
 from tactile_resonance.identification.result import (
-    ComplexArray,
     FloatArray,
     Poles,
     PolesBatch,
     PolesStatus,
 )
 from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL
-
-# A mode that noise makes is taken for one this often.
-NOISE_PASSES_FOR_A_MODE = 1e-4
 
 
 def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] = ()) -> Poles:
@@ -54,27 +47,16 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
                 model.zero_sensitivity(zeros), coefficients[n : n + m, n : n + m]
             )
 
-    found = poles
-    if known and residue is not None:
-        residues, lines = batch.residues[index][there], int(batch.lines[index])
-        real = _significant(residues, residue, lines)
-        if not real.any() and poles.size > 1:
-            # neighbours nearer than their widths: neither is certain alone, both together are
-            sensitivity = model.residue_sensitivity(poles)
-            real[:] = _significant_together(residues, sensitivity, coefficients, lines)
-        there[there] = real
-        poles, residue = poles[real], residue[real]
-        if not real.any():
-            status, residue = PolesStatus.NO_RESONANCE, None
-        elif status is PolesStatus.UNSTABLE_POLE and (poles.real < 0).all():
-            # of the modes that are left none is; the covariance is known, or none were left out
-            status = PolesStatus.MODEL_ERROR if batch.suspect[index] else PolesStatus.OK
-        left_out = [
-            f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
-            "noise makes"
-            for pole in found[~real]
-        ]
-        notes = [*left_out, *notes]
+    real = batch.significant[index][there]
+    left_out = [
+        f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
+        "noise makes"
+        for pole in poles[~real]
+    ]
+    notes = [*left_out, *notes]
+    there[there] = real
+    poles = poles[real]
+    residue = residue[real] if residue is not None and real.any() else None
 
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
@@ -105,43 +87,6 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         status=status,
         message=message,
     )
-
-
-def _significant(
-    residues: ComplexArray, covariance: FloatArray, lines: int
-) -> npt.NDArray[np.bool_]:
-    """(n,) modes whose residue noise alone would not make.
-
-    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
-    zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
-    (Bonferroni). Where it cannot be computed the mode is kept.
-    """
-    limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / max(lines, 1))
-    kept = np.ones(residues.size, bool)
-    for k, (residue, matrix) in enumerate(zip(residues, covariance, strict=True)):
-        vector = np.array([residue.real, residue.imag])
-        try:
-            distance = vector @ np.linalg.solve(matrix, vector)
-        except np.linalg.LinAlgError:
-            continue
-        kept[k] = not distance < limit
-    return kept
-
-
-def _significant_together(
-    residues: ComplexArray, sensitivity: ComplexArray, coefficients: FloatArray, lines: int
-) -> bool:
-    """Whether noise alone would not make all of them: as `_significant`, over the choices of lines."""
-    stacked = np.concatenate([sensitivity.real, sensitivity.imag])  # (2 n, p)
-    p = stacked.shape[-1]
-    covariance = stacked @ coefficients[:p, :p] @ stacked.T
-    vector = np.concatenate([residues.real, residues.imag])
-    try:
-        distance = vector @ np.linalg.solve(covariance, vector)
-    except np.linalg.LinAlgError:
-        return True
-    chance = NOISE_PASSES_FOR_A_MODE / comb(max(lines, residues.size), residues.size)
-    return not distance < special.chdtri(vector.size, chance)
 
 
 def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:

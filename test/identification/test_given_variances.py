@@ -110,7 +110,7 @@ def test_errors_larger_than_their_variance_raise_the_alarm_as_often_as_they_must
         frf(g=g, variance_noise=np.full(41, 1e-6), noise_dof=10**5), structure=BARE
     )
     cost = stats.gamma(41 - 2.5)
-    assert_rate(result.suspect, cost.sf(cost.isf(1e-3) / larger))
+    assert_rate(result.has_status(PolesStatus.MODEL_ERROR), cost.sf(cost.isf(1e-3) / larger))
 
 
 @pytest.mark.parametrize("larger", [1.4, 1.8])
@@ -125,7 +125,7 @@ def test_errors_larger_than_between_harmonics_raise_the_alarm_as_often_as_they_m
     result = plan.from_bins(u, y)
     # seven parameters, two of them of the transient: half of each goes to either kind of bins
     cost = stats.f(2 * 41 - 6, 2 * 40 - 1)
-    assert_rate(result.suspect, cost.sf(cost.isf(1e-3) / larger))
+    assert_rate(result.has_status(PolesStatus.MODEL_ERROR), cost.sf(cost.isf(1e-3) / larger))
 
 
 @pytest.mark.parametrize("channel", [0, 1])
