@@ -169,7 +169,7 @@ class Envelope:
                     across = 0.0
             velocity = along + across * normal
         across = float(normal @ velocity)
-        if across < 0:
+        if across < -ROUNDING * float(np.linalg.norm(velocity)):
             # further up just so fast that it can slow down before it is near
             room = max(0.0, place.height_m - limits.near_m + REACTION_S * across)
             most = math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room)

@@ -72,7 +72,16 @@ ALONG_A_WALL = (
 )
 
 
+# along floor and surface, where rounding turns 1e-133 m/s away from the surface into 1e-299 m/s towards it
+ALONG_THE_SURFACE = (
+    np.array([1.0, 0.0, -5e-133, 0.0, 0.0, 0.0]),
+    np.zeros(3),
+    Place(np.array([-6e-298, 0.0, -1.0]), 0.0, None, 0.0),
+)
+
+
 @example(*ALONG_A_WALL)
+@example(*ALONG_THE_SURFACE)
 @settings(max_examples=200, deadline=None)
 @given(twists, positions, places)
 def test_it_never_turns_a_motion_round_and_never_makes_one_faster(twist, position, place):
