@@ -56,7 +56,9 @@ def significant_modes(
         return found
     with np.errstate(all="ignore"):
         sensitivity = model.at((rows,)).residue_sensitivity(poles[rows])  # (rows, k, p)
-        distance = _distance(residues[rows], real_covariance(sensitivity, coefficients[rows]))
+        distance = squared_distance(
+            residues[rows], real_covariance(sensitivity, coefficients[rows])
+        )
     limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / np.maximum(lines[rows], 1))
     found[rows] &= ~(distance < limit[:, None])
     if modes > 1:
@@ -70,8 +72,8 @@ def significant_modes(
     return found
 
 
-def _distance(values: ComplexArray, covariance: FloatArray) -> FloatArray:
-    """(...) squared Mahalanobis distance of complex values from zero."""
+def squared_distance(values: ComplexArray, covariance: FloatArray) -> FloatArray:
+    """(...) squared Mahalanobis distance from zero; covariance (..., 2, 2) of (Re, Im)."""
     std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))  # (..., 2)
     re, im = values.real / std[..., 0], values.imag / std[..., 1]
     correlation = covariance[..., 0, 1] / (std[..., 0] * std[..., 1])
