@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.processes import take_priority
-from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import CAN_PORT, READY, TABLE_IN_BASE
 
 if TYPE_CHECKING:
     from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
@@ -24,7 +24,7 @@ BENCH_DEFAULTS = {
     "rigid_tip": False,
     "cell": None,
     "mount": "table",
-    "can_port": 29536,
+    "can_port": CAN_PORT,
 }
 """Of the options that say what the tool touches."""
 
@@ -41,7 +41,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--host", default="127.0.1.1", help="any 127.x.y.z, one for each robot (default: 127.0.1.1)"
     )
     parser.add_argument(
-        "--speed", type=float, default=1.0, help="robot time over wall time (default: 1)"
+        "--simulated-time",
+        action="store_true",
+        help="let time go on as those who connect to port 30021 let it, and never faster than what they "
+        "compute; without anybody there at the pace of real time (default: the wall clock)",
     )
     parser.add_argument(
         "--control-port", type=int, default=30020, help="for faults and queries (default: 30020)"
@@ -102,21 +105,24 @@ def run(options: argparse.Namespace) -> int:
         seed=options.seed,
     )
     robot = SimulatedRobot(
-        controller, options.host, speed=options.speed, control_port=options.control_port
+        controller,
+        options.host,
+        simulated_time=options.simulated_time,
+        control_port=options.control_port,
     )
     ready = f"{READY} {options.host}, control port {options.control_port}"
     if bench is not None:
         bench.attach(robot)
         ready += f"; {options.tissue or options.scene} under it, load cell: socketcand port {options.can_port}"
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: robot.stop())
+        signal.signal(number, lambda *_: robot.time.stop())
     if options.priority:
         take_priority(options.priority)
     print(ready, flush=True)
     robot.run()
     print(
-        f"ended after {robot.controller.time_s:.1f} s of robot time, {robot.pace.stalls} stalls, "
-        f"longest delay {robot.pace.longest_s * 1e3:.1f} ms"
+        f"ended after {robot.controller.time_s:.1f} s of robot time"
+        + ("" if options.simulated_time else f", {robot.time.pace}")
     )
     return 0
 
@@ -159,12 +165,12 @@ class _Bench:
         options = self._options
         cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed + 1)
         try:
-            bus = SocketcandServer(options.host, options.can_port)
-        except OSError as error:
-            raise ValueError(
-                f"can-port: {options.can_port} of {options.host}: {error.strerror}"
-            ) from error
-        attach(robot, self.tabletop, CellOnBus(self.tabletop.plant, cell, bus))
+            bus = SocketcandServer(robot.reactor, options.can_port, cell.receive)
+        except ValueError as error:
+            raise ValueError(f"can-port: {error}") from error
+        robot.time.frames_sent = bus.frames_sent
+        plant, simulated = self.tabletop.plant, robot.time.simulated
+        attach(robot, self.tabletop, CellOnBus(plant, cell, bus, simulated))
 
 
 def require_loopback(host: str) -> None:

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import selectors
+import select
 import socket
 import struct
-import time
 from collections.abc import Callable
 from typing import Protocol
 
-# What a client may leave unread before data for it are dropped: about 0.2 s of all RTDE variables.
+# What a client may leave unread before it is closed, where its port says nothing else: about 0.2 s of all
+# RTDE variables.
 MOST_UNSENT = 64 * 1024
 # Of a port at a time; select takes descriptors below 1024 only.
 MOST_CONNECTIONS = 100
@@ -37,18 +37,19 @@ class Connection:
     ----------
     port : int
         To which it came.
+    peer_port : int
+        From which it came.
     frozen : bool
         Nothing is read or written meanwhile, as if no packet passed the network.
     """
 
-    def __init__(
-        self, reactor: Reactor, channel: socket.socket, port: int, freezable: bool
-    ) -> None:
+    def __init__(self, reactor: Reactor, channel: socket.socket, listener: _Listener) -> None:
         self._reactor = reactor
-        self.port = port
+        self.port, self.peer_port = listener.port, int(channel.getpeername()[1])
         self._socket = channel
         self._unsent = bytearray()
-        self.freezable = freezable
+        self._most_unsent = listener.most_unsent
+        self.freezable = listener.freezable
         self.frozen = False
         self.is_open = True
         self.service: Service | None = None
@@ -64,16 +65,32 @@ class Connection:
         """
         if not self.is_open or (droppable and (self._unsent or self.frozen)):
             return False
-        if len(self._unsent) > MOST_UNSENT:
+        if len(self._unsent) > self._most_unsent:
             self.close()
             return False
-        self._unsent += data
-        self.flush()
+        if self._unsent or self.frozen:
+            self._unsent += data
+            return True
+        try:
+            sent = self._socket.send(data)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self.close()
+            return False
+        if sent < len(data):
+            self._unsent += data[sent:]
+            self._reactor.unsent.add(self)
         return True
+
+    @property
+    def holds_data(self) -> bool:
+        """Whether something waits to be sent."""
+        return bool(self._unsent)
 
     def flush(self) -> None:
         """Send what waits, as far as the network takes it."""
-        if self.frozen or not self._unsent:
+        if self.frozen:
             return
         try:
             del self._unsent[: self._socket.send(self._unsent)]
@@ -81,11 +98,14 @@ class Connection:
             pass
         except OSError:
             self.close()
+        if not self._unsent:
+            self._reactor.unsent.discard(self)
 
     def read(self) -> None:
         """Hand what came to the service."""
         try:
             data = self._socket.recv(MOST_AT_ONCE)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         except BlockingIOError:
             return
         except OSError:
@@ -111,6 +131,21 @@ class Connection:
             self.service.closed()
 
 
+class _Listener:
+    """One port."""
+
+    def __init__(
+        self,
+        channel: socket.socket,
+        serve: Callable[[Connection], Service],
+        freezable: bool,
+        most_unsent: int,
+    ) -> None:
+        self.channel, self.serve = channel, serve
+        self.port = int(channel.getsockname()[1])
+        self.freezable, self.most_unsent = freezable, most_unsent
+
+
 class Reactor:
     """Listens on ports of one address and serves their connections.
 
@@ -118,98 +153,119 @@ class Reactor:
     ----------
     host : str
         Address to listen on.
+
+    Attributes
+    ----------
+    frozen : bool
+        Nothing passes the freezable ports.
+    unsent : set of Connection
+        Those for which data wait.
     """
 
     def __init__(self, host: str) -> None:
         self.host = host
-        # select: epoll of Python 3.12 and before waits in whole milliseconds
-        self._selector = selectors.SelectSelector()
-        self._listeners: dict[socket.socket, tuple[bool, Callable[[], None]]] = {}
+        self.frozen = False
+        self.unsent: set[Connection] = set()
+        self._listeners: list[_Listener] = []
         self._connections: set[Connection] = set()
-        self._frozen = False
+        # what is called where a descriptor can be read, and the descriptors as select takes them
+        self._readers: dict[int, Callable[[], None]] = {}
+        self._descriptors: list[int] = []
 
     def listen(
-        self, port: int, serve: Callable[[Connection], Service], freezable: bool = True
-    ) -> None:
-        """Listen on a port; `serve` makes the service of each connection.
+        self,
+        port: int,
+        serve: Callable[[Connection], Service],
+        freezable: bool = True,
+        most_unsent: int = MOST_UNSENT,
+    ) -> int:
+        """Listen on a port, 0 for a free one; `serve` makes the service of each connection.
+
+        Returns
+        -------
+        int
+            The port.
 
         Raises
         ------
         ValueError
             Where the port cannot be had.
         """
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        channel = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind((self.host, port))
-            listener.listen(16)
+            channel.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            channel.bind((self.host, port))
+            channel.listen(16)
         except OSError as error:
-            listener.close()
+            channel.close()
             raise ValueError(
                 f"port {port} of {self.host}: {error.strerror}; does another simulated robot run "
                 "there? --host takes any address 127.x.y.z"
             ) from error
-        listener.setblocking(False)
+        channel.setblocking(False)
+        listener = _Listener(channel, serve, freezable, most_unsent)
+        self._listeners.append(listener)
+        self._renew()
+        return listener.port
 
-        def accept() -> None:
-            try:
-                channel, _ = listener.accept()
-            except OSError:
-                return
-            if sum(other.port == port for other in self._connections) >= MOST_CONNECTIONS:
-                channel.close()
-                return
-            channel.setblocking(False)
-            channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = Connection(self, channel, port, freezable)
-            self._connections.add(connection)
-            self._selector.register(connection, selectors.EVENT_READ, connection.read)
-            connection.service = serve(connection)
-
-        self._listeners[listener] = (freezable, accept)
-        self._selector.register(listener, selectors.EVENT_READ, accept)
-
-    def serve_until(self, deadline_ns: int) -> None:
-        """Serve until a time of ``time.perf_counter_ns``, but look at every port at least once."""
-        for connection in list(self._connections):
+    def serve(self, wait_s: float) -> None:
+        """Wait for at most so long until somebody has sent something, and serve all who have."""
+        for connection in list(self.unsent):
             connection.flush()
-        while True:
-            wait_s = max(0.0, (deadline_ns - time.perf_counter_ns()) * 1e-9)
-            for key, _ in self._selector.select(wait_s):
-                key.data()
-            if time.perf_counter_ns() >= deadline_ns:
-                return
+        readers = self._readers
+        for descriptor in select.select(self._descriptors, [], [], wait_s)[0]:
+            # one served before may have closed another
+            if descriptor in readers:
+                readers[descriptor]()
 
     def freeze(self, frozen: bool) -> None:
         """Let no packet of the freezable ports pass, or let them pass again."""
-        if frozen == self._frozen:
-            return
-        self._frozen = frozen
-        ends: list[tuple[socket.socket | Connection, Callable[[], None]]] = []
-        for listener, (freezable, accept) in self._listeners.items():
-            if freezable:
-                ends.append((listener, accept))
+        self.frozen = frozen
         for connection in self._connections:
-            if connection.freezable:
-                connection.frozen = frozen
-                ends.append((connection, connection.read))
-        for end, callback in ends:
-            if frozen:
-                self._selector.unregister(end)
-            else:
-                self._selector.register(end, selectors.EVENT_READ, callback)
+            connection.frozen = frozen and connection.freezable
+            if connection.holds_data:
+                self.unsent.add(connection)
+        self._renew()
 
     def forget(self, connection: Connection) -> None:
         """Stop serving a connection that is about to close."""
         self._connections.discard(connection)
-        if not (self._frozen and connection.freezable):
-            self._selector.unregister(connection)
+        self.unsent.discard(connection)
+        self._renew()
 
     def close(self) -> None:
         """Close all connections and ports."""
         for connection in list(self._connections):
             connection.close()
         for listener in self._listeners:
-            listener.close()
+            listener.channel.close()
         self._listeners.clear()
-        self._selector.close()
+        self._renew()
+
+    def _accept(self, listener: _Listener) -> None:
+        try:
+            channel, _ = listener.channel.accept()
+            here = sum(other.port == listener.port for other in self._connections)
+            if here >= MOST_CONNECTIONS:
+                channel.close()
+                return
+            channel.setblocking(False)
+            channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection = Connection(self, channel, listener)
+        except OSError:  # gone again already
+            return
+        self._connections.add(connection)
+        connection.service = listener.serve(connection)
+        self._renew()
+
+    def _renew(self) -> None:
+        """Find anew who is listened to."""
+        self._readers = {
+            listener.channel.fileno(): lambda listener=listener: self._accept(listener)  # type: ignore[misc]
+            for listener in self._listeners
+            if not (self.frozen and listener.freezable)
+        }
+        for connection in self._connections:
+            if not connection.frozen:
+                self._readers[connection.fileno()] = connection.read
+        self._descriptors = list(self._readers)

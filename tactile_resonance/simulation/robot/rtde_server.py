@@ -34,11 +34,14 @@ class RtdeServer:
     ----------
     registers_in_use : bool
         A fieldbus or another program claims the input registers: every input recipe is refused.
+    packets : int
+        Packages of inputs that have come since the start.
     """
 
     def __init__(self, controller: UrController) -> None:
         self.controller = controller
         self.registers_in_use = False
+        self.packets = 0
         self._services: list[_Service] = []
 
     def serve(self, connection: Connection) -> _Service:
@@ -57,6 +60,15 @@ class RtdeServer:
         known: dict[str, OutputValue] = {}  # what several clients ask for is computed once
         for service in list(self._services):
             service.publish(cycle, known)
+
+    def repeat(self) -> None:
+        """Send what was sent last again: clients take a robot that says nothing for lost."""
+        for service in list(self._services):
+            service.repeat()
+
+    def sent_ns(self, port: int) -> int:
+        """Time stamp [ns] of the newest outputs that were sent to a client's port; 0: none."""
+        return max((s.sent_ns for s in self._services if s.connection.peer_port == port), default=0)
 
     def drop(self) -> int:
         """Abort all connections; returns how many there were."""
@@ -88,6 +100,8 @@ class _Service:
         self._outputs: _Recipe | None = None
         self._period = 1
         self._started = False
+        self._newest = b""  # outputs that were sent last
+        self.sent_ns = 0
         self._answers = {
             Kind.PROTOCOL_VERSION: self._protocol_version,
             Kind.CONTROLLER_VERSION: self._controller_version,
@@ -124,8 +138,15 @@ class _Service:
         for name in recipe.names:
             if name not in known:
                 known[name] = outputs(name)
-        values = [known[name] for name in recipe.names]
-        self.connection.send(recipe.layout.pack(1, values), droppable=True)
+        self._newest = recipe.layout.pack(1, [known[name] for name in recipe.names])
+        if self.connection.send(self._newest, droppable=True):
+            controller = self._server.controller
+            self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
+
+    def repeat(self) -> None:
+        """Send the newest outputs again."""
+        if self._started and self._newest:
+            self.connection.send(self._newest, droppable=True)
 
     def _protocol_version(self, payload: bytes) -> bytes:
         return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
@@ -174,6 +195,7 @@ class _Service:
         recipe = self._recipes.get(payload[0]) if payload else None
         if recipe is None:
             return
+        self._server.packets += 1
         values = recipe.layout.unpack(payload)
         if values is None:  # a real controller takes no packet of the wrong size either
             return

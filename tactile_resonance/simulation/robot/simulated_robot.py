@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated controller on its ports, at the pace of the wall clock."""
+"""The simulated controller on its ports, stepped by the time of its bench."""
 
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
+from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import number
+from tactile_resonance.simulation.bench_time import BenchTime
 from tactile_resonance.simulation.robot import dashboard, rtde_server, script_server
 from tactile_resonance.simulation.robot.control_port import PORT as CONTROL_PORT
 from tactile_resonance.simulation.robot.control_port import ControlPort
@@ -17,37 +17,20 @@ from tactile_resonance.simulation.robot.controller import UrController
 from tactile_resonance.simulation.robot.reactor import Reactor
 from tactile_resonance.simulation.robot.target import CYCLE_S
 
-# A step that begins later than this is a stall: what ran meanwhile is not to be trusted.
-STALL_S = 0.010
 _LONGEST_FREEZE_S = 600.0
 
 
-@dataclass
-class Pace:
-    """How well the simulation kept its pace.
-
-    Attributes
-    ----------
-    stalls : int
-        Steps that began more than 10 ms late, for no fault that was asked for.
-    longest_s : float
-        Longest delay of a step [s].
-    """
-
-    stalls: int = 0
-    longest_s: float = 0.0
-
-
 class SimulatedRobot:
-    """A controller with RTDE, dashboard, script and control ports.
+    """A controller with RTDE, dashboard, script and control ports, and that of its time.
 
     Parameters
     ----------
     controller : UrController
     host : str
         Address of all ports; any of 127.0.0.0/8.
-    speed : float
-        Robot time over wall time.
+    simulated_time : bool
+        Time goes on as those who take part in it let it (`tactile_resonance.clock`); else at the pace of the
+        wall clock.
     control_port : int
 
     Attributes
@@ -56,7 +39,7 @@ class SimulatedRobot:
     reactor : Reactor
     rtde : RtdeServer
     control : ControlPort
-    pace : Pace
+    time : BenchTime
     after_step : list of callables
         Called after each step of the controller: what shares its clock.
 
@@ -71,86 +54,70 @@ class SimulatedRobot:
         controller: UrController,
         host: str,
         *,
-        speed: float = 1.0,
+        simulated_time: bool = False,
         control_port: int = CONTROL_PORT,
     ) -> None:
-        if not 0.01 <= speed <= 10.0:
-            raise ValueError(f"speed: {speed:g}, expected 0.01 to 10")
         self.controller = controller
-        self.pace = Pace()
         self.after_step: list[Callable[[], None]] = []
-        self._cycle_ns = round(CYCLE_S / speed * 1e9)
-        self._frozen_until_ns = 0
-        self._halted_until_ns = 0
-        self._stopping = False
+        self._cycle = 0
+        self._frozen_until_ns = self._halted_until_ns = 0
         self.rtde = rtde_server.RtdeServer(controller)
         self.control = ControlPort(self._orders())
         self.reactor = Reactor(host)
+        self.time = BenchTime(self.reactor, round(CYCLE_S * 1e9), simulated=simulated_time)
+        self.time.steps.append(self._step)
+        self.time.repeats.append(self.rtde.repeat)
+        self.time.stalled.append(self._stood_still)
+        self.time.robot_sent_ns = self.rtde.sent_ns
+        self.time.packets_arrived = self._packets_arrived
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
             self.reactor.listen(dashboard.PORT, dashboard.DashboardServer(controller).serve)
             self.reactor.listen(script_server.PORT, script_server.ScriptServer(controller).serve)
             self.reactor.listen(control_port, self.control.serve, freezable=False)
+            if simulated_time:
+                self.reactor.listen(TIME_PORT, self.time.serve, freezable=False)
         except ValueError:
             self.reactor.close()
             raise
 
     def freeze_network(self, seconds: float) -> None:
         """Let no packet of the robot's own ports pass for a time; the robot goes on."""
-        self._frozen_until_ns = time.perf_counter_ns() + round(seconds * 1e9)
+        self._frozen_until_ns = self.time.now_ns + round(seconds * 1e9)
         self.reactor.freeze(True)
 
     def freeze_controller(self, seconds: float) -> None:
         """Let the whole controller stand still for a time, its clock too."""
-        self._halted_until_ns = time.perf_counter_ns() + round(seconds * 1e9)
-
-    def stop(self) -> None:
-        """Let `run` return after its step."""
-        self._stopping = True
+        self._halted_until_ns = self.time.now_ns + round(seconds * 1e9)
 
     def run(self) -> None:
-        """Step and serve until stopped, then close all ports."""
+        """Step and serve until `time` is stopped, then close all ports."""
         gc.collect()
         gc.freeze()  # what is there to stay needs no search for garbage
-        due_ns = time.perf_counter_ns()
-        cycle = 0
         try:
-            while not self._stopping:
-                self.reactor.serve_until(due_ns)
-                now_ns = time.perf_counter_ns()
-                if now_ns < self._halted_until_ns:
-                    due_ns = min(self._halted_until_ns, now_ns + self._cycle_ns)
-                    continue
-                if self._frozen_until_ns and now_ns >= self._frozen_until_ns:
-                    self._frozen_until_ns = 0
-                    self.reactor.freeze(False)
-                due_ns = self._next(due_ns, now_ns)
-                self.controller.step()
-                for call in self.after_step:
-                    call()
-                self.rtde.publish(cycle)
-                cycle += 1
+            self.time.run()
         finally:
             self.reactor.close()
 
-    def _next(self, due_ns: int, now_ns: int) -> int:
-        """When the step after the one that is due begins.
+    def _step(self) -> None:
+        now_ns = self.time.now_ns
+        if self._frozen_until_ns and now_ns >= self._frozen_until_ns:
+            self._frozen_until_ns = 0
+            self.reactor.freeze(False)
+        if now_ns < self._halted_until_ns:
+            return
+        self.controller.step()
+        for call in self.after_step:
+            call()
+        self.rtde.publish(self._cycle)
+        self._cycle += 1
 
-        Short delays are made up for, so that robot time keeps to wall time. After a stall they are not:
-        steps in quick succession would show clients what no robot does. The robot's time stamps go on
-        with the wall clock, as if packets had been lost.
-        """
-        late_ns = now_ns - due_ns
-        if late_ns <= STALL_S * 1e9:
-            self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
-            return due_ns + self._cycle_ns
-        if self._halted_until_ns:
-            self._halted_until_ns = 0
-        else:
-            self.pace.stalls += 1
-            self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
-            self.controller.stood_still_s += late_ns * 1e-9
-        return now_ns + self._cycle_ns
+    def _stood_still(self, seconds: float) -> None:
+        """The robot's time stamps go on with the wall clock, as if packets had been lost."""
+        self.controller.stood_still_s += seconds
+
+    def _packets_arrived(self) -> int | None:
+        return None if self.reactor.frozen else self.rtde.packets
 
     def _orders(self) -> dict[str, Callable[[dict], dict]]:
         """What the control port does for the robot itself."""
@@ -179,9 +146,9 @@ class SimulatedRobot:
             "tcp_speed": controller.outputs("actual_TCP_speed"),
             "tcp_force": controller.outputs("actual_TCP_force"),
             "rtde_connections": self.rtde.connections,
-            "stalls": self.pace.stalls,
+            "stalls": self.time.pace.stalls,
             "stood_still_s": controller.stood_still_s,
-            "longest_delay_s": self.pace.longest_s,
+            "longest_delay_s": self.time.pace.longest_s,
         }
 
     def _freeze(self, fields: dict) -> dict:

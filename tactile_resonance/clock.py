@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time that devices, loops and waits live by: this machine's, or that of a simulated bench.
+
+Simulated time belongs to the bench (`simulation.bench_time`) and goes on in steps. Whoever takes part in it
+connects to the bench and says up to when it may go on without him; the bench tells him when it has come to
+that time and then waits for his next word. So what is computed never comes too late, however slow the
+machine is. He also says whether he needs the time to pass:
+
+- `Demand.NONE`: it may stand as far as he is concerned;
+- `Demand.REAL`: it goes on at the pace of real time at the most;
+- `Demand.FAST`: it goes on as fast as everybody lets it.
+
+Without anybody's demand it goes on at the pace of real time; while somebody conducts (a scan), it stands
+then. A conductor lets it go on with `go`, until a device hands something over: then it stands until the
+next `go`, so that nothing passes while the conductor makes up his mind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Protocol
+
+PORT = 30021
+"""Of a bench's time where no other is given."""
+
+ENDLESS_NS = 1 << 62
+"""Up to here: for ever."""
+
+MESSAGE = struct.Struct("<Bxxxxxxxqqq")
+"""Kind and three integers, either way."""
+
+
+class Demand(IntEnum):
+    """Whether somebody needs time to pass."""
+
+    NONE = 0
+    REAL = 1
+    FAST = 2
+
+
+class ToBench(IntEnum):
+    """Kinds of messages to the bench, with their integers."""
+
+    HOLD = 1  # time up to which it may go on [ns], demand, packets sent to the robot
+    ASK = 2  # answered by TIME
+    GO = 3
+    SEED = 4  # up to three integers: noise is theirs from now on
+    WAKE = 6  # time at which it is told, and which nobody waits for [ns]
+    PORTS = 5  # local ports of the connections to the robot's RTDE server and to the bus of the cell
+
+
+class FromBench(IntEnum):
+    """Kinds of messages from the bench, with their integers."""
+
+    TOLD = 1  # time now [ns]; what was sent: stamp of the newest robot state [ns], frames of the bus
+    TIME = 2  # time now [ns]
+
+
+class ClockLostError(ConnectionError):
+    """The bench whose time it was has gone."""
+
+
+class Clock(Protocol):
+    """A clock that never goes back."""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether it is that of a bench."""
+        ...
+
+    def now_ns(self) -> int:
+        """Time now [ns]."""
+        ...
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Return at a time, or at once where it has passed; the demand is that for simulated time."""
+        ...
+
+    def ros_ns(self, time_ns: int) -> int:
+        """A time of this clock as ROS time: since 1970, or of the simulation [ns]."""
+        ...
+
+
+class WallClock:
+    """This machine's monotonic clock, related to ROS time once, when it is made."""
+
+    simulated = False
+
+    def __init__(self) -> None:
+        self._ros_ahead_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Time now [ns]."""
+        return time.monotonic_ns()
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Sleep until a time; at once where it has passed."""
+        left_ns = time_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns * 1e-9)
+
+    def ros_ns(self, time_ns: int) -> int:
+        """UNIX time [ns]."""
+        return time_ns + self._ros_ahead_ns
+
+    def own_ns(self, ros_ns: int) -> int:
+        """Time of this clock [ns] at a UNIX time [ns]."""
+        return ros_ns - self._ros_ahead_ns
+
+
+class SimulatedClock:
+    """Takes part in the time of a bench; of one thread, but `now_ns` is anybody's.
+
+    Parameters
+    ----------
+    address : str
+        ``HOST:PORT`` of the bench's time.
+    name : str
+        By which it is named where it holds the time.
+    told_with : str
+        Name of another that holds the time in its place: told whenever that one would be.
+    hands_over : bool
+        When it is told, a conductor's `go` has ended.
+    conducts : bool
+        Time stands while nobody needs it.
+
+    Raises
+    ------
+    ClockLostError
+        Where no bench answers.
+    ValueError
+        Where the address is none.
+    """
+
+    simulated = True
+
+    def __init__(
+        self,
+        address: str,
+        name: str,
+        *,
+        told_with: str = "",
+        hands_over: bool = False,
+        conducts: bool = False,
+    ) -> None:
+        self.name = name
+        self._now_ns = 0
+        self.robot_ns = self.frames = 0
+        self._buffer = b""
+        try:
+            self._socket = socket.create_connection(time_address(address), 5.0)
+        except OSError as error:
+            raise ClockLostError(f"no simulated time at {address}: {error}") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        join = {"name": name, "with": told_with, "hands_over": hands_over, "conducts": conducts}
+        self._socket.sendall(json.dumps(join).encode() + b"\n")
+        self._socket.settimeout(None)
+        self.ask_ns()
+
+    def fileno(self) -> int:
+        """Descriptor to wait on."""
+        return self._socket.fileno()
+
+    def now_ns(self) -> int:
+        """Time that was told last [ns]."""
+        return self._now_ns
+
+    def ros_ns(self, time_ns: int) -> int:
+        """The same: simulated time is ROS time."""
+        return time_ns
+
+    def own_ns(self, ros_ns: int) -> int:
+        """The same."""
+        return ros_ns
+
+    def ask_ns(self) -> int:
+        """Time now [ns], which may stand or go on."""
+        self._send(ToBench.ASK)
+        while self._next(None) is not FromBench.TIME:
+            pass
+        return self._now_ns
+
+    def hold(self, until_ns: int, demand: Demand, packets: int = -1) -> None:
+        """Let time go on up to a time [ns]; see the module's text for the demand.
+
+        `packets` counts what was sent to the robot since it was 0: the bench takes all of it before its next
+        step. Below 0 nothing is said of them.
+        """
+        self._send(ToBench.HOLD, min(until_ns, ENDLESS_NS), demand, packets)
+
+    def free(self, demand: Demand = Demand.NONE) -> None:
+        """Let time go on without a limit."""
+        self.hold(ENDLESS_NS, demand)
+
+    def wait_until(
+        self,
+        time_ns: int,
+        demand: Demand = Demand.FAST,
+        /,
+        while_waiting: Callable[[], None] | None = None,
+    ) -> None:
+        """Let time go on up to a time [ns] and wait for that; it stands then until the next word.
+
+        `while_waiting` is called every tenth of a second of this machine's time; what it raises ends the
+        wait.
+        """
+        if time_ns <= self._now_ns:
+            return
+        self.hold(time_ns, demand)
+        while self._now_ns < time_ns:
+            self.wait_told(while_waiting)
+
+    def sleep_until(
+        self, time_ns: int, while_waiting: Callable[[], None] | None = None
+    ) -> None:
+        """Wait until it is a time [ns], without a part in whether and when that comes."""
+        if time_ns <= self._now_ns:
+            return
+        self._send(ToBench.WAKE, time_ns)
+        while self._now_ns < time_ns:
+            self.wait_told(while_waiting)
+
+    def wait_told(self, while_waiting: Callable[[], None] | None = None) -> None:
+        """Wait until the bench tells a time, or tells one again."""
+        while self._next(while_waiting) is not FromBench.TOLD:
+            pass
+
+    def refresh(self) -> None:
+        """Take what was told meanwhile, without waiting."""
+        while self._buffer or select.select([self._socket], [], [], 0)[0]:
+            self._next(None)
+
+    def go(self) -> None:
+        """Let time go on until a device hands something over; of one who conducts."""
+        self._send(ToBench.GO)
+
+    def seed(self, *integers: int) -> None:
+        """Let all noise of the bench be that of these integers, three at the most, from now on."""
+        self._send(ToBench.SEED, *integers)
+
+    def ports(self, robot: int, bus: int) -> None:
+        """Name the local ports of connections whose data are to be named with each time that is told."""
+        self._send(ToBench.PORTS, robot, bus)
+
+    def interrupt(self) -> None:
+        """Let whoever waits raise `ClockLostError`; from any thread."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Take part no more."""
+        self._socket.close()
+
+    def _send(self, kind: ToBench, *integers: int) -> None:
+        a, b, c = (*integers, 0, 0, 0)[:3]
+        try:
+            self._socket.sendall(MESSAGE.pack(kind, a, b, c))
+        except OSError as error:
+            raise ClockLostError(f"simulated time: {error}") from error
+
+    def _next(self, while_waiting: Callable[[], None] | None) -> FromBench:
+        """Take the next message."""
+        while len(self._buffer) < MESSAGE.size:
+            if while_waiting is not None and not select.select([self._socket], [], [], 0.1)[0]:
+                while_waiting()
+                continue
+            try:
+                data = self._socket.recv(64 * MESSAGE.size)
+            except OSError as error:
+                raise ClockLostError(f"simulated time: {error}") from error
+            if not data:
+                raise ClockLostError("simulated time: the bench has ended")
+            self._buffer += data
+        kind, now_ns, robot_ns, frames = MESSAGE.unpack_from(self._buffer)
+        self._buffer = self._buffer[MESSAGE.size :]
+        self._now_ns = now_ns
+        if kind == FromBench.TOLD:
+            self.robot_ns, self.frames = robot_ns, frames
+        return FromBench(kind)
+
+
+def time_address(text: str) -> tuple[str, int]:
+    """Host and port of ``HOST:PORT``.
+
+    Raises
+    ------
+    ValueError
+        Where it is none.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"time: {text!r}, expected HOST:PORT of a simulated bench")
+    return host, int(port)

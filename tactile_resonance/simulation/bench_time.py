@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time of a simulated bench: it goes on as far as all who take part let it (`tactile_resonance.clock`).
+
+`BenchTime` keeps the account and is the port to which they connect; `run` steps what is simulated, serves
+all ports in between and keeps the pace. On the wall clock (`simulated` false) nobody takes part: steps come
+at the pace of real time, and what the machine stood still for is gone.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tactile_resonance.clock import ENDLESS_NS, MESSAGE, Demand, FromBench, ToBench
+from tactile_resonance.simulation.robot.reactor import Connection, Reactor
+
+START_NS = 1_000_000_000
+"""Time when a bench begins: ROS takes 0 for no time at all."""
+STALL_S = 0.010
+"""On the wall clock a step that begins later than this is a stall: what ran meanwhile is not to be trusted."""
+REPEAT_S = 0.05
+"""So often, on this machine's clock, what stands is told again."""
+PACKETS_WITHIN_S = 0.5
+"""A command that its sender has sent arrives within this, on this machine's clock."""
+_LONGEST_JOIN = 4096
+
+
+@dataclass
+class Pace:
+    """How well steps on the wall clock kept their pace.
+
+    Attributes
+    ----------
+    stalls : int
+        Steps that began more than 10 ms late, for no fault that was asked for.
+    longest_s : float
+        Longest delay of a step [s].
+    """
+
+    stalls: int = 0
+    longest_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.stalls} stalls, longest delay {self.longest_s * 1e3:.1f} ms"
+
+
+class Participant:
+    """One connection to the time."""
+
+    def __init__(self, keeper: BenchTime, connection: Connection) -> None:
+        self._keeper, self._connection = keeper, connection
+        self._buffer = b""
+        self.joined = False
+        self.name = self.told_with = ""
+        self.hands_over = self.conducts = False
+        self.until_ns, self.demand = ENDLESS_NS, Demand.NONE
+        self.told_ns = -1  # until_ns of which it was told
+        self.wake_ns = ENDLESS_NS
+        self.robot_port = self.bus_port = 0
+
+    def received(self, data: bytes) -> None:
+        """Take what was sent; ValueError where it makes no sense."""
+        self._buffer += data
+        if not self.joined:
+            line, end, rest = self._buffer.partition(b"\n")
+            if not end:
+                if len(line) > _LONGEST_JOIN:
+                    raise ValueError("time: no line ends")
+                return
+            try:
+                self._join(json.loads(line))
+            except RecursionError as error:
+                raise ValueError("time: nested too deeply") from error
+            self._buffer = rest
+        while len(self._buffer) >= MESSAGE.size:
+            kind, a, b, c = MESSAGE.unpack_from(self._buffer)
+            self._buffer = self._buffer[MESSAGE.size :]
+            self._take(ToBench(kind), a, b, c)
+
+    def closed(self) -> None:
+        """Whoever has gone holds nothing."""
+        self._keeper.leave(self)
+
+    def tell(self, kind: FromBench, now_ns: int, robot_ns: int = 0, frames: int = 0) -> None:
+        """Send a time."""
+        self._connection.send(MESSAGE.pack(kind, now_ns, robot_ns, frames))
+
+    def _join(self, fields: object) -> None:
+        if not isinstance(fields, dict) or "name" not in fields:
+            raise ValueError("time: no name")
+        self.name, self.told_with = str(fields["name"]), str(fields.get("with", ""))
+        self.hands_over = fields.get("hands_over") is True
+        self.conducts = fields.get("conducts") is True
+        self.joined = True
+        self._keeper.join(self)
+
+    def _take(self, kind: ToBench, a: int, b: int, c: int) -> None:
+        keeper = self._keeper
+        if kind is ToBench.HOLD:
+            self.until_ns, self.demand, self.told_ns = a, Demand(b), -1
+            keeper.expect(c)
+            keeper.tell_reached()
+        elif kind is ToBench.WAKE:
+            self.wake_ns = a
+            keeper.tell_reached()
+        elif kind is ToBench.ASK:
+            self.tell(FromBench.TIME, keeper.now_ns)
+        elif kind is ToBench.GO:
+            self.until_ns = ENDLESS_NS
+        elif kind is ToBench.SEED:
+            keeper.seed(a, b, c)
+        else:
+            self.robot_port, self.bus_port = a, b
+
+
+class BenchTime:
+    """Who takes part, how far time may go, and the loop that lets it.
+
+    Parameters
+    ----------
+    reactor : Reactor
+        Whose ports are served.
+    step_ns : int
+        Of what is simulated, and of the time [ns].
+    simulated : bool
+        False: on the wall clock, and nobody takes part.
+
+    Attributes
+    ----------
+    now_ns : int
+        Time [ns].
+    steps : list of callables
+        Called for each step.
+    repeats : list of callables
+        Called again and again while time stands.
+    seeds : list of callables
+        Called with three integers from which noise is to follow.
+    stalled : list of callables
+        Called with the time [s] that was lost in a stall.
+    robot_sent_ns, frames_sent : callables
+        From a local port of a participant: stamp of the newest robot state [ns] and number of frames of the
+        bus sent to there.
+    packets_arrived : callable
+        How many packets for the robot have come since the start; None while none can come.
+    pace : Pace
+    """
+
+    def __init__(self, reactor: Reactor, step_ns: int, *, simulated: bool) -> None:
+        self.now_ns = START_NS
+        self.steps: list[Callable[[], None]] = []
+        self.repeats: list[Callable[[], None]] = []
+        self.seeds: list[Callable[[tuple[int, int, int]], None]] = []
+        self.stalled: list[Callable[[float], None]] = []
+        self.robot_sent_ns: Callable[[int], int] = lambda port: 0
+        self.frames_sent: Callable[[int], int] = lambda port: 0
+        self.packets_arrived: Callable[[], int | None] = lambda: None
+        self.pace = Pace()
+        self.simulated = simulated
+        self._reactor, self._step_ns = reactor, step_ns
+        self._participants: list[Participant] = []
+        self._packets_due = self._packets_mark = 0
+        self._packets_late_s = 0.0
+        self._stopping = False
+
+    # who takes part
+
+    def serve(self, connection: Connection) -> Participant:
+        """Serve a new connection."""
+        return Participant(self, connection)
+
+    def join(self, participant: Participant) -> None:
+        """Count one who takes part."""
+        self._participants.append(participant)
+        self.tell_reached()
+
+    def leave(self, participant: Participant) -> None:
+        """Forget one who took part."""
+        if participant in self._participants:
+            self._participants.remove(participant)
+
+    def expect(self, packets: int) -> None:
+        """No step before so many packets have come that were sent to the robot since the last 0; below 0: none said."""
+        if packets < 0:
+            return
+        if packets == 0:
+            self._packets_mark, self._packets_due = self.packets_arrived() or 0, 0
+        elif self._packets_mark >= 0:
+            self._packets_due = self._packets_mark + packets
+            self._packets_late_s = time.monotonic() + PACKETS_WITHIN_S
+
+    def seed(self, *integers: int) -> None:
+        """Let noise follow from integers."""
+        for call in self.seeds:
+            call((integers[0], integers[1], integers[2]))
+
+    @property
+    def held_by(self) -> list[str]:
+        """Names of those for whom the time stands."""
+        return [p.name for p in self._participants if p.until_ns <= self.now_ns]
+
+    # the account
+
+    def demand(self) -> Demand | None:
+        """How the next step is wanted; None: it may not come."""
+        now_ns = self.now_ns
+        wanted, conducted = Demand.NONE, False
+        for participant in self._participants:
+            if participant.until_ns <= now_ns:
+                return None
+            wanted = max(wanted, participant.demand)
+            conducted = conducted or participant.conducts
+        if wanted is Demand.NONE and not conducted:
+            return Demand.REAL
+        return wanted if wanted is not Demand.NONE else None
+
+    def tell_reached(self) -> None:
+        """Tell everybody whose time has come, and end a conductor's go where something is handed over."""
+        for participant in self._participants:
+            if participant.wake_ns <= self.now_ns:
+                participant.wake_ns = ENDLESS_NS
+                participant.tell(FromBench.TOLD, self.now_ns)
+            if participant.until_ns > self.now_ns or participant.told_ns == participant.until_ns:
+                continue
+            participant.told_ns = participant.until_ns
+            if participant.conducts:
+                continue
+            others = [p for p in self._participants if p.told_with == participant.name]
+            for other in others or [participant]:
+                robot_ns = self.robot_sent_ns(other.robot_port) if other.robot_port else 0
+                frames = self.frames_sent(other.bus_port) if other.bus_port else 0
+                other.tell(FromBench.TOLD, self.now_ns, robot_ns, frames)
+            if participant.hands_over:
+                for conductor in self._participants:
+                    if conductor.conducts:
+                        conductor.until_ns = self.now_ns
+
+    # the loop
+
+    def stop(self) -> None:
+        """Let `run` return after its step."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Step, serve and keep the pace until stopped; the ports stay open."""
+        due_ns = time.perf_counter_ns()
+        repeat_ns = due_ns
+        while not self._stopping:
+            demand = self.demand()
+            if demand is not None and not self._all_packets():
+                demand = None
+            now_ns = time.perf_counter_ns()
+            if demand is None:
+                # nothing is due: until somebody speaks, but what stands is told again
+                self._reactor.serve(min(REPEAT_S, max(0.0, (repeat_ns - now_ns) * 1e-9)))
+                now_ns = time.perf_counter_ns()
+                if now_ns >= repeat_ns:
+                    repeat_ns = now_ns + round(REPEAT_S * 1e9)
+                    for call in self.repeats:
+                        call()
+                due_ns = now_ns
+                continue
+            if demand is Demand.REAL and due_ns > now_ns:
+                self._reactor.serve((due_ns - now_ns) * 1e-9)
+                continue
+            self._reactor.serve(0.0)
+            if self.demand() is None:
+                continue
+            due_ns = self._next_due(due_ns, time.perf_counter_ns())
+            self._step()
+            repeat_ns = time.perf_counter_ns() + round(REPEAT_S * 1e9)
+
+    def _all_packets(self) -> bool:
+        """Whether what was sent to the robot is there; where it does not come, nothing is waited for any more."""
+        arrived = self.packets_arrived()
+        if arrived is None or self._packets_due <= arrived:
+            return True
+        if time.monotonic() < self._packets_late_s:
+            return False
+        self._packets_mark, self._packets_due = -1, 0
+        return True
+
+    def _step(self) -> None:
+        self.now_ns += self._step_ns
+        for call in self.steps:
+            call()
+        self.tell_reached()
+
+    def _next_due(self, due_ns: int, now_ns: int) -> int:
+        """When the step after this one begins at the pace of real time.
+
+        On the wall clock short delays are made up for, so that the time of what is simulated keeps to that of
+        the machine. After a stall they are not: steps in quick succession would show clients what no robot
+        does; what was lost is told to those who stamp data. In simulated time nothing is lost.
+        """
+        late_ns = now_ns - due_ns
+        if self.simulated:
+            return max(due_ns, now_ns - self._step_ns) + self._step_ns
+        self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
+        if late_ns <= STALL_S * 1e9:
+            return due_ns + self._step_ns
+        self.pace.stalls += 1
+        for call in self.stalled:
+            call(late_ns * 1e-9)
+        return now_ns + self._step_ns
