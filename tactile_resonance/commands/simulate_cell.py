@@ -7,21 +7,21 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from tactile_resonance.commands.simulate_ur import require_loopback
 from tactile_resonance.fields import number
-from tactile_resonance.simulation.cell_loop import CellLoop
+from tactile_resonance.simulation.bench_time import BenchTime
 from tactile_resonance.simulation.load_cell import LoadCell
+from tactile_resonance.simulation.robot.reactor import Reactor
 from tactile_resonance.simulation.slcan import SlcanServer
 from tactile_resonance.simulation.socketcand import SocketcandServer
-from tactile_resonance.simulation.tcp_bus import TcpBus
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.tcp_bus import Receiver, TcpBus
+from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S, CellParameters
 
-BUSES: dict[str, Callable[[str, int], TcpBus]] = {
+BUSES: dict[str, Callable[[Reactor, int, Receiver], TcpBus]] = {
     "socketcand": SocketcandServer,
     "slcan": SlcanServer,
 }
@@ -64,27 +64,32 @@ def run(options: argparse.Namespace) -> int:
     if options.seed < 0:
         raise ValueError(f"--seed: {options.seed}, expected 0 or above")
     cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed)
-    try:
-        bus = BUSES[options.bus](options.host, options.port)
-    except OSError as error:
-        raise ValueError(f"{options.host}:{options.port}: {error.strerror or error}") from error
-    ended = threading.Event()
+    reactor = Reactor(options.host)
+    bus = BUSES[options.bus](reactor, options.port, cell.receive)
+    pace = BenchTime(reactor, round(SAMPLE_PERIOD_S * 1e9), simulated=False)
     for which in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(which, lambda *_: ended.set())
-    wrench = np.zeros(6)
+        signal.signal(which, lambda *_: pace.stop())
+    wrench = [0.0] * 6
     threading.Thread(target=_listen, args=(cell, wrench), daemon=True).start()
-    loop = CellLoop(cell, bus, lambda _: wrench)
+    began_ns = pace.now_ns
+
+    def step() -> None:
+        elapsed_s = (pace.now_ns - began_ns) * 1e-9
+        bus.keep_epoch(time.time(), elapsed_s)
+        bus.send(cell.step(wrench, elapsed_s))
+
+    pace.steps.append(step)
     print(f"load cell: {options.bus} {options.host}:{bus.port}", flush=True)
     try:
-        loop.run(ended.is_set)
+        pace.run()
     finally:
-        bus.close()
-    if loop.stalls:
-        print(f"load cell: late by more than 10 ms {loop.stalls} times", file=sys.stderr)
+        reactor.close()
+    if pace.pace.stalls:
+        print(f"load cell: {pace.pace}", file=sys.stderr)
     return 0
 
 
-def _listen(cell: LoadCell, wrench: np.ndarray) -> None:
+def _listen(cell: LoadCell, wrench: list[float]) -> None:
     """Do what the lines on standard input say."""
     for line in sys.stdin:
         words = line.split()

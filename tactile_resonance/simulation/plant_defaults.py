@@ -14,12 +14,5 @@ simulated robot starts, x of the scene along its beam."""
 HOST = "127.0.1.1"
 """Address at which the simulated robot answers where none is given."""
 
-PATIENT_S = 0.06
-PATIENT = {
-    "limits.force_age_s": PATIENT_S,
-    "limits.arm_age_s": PATIENT_S,
-    "robot_config": "config/devices/ur5e_patient.yaml",
-    "force_config": "can_patient.yaml",
-}
-"""Parameters of contact_node by which data may be older than on hardware: what stands still is a simulation
-that shares its cores with all nodes."""
+CAN_PORT = 29536
+"""Of the socketcand server of the simulated load cell, at the robot's address."""

@@ -20,10 +20,10 @@ from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.plant_history import PlantHistory
-from tactile_resonance.simulation.robot.simulated_robot import STALL_S, SimulatedRobot
+from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
-from tactile_resonance.simulation.socketcand import SocketcandServer
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
@@ -171,31 +171,27 @@ class Tabletop:
 
 
 class CellOnBus:
-    """Steps the load cell with the plant and serves its bus.
+    """A load cell stepped with the plant, on the bus that it sends to.
 
     Parameters
     ----------
     plant : Plant
     cell : LoadCell
-    bus : SocketcandServer
+    bus : TcpBus
+    simulated_time : bool
+        Frames are stamped with the plant's time; else with this machine's.
     """
 
-    def __init__(self, plant: Plant, cell: LoadCell, bus: SocketcandServer) -> None:
+    def __init__(self, plant: Plant, cell: LoadCell, bus: TcpBus, simulated_time: bool) -> None:
         self._plant, self._cell, self._bus = plant, cell, bus
+        self._simulated = simulated_time
 
     def step(self) -> None:
-        """Take what clients sent, advance to the plant's time, send what is due."""
-        self._keep_epoch(time.time() - self._plant.time_s)
-        for can_id, data in self._bus.poll():
-            self._bus.send(self._cell.receive(can_id, data))
+        """Advance to the plant's time, send what is due."""
+        if not self._simulated:
+            self._bus.keep_epoch(time.time(), self._plant.time_s)
         force_n, torque_nm = self._plant.wrench_at_cell()
-        wrench = np.concatenate([force_n, torque_nm])
-        self._bus.send(self._cell.step(wrench, self._plant.time_s))
-
-    def _keep_epoch(self, now_s: float) -> None:
-        """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall."""
-        if now_s < self._bus.epoch_s or now_s > self._bus.epoch_s + STALL_S:
-            self._bus.epoch_s = now_s
+        self._bus.send(self._cell.step((*force_n, *torque_nm), self._plant.time_s))
 
     def inject(self, fields: dict) -> dict:
         """Control port: fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
@@ -212,7 +208,7 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     commands = robot.control.commands
     commands["place_surface"] = tabletop.place_surface
     commands["place_tissue"] = tabletop.place_tissue
-    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.pace.stalls}
+    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.pace.stalls}
     history = PlantHistory(tabletop.plant)
     commands["history"] = history.since
     robot.after_step.append(history.step)

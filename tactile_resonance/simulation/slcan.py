@@ -11,7 +11,8 @@ import re
 import time
 
 from tactile_resonance.simulation.load_cell import CanFrame
-from tactile_resonance.simulation.tcp_bus import Client, TcpBus
+from tactile_resonance.simulation.robot.reactor import Connection
+from tactile_resonance.simulation.tcp_bus import BusClient, TcpBus
 
 OK, FAILED = b"\r", b"\a"
 _FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
@@ -20,44 +21,41 @@ _FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 class SlcanServer(TcpBus):
     """See `TcpBus`. Frames carry no time stamps."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 29537) -> None:
-        super().__init__(host, port)
+    END = b"\r"
 
-    def greeting(self) -> bytes:
-        """What a new client is sent: nothing."""
-        return b""
-
-    def understand(self, client: Client) -> list[tuple[int, bytes]]:
-        """Frames in what a client has sent; answers to the rest."""
-        frames = []
-        while (end := client.received.find(b"\r")) >= 0:
-            line = client.received[:end].decode("ascii", "replace")
-            client.received = client.received[end + 1 :]
-            command = line[:1]
-            if command in ("S", "s"):  # while it listens the speed stays as it is
-                client.queue += OK if client.listens_from_s is None else FAILED
-            elif command in ("O", "L"):
-                client.listens_from_s = time.monotonic()
-                client.queue += OK
-            elif command == "C":
-                client.listens_from_s = None
-                client.queue += OK
-            elif command == "t":
-                frame = _frame(line)
-                if frame is None or client.listens_from_s is None:
-                    client.queue += FAILED
-                else:
-                    frames.append(frame)
-                    client.queue += b"z" + OK
-            elif command in ("V", "N"):
-                client.queue += command.encode() + b"0000" + OK
-            else:
-                client.queue += FAILED
-        return frames
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
+        return _SlcanClient(self, connection)
 
     def text_of(self, frame: CanFrame) -> bytes:
         """A frame of the bus as clients read it."""
         return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
+
+
+class _SlcanClient(BusClient):
+    def understand(self, message: bytes) -> None:
+        """Do what one line says."""
+        line = message.decode("ascii", "replace")
+        command = line[:1]
+        if command in ("S", "s"):  # while it listens the speed stays as it is
+            self.send(OK if self.listens_from_s is None else FAILED)
+        elif command in ("O", "L"):
+            self.listens_from_s = time.monotonic()
+            self.send(OK)
+        elif command == "C":
+            self.listens_from_s = None
+            self.send(OK)
+        elif command == "t":
+            frame = _frame(line)
+            if frame is None or self.listens_from_s is None:
+                self.send(FAILED)
+            else:
+                self.send(b"z" + OK)
+                self._bus.take(*frame)
+        elif command in ("V", "N"):
+            self.send(command.encode() + b"0000" + OK)
+        else:
+            self.send(FAILED)
 
 
 def _frame(line: str) -> tuple[int, bytes] | None:

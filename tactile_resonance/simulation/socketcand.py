@@ -11,7 +11,8 @@ import re
 import time
 
 from tactile_resonance.simulation.load_cell import CanFrame
-from tactile_resonance.simulation.tcp_bus import Client, TcpBus
+from tactile_resonance.simulation.robot.reactor import Connection, Reactor
+from tactile_resonance.simulation.tcp_bus import BusClient, Receiver, TcpBus
 
 MOST_EXTENDED = 0x1FFFFFFF
 """Largest identifier of 29 bits."""
@@ -23,45 +24,52 @@ QUIET_S = 0.05
 class SocketcandServer(TcpBus):
     """The bus `channel`; see `TcpBus`."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 29536, channel: str = "can0") -> None:
-        super().__init__(host, port)
-        self._channel = channel
+    END = b">"
 
-    def greeting(self) -> bytes:
-        """What a new client is sent."""
-        return b"< hi >"
+    def __init__(
+        self, reactor: Reactor, port: int, receiver: Receiver, channel: str = "can0"
+    ) -> None:
+        super().__init__(reactor, port, receiver)
+        self.channel = channel
 
-    def understand(self, client: Client) -> list[tuple[int, bytes]]:
-        """Frames in what a client has sent; answers to the rest."""
-        frames = []
-        while (end := client.received.find(b">")) >= 0:
-            words = client.received[:end].strip(b"< \r\n").decode("ascii", "replace").split()
-            client.received = client.received[end + 1 :]
-            if not words:
-                continue
-            if words[0] == "send" and client.listens_from_s is not None:
-                frame = _frame(words[1:])
-                if frame is None:
-                    client.queue += b"< error syntax of send >"
-                    continue
-                frames.append(frame)
-                client.listens_from_s = time.monotonic()
-            elif words[0] == "open" and words[1:] != [self._channel]:
-                client.queue += b"< error could not open bus >"
-            elif words[0] in ("open", "rawmode"):
-                client.queue += b"< ok >"
-                if words[0] == "rawmode":
-                    client.listens_from_s = time.monotonic() + QUIET_S
-            elif words[0] == "echo":
-                client.queue += b"< echo >"
-            else:
-                client.queue += b"< error unknown command >"
-        return frames
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
+        return _SocketcandClient(self, connection)
 
     def text_of(self, frame: CanFrame) -> bytes:
         """A frame of the bus as clients read it."""
         stamp = self.epoch_s + frame.time_s
         return b"< frame %03X %.6f %s >" % (frame.can_id, stamp, frame.data.hex().upper().encode())
+
+
+class _SocketcandClient(BusClient):
+    def __init__(self, bus: SocketcandServer, connection: Connection) -> None:
+        super().__init__(bus, connection)
+        self._server = bus
+        self.send(b"< hi >")
+
+    def understand(self, message: bytes) -> None:
+        """Do what one message says."""
+        words = message.strip(b"< \r\n").decode("ascii", "replace").split()
+        if not words:
+            return
+        if words[0] == "send" and self.listens_from_s is not None:
+            frame = _frame(words[1:])
+            if frame is None:
+                self.send(b"< error syntax of send >")
+                return
+            self.listens_from_s = time.monotonic()
+            self._server.take(*frame)
+        elif words[0] == "open" and words[1:] != [self._server.channel]:
+            self.send(b"< error could not open bus >")
+        elif words[0] in ("open", "rawmode"):
+            self.send(b"< ok >")
+            if words[0] == "rawmode":
+                self.listens_from_s = time.monotonic() + QUIET_S
+        elif words[0] == "echo":
+            self.send(b"< echo >")
+        else:
+            self.send(b"< error unknown command >")
 
 
 def _frame(words: list[str]) -> tuple[int, bytes] | None:

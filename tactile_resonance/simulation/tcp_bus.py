@@ -1,149 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A CAN bus over TCP, whatever its text: clients, their queues, and frames to all of them."""
+"""A CAN bus over TCP, whatever its text: clients, what they send to the cell, and frames to all of them."""
 
 from __future__ import annotations
 
-import contextlib
-import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
+from tactile_resonance.simulation.bench_time import STALL_S
 from tactile_resonance.simulation.load_cell import CanFrame
+from tactile_resonance.simulation.robot.reactor import Connection, Reactor
 
 LONGEST_QUEUE = 1 << 20
 """Bytes that a client may leave unread before it is dropped."""
-MOST_AT_ONCE = 1 << 14
-"""Bytes of a client that are looked at before others have their turn; a message is much shorter."""
-MOST_CLIENTS = 32
+LONGEST_MESSAGE = 1 << 14
+"""Bytes of a client without the end of a message."""
+
+Receiver = Callable[[int, bytes], Iterable[CanFrame]]
+"""Takes identifier and data of a frame of the bus; returns those that answer it."""
 
 
-class Client:
+class BusClient(ABC):
     """One connection.
 
     Attributes
     ----------
-    received : bytes
-        Not yet understood.
-    queue : bytes
-        To be sent.
     listens_from_s : float or None
         From when on it gets the bus's frames (monotonic clock); None: not yet.
+    frames : int
+        Of the bus, sent to it.
     """
 
-    def __init__(self, connection: socket.socket) -> None:
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.connection = connection
-        self.received = self.queue = b""
+    def __init__(self, bus: TcpBus, connection: Connection) -> None:
+        self._bus, self.connection = bus, connection
+        self._buffer = b""
         self.listens_from_s: float | None = None
+        self.frames = 0
+
+    def received(self, data: bytes) -> None:
+        """Answer each whole message; ValueError where one has no end."""
+        *messages, self._buffer = (self._buffer + data).split(self._bus.END)
+        for message in messages:
+            self.understand(message)
+        if len(self._buffer) > LONGEST_MESSAGE:
+            raise ValueError("bus: a message without end")
+
+    def closed(self) -> None:
+        """It has gone."""
+        self._bus.clients.discard(self)
+
+    def send(self, text: bytes) -> None:
+        """Send an answer."""
+        self.connection.send(text)
+
+    @abstractmethod
+    def understand(self, message: bytes) -> None:
+        """Do what one message says."""
 
 
 class TcpBus(ABC):
-    """One bus, any number of clients; never waits, so that a loop of 1 kHz can serve it.
+    """One bus, any number of clients.
 
     Parameters
     ----------
-    host : str
+    reactor : Reactor
+        Whose port it becomes.
     port : int
         0: a free one, to be found in `port`.
+    receiver : callable
+        The cell.
 
     Attributes
     ----------
     port : int
     epoch_s : float
-        UNIX time [s] at time 0 of the frames: they are stamped with the sum. To be set by whoever owns the
-        plant's clock.
+        Time [s] at time 0 of the frames: they are stamped with the sum. To be set by whoever owns the plant's
+        clock.
+    clients : set of BusClient
 
     Raises
     ------
-    OSError
+    ValueError
         Where the port cannot be had.
     """
 
-    def __init__(self, host: str, port: int) -> None:
-        self._listener = socket.create_server((host, port))
-        self._listener.setblocking(False)
-        self.port: int = self._listener.getsockname()[1]
+    END: bytes
+    """Of a message."""
+
+    def __init__(self, reactor: Reactor, port: int, receiver: Receiver) -> None:
         self.epoch_s = 0.0
-        self._clients: list[Client] = []
+        self.clients: set[BusClient] = set()
+        self._receiver = receiver
+        self.port = reactor.listen(port, self._serve, freezable=False, most_unsent=LONGEST_QUEUE)
 
     @abstractmethod
-    def greeting(self) -> bytes:
-        """What a new client is sent."""
-
-    @abstractmethod
-    def understand(self, client: Client) -> list[tuple[int, bytes]]:
-        """Frames in what a client has sent; answers to the rest."""
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
 
     @abstractmethod
     def text_of(self, frame: CanFrame) -> bytes:
         """A frame of the bus as clients read it."""
 
-    def poll(self) -> list[tuple[int, bytes]]:
-        """Take new clients and what all have sent: identifier and data of each frame for the bus."""
-        # nobody there, or no descriptor left for a client: the bus goes on with those it has
-        with contextlib.suppress(OSError):
-            while len(self._clients) < MOST_CLIENTS:
-                client = Client(self._listener.accept()[0])
-                client.queue = self.greeting()
-                self._clients.append(client)
-        frames: list[tuple[int, bytes]] = []
-        for client in list(self._clients):
-            try:
-                if not self._read(client):
-                    self._drop(client)
-                    continue
-                frames += self.understand(client)
-                self._flush(client)
-            except OSError:
-                self._drop(client)
-        return frames
-
-    def _read(self, client: Client) -> bool:
-        """Take what a client has sent, as far as it is its turn; whether it is to be kept."""
-        if len(client.received) >= MOST_AT_ONCE:
-            return False  # a message without end
-        try:
-            received = client.connection.recv(MOST_AT_ONCE - len(client.received))
-        except BlockingIOError:
-            return True
-        client.received += received
-        return bool(received)
+    def take(self, can_id: int, data: bytes) -> None:
+        """Hand a client's frame to the cell, and its answer to all."""
+        self.send(self._receiver(can_id, data))
 
     def send(self, frames: Iterable[CanFrame]) -> None:
         """Hand frames of the bus to every client that listens."""
-        text = b"".join(self.text_of(frame) for frame in frames)
-        if not text:
+        texts = [self.text_of(frame) for frame in frames]
+        if not texts:
             return
-        now_s = time.monotonic()
-        for client in list(self._clients):
-            if client.listens_from_s is None or now_s < client.listens_from_s:
-                continue
-            client.queue += text
-            try:
-                self._flush(client)
-            except OSError:
-                self._drop(client)
+        text, now_s = b"".join(texts), time.monotonic()
+        for client in list(self.clients):
+            if client.listens_from_s is not None and now_s >= client.listens_from_s:
+                client.frames += len(texts)
+                client.connection.send(text)
+
+    def keep_epoch(self, machine_s: float, plant_s: float) -> None:
+        """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall [s]."""
+        ahead_s = machine_s - plant_s
+        if not self.epoch_s <= ahead_s <= self.epoch_s + STALL_S:
+            self.epoch_s = ahead_s
+
+    def frames_sent(self, port: int) -> int:
+        """Frames of the bus that were sent to a client's port."""
+        return max((c.frames for c in self.clients if c.connection.peer_port == port), default=0)
 
     def drop_clients(self) -> None:
         """Close every connection, as a server that dies does; new clients are served again."""
-        for client in list(self._clients):
-            self._drop(client)
+        for client in list(self.clients):
+            client.connection.close()
 
-    def close(self) -> None:
-        """Close the connections and stop listening."""
-        self._listener.close()
-        self.drop_clients()
-
-    def _flush(self, client: Client) -> None:
-        with contextlib.suppress(BlockingIOError):
-            while client.queue:
-                client.queue = client.queue[client.connection.send(client.queue) :]
-        if len(client.queue) > LONGEST_QUEUE:
-            self._drop(client)
-
-    def _drop(self, client: Client) -> None:
-        with contextlib.suppress(ValueError):
-            self._clients.remove(client)
-        client.connection.close()
+    def _serve(self, connection: Connection) -> BusClient:
+        client = self.client(connection)
+        self.clients.add(client)
+        return client
