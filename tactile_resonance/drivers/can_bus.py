@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening buses of python-can, and whether they are quick enough."""
+"""Frames of a CAN bus without waiting: of any interface that python-can knows, and of socketcand in batches."""
 
 from __future__ import annotations
 
-import logging
+import select
 import socket
 import threading
-from typing import Any
+import time
+from binascii import Error as HexError
+from binascii import unhexlify
+from collections import deque
+from typing import Any, NamedTuple, Protocol
 
 import can
 
@@ -16,9 +20,257 @@ OPEN_WITHIN_S = 3.5  # serial adapters are given two seconds to wake up
 RATE_WINDOW_S = 0.5
 LEAST_SHARE = 0.9
 """Of the wrenches of a window that must arrive; fewer in two on end, and they pile up on the way."""
+KEPT_FRAMES = 20000
+READER_HUNG_S = 0.25
+_LONGEST_MESSAGE = 4096
+_AT_ONCE = 1 << 16
 
 
-def open_bus(settings: dict[str, Any], where: str) -> can.BusABC:
+class Frame(NamedTuple):
+    """One frame of the bus.
+
+    Attributes
+    ----------
+    can_id : int
+    data : bytes
+    stamp_s : float
+        Of the adapter [s].
+    arrival_ns : int
+        When it was taken from the interface (monotonic clock) [ns].
+    extended, remote, error : bool
+        Identifier of 29 bits; a request for data; the interface tells of an error.
+    """
+
+    can_id: int
+    data: bytes
+    stamp_s: float
+    arrival_ns: int
+    extended: bool = False
+    remote: bool = False
+    error: bool = False
+
+
+class Bus(Protocol):
+    """An open bus."""
+
+    def read(self) -> list[Frame]:
+        """Frames since the last call, oldest first, without waiting. Raises what the interface raises."""
+        ...
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing more waited when it was looked at last."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Return when frames have come, after a time at the latest."""
+        ...
+
+    def send(self, can_id: int, data: bytes, extended: bool) -> None:
+        """Send a frame. Raises what the interface raises."""
+        ...
+
+    def close(self) -> None:
+        """Let it go."""
+        ...
+
+
+class SocketcandBus:
+    """A bus over TCP (socketcand, raw mode): all frames that have come with one look at the socket.
+
+    python-can's own client serves the same protocol frame by frame. Protocol: linux-can/socketcand,
+    doc/protocol.md.
+
+    Parameters
+    ----------
+    host, port, channel : str, int, str
+
+    Attributes
+    ----------
+    local_port : int
+    frames : int
+        Received since it was opened.
+
+    Raises
+    ------
+    OSError
+        Where nobody answers, or not in time.
+    """
+
+    def __init__(self, host: str, port: int, channel: str) -> None:
+        self._socket = socket.create_connection((host, port), OPEN_WITHIN_S)
+        self.local_port = int(self._socket.getsockname()[1])
+        self.frames = 0
+        self._buffer, self._drained = b"", False
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._expect(b"< hi >", b"")
+            self._expect(b"< ok >", f"< open {channel} >".encode())
+            self._expect(b"< ok >", b"< rawmode >")
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.setblocking(False)
+
+    @property
+    def drained(self) -> bool:
+        """See `Bus`."""
+        return self._drained
+
+    def read(self) -> list[Frame]:
+        """See `Bus`."""
+        try:
+            data = self._socket.recv(_AT_ONCE)
+        except BlockingIOError:
+            self._drained = True
+            return []
+        self._drained = len(data) < _AT_ONCE
+        if not data:
+            raise ConnectionError("the server has closed the connection")
+        *messages, self._buffer = (self._buffer + data).split(b">")
+        if len(self._buffer) > _LONGEST_MESSAGE:
+            raise ConnectionError("the server sends a message without end")
+        arrival_ns = time.monotonic_ns()
+        frames = []
+        for message in messages:
+            words = message.split()
+            if len(words) < 4 or words[1] not in (b"frame", b"error"):
+                continue
+            try:
+                frames.append(
+                    Frame(
+                        int(words[2], 16),
+                        unhexlify(b"".join(words[4:])) if words[1] == b"frame" else b"",
+                        float(words[3]),
+                        arrival_ns,
+                        extended=len(words[2]) > 3,
+                        error=words[1] == b"error",
+                    )
+                )
+            except (ValueError, HexError) as error:
+                text = message.decode("ascii", "replace")
+                raise ConnectionError(f"the server sends {text!r}") from error
+        self.frames += len(frames)
+        return frames
+
+    def wait(self, seconds: float) -> None:
+        """See `Bus`."""
+        select.select([self._socket], [], [], seconds)
+
+    def send(self, can_id: int, data: bytes, extended: bool) -> None:
+        """See `Bus`."""
+        name = f"{can_id:08X}" if extended else f"{can_id:03X}"
+        values = " ".join(f"{byte:02X}" for byte in data)
+        self._socket.sendall(f"< send {name} {len(data):X} {values} >".encode())
+
+    def close(self) -> None:
+        """See `Bus`."""
+        self._socket.close()
+
+    def _expect(self, answer: bytes, request: bytes) -> None:
+        if request:
+            self._socket.sendall(request)
+        while answer not in self._buffer:
+            part = self._socket.recv(256)
+            if not part:
+                raise ConnectionError("the server has closed the connection")
+            self._buffer += part
+            if b"< error" in self._buffer:
+                raise ConnectionError(self._buffer.decode("ascii", "replace"))
+        self._buffer = self._buffer.partition(answer)[2]
+
+
+class AnyBus:
+    """A bus of python-can, read by a thread that waits for its frames, one by one.
+
+    Parameters
+    ----------
+    bus : can.BusABC
+    request : tuple of int, bytes, bool and float, or None
+        Identifier, data, whether extended, and period [s] of a frame that is sent again and again.
+    look_s : float
+        After so long without a frame nothing waits [s].
+    """
+
+    def __init__(
+        self, bus: can.BusABC, request: tuple[int, bytes, bool, float] | None, look_s: float
+    ) -> None:
+        self._bus, self._request, self._look_s = bus, request, look_s
+        self.drained = False
+        self._frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
+        self._came = threading.Event()
+        self._ended = threading.Event()
+        self._error: Exception | None = None
+        self._alive_s = time.monotonic()
+        self._thread = threading.Thread(target=self._receive, name="can", daemon=True)
+        self._thread.start()
+
+    def read(self) -> list[Frame]:
+        """See `Bus`."""
+        self._came.clear()
+        frames = []
+        while self._frames:
+            frames.append(self._frames.popleft())
+        if not frames and self._error is not None:
+            raise self._error
+        if not frames and time.monotonic() - self._alive_s > READER_HUNG_S:
+            raise ConnectionError("the interface hangs")
+        return frames
+
+    def wait(self, seconds: float) -> None:
+        """See `Bus`."""
+        self._came.wait(seconds)
+
+    def send(self, can_id: int, data: bytes, extended: bool) -> None:
+        """See `Bus`."""
+        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=extended))
+
+    def close(self) -> None:
+        """See `Bus`."""
+        self._ended.set()
+        self._thread.join(1.0)
+        self._bus.shutdown()
+
+    def _receive(self) -> None:
+        """Body of the thread."""
+        due_s = time.monotonic()
+        try:
+            while not self._ended.is_set():
+                now_s = self._alive_s = time.monotonic()
+                wait_s = self._look_s
+                if self._request is not None:
+                    can_id, data, extended, period_s = self._request
+                    if now_s >= due_s:
+                        due_s = max(due_s + period_s, now_s)
+                        self.send(can_id, data, extended)
+                    wait_s = min(wait_s, max(0.0, due_s - now_s))
+                message = self._bus.recv(wait_s)
+                self.drained = message is None
+                if message is None:
+                    continue
+                self._frames.append(
+                    Frame(
+                        message.arbitration_id,
+                        bytes(message.data),
+                        message.timestamp,
+                        time.monotonic_ns(),
+                        message.is_extended_id,
+                        message.is_remote_frame,
+                        message.is_error_frame,
+                    )
+                )
+                self._came.set()
+        except Exception as error:  # each interface has errors of its own
+            self._error = error
+            self._came.set()
+
+
+def open_bus(
+    settings: dict[str, Any],
+    where: str,
+    request: tuple[int, bytes, bool, float] | None,
+    look_s: float,
+) -> Bus:
     """Open a bus within a time: some interfaces try for long, or wait for ever.
 
     Parameters
@@ -27,19 +279,21 @@ def open_bus(settings: dict[str, Any], where: str) -> can.BusABC:
         Arguments of ``can.Bus``.
     where : str
         Name for messages.
+    request, look_s : tuple or None, float
+        See `AnyBus`.
 
     Raises
     ------
     ForceError
         `LINK_LOST`.
     """
-    if settings["interface"] == "socketcand":
-        # a message in two pieces is no fault, but python-can warns of each
-        logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)
-        # python-can would try for ten seconds, without a pause
-        address = (settings.get("host"), settings.get("port"))
+    plain = set(settings) <= {"interface", "host", "port", "channel", "tcp_tune"}
+    if settings["interface"] == "socketcand" and plain and request is None:
         try:
-            socket.create_connection(address, OPEN_WITHIN_S).close()
+            return SocketcandBus(settings["host"], settings["port"], settings["channel"])
+        except TimeoutError as error:
+            text = f"{where}: not open after {OPEN_WITHIN_S:g} s"
+            raise ForceError(ForceFault.LINK_LOST, text) from error
         except (OSError, ValueError) as error:  # ValueError: what no name or address can be
             text = f"{where}: {one_line(error)}"
             raise ForceError(ForceFault.LINK_LOST, text) from error
@@ -67,7 +321,7 @@ def open_bus(settings: dict[str, Any], where: str) -> can.BusABC:
         given_up.set()
         text = f"{where}: not open after {OPEN_WITHIN_S:g} s"
         raise ForceError(ForceFault.LINK_LOST, text)
-    return opened[0]
+    return AnyBus(opened[0], request, look_s)
 
 
 class Flow:

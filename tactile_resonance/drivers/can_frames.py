@@ -8,13 +8,12 @@ needed is one ``struct`` format over the joined bytes, which the standard librar
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.configuration import shared_file
 from tactile_resonance.fields import known_keys, read_yaml, require, section
@@ -99,23 +98,40 @@ class CanDescription:
     request: bytes | None = None
     reply: Reply | None = None
 
-    def decode(self, data: bytes) -> tuple[NDArray[np.float64], bool] | None:
+    def decode(self, data: bytes) -> tuple[tuple[float, ...], bool] | None:
         """Counts (6,) and overload of the joined bytes; NaN for a count that is no number.
 
         None where the bytes are another answer.
         """
         if len(data) != self.layout.size:
             return None
-        values = dict(zip(self.fields, self.layout.unpack(data), strict=True))
-        if any(values[name] != value for name, value in self.constant.items()):
-            return None
-        counts = np.array([values[name] for name in CHANNELS], dtype=float)
-        over = self.overload is not None and bool(values[self.overload[0]] & self.overload[1])
-        invalid = np.isin(counts, self.invalid_counts)
-        if self.full_scale_counts is not None:
-            over = over or bool(np.any(np.abs(counts[~invalid]) >= self.full_scale_counts))
-        counts[invalid] = np.nan
-        return counts, over
+        values = self.layout.unpack(data)
+        for at, wanted in self._constants:
+            if values[at] != wanted:
+                return None
+        counts = [float(values[at]) for at in self._channels]
+        over = self._overload_at is not None and bool(
+            values[self._overload_at] & self.overload[1]  # type: ignore[index]
+        )
+        if self.full_scale_counts is not None or self.invalid_counts:
+            for axis, count in enumerate(counts):
+                if count in self.invalid_counts:
+                    counts[axis] = math.nan
+                elif self.full_scale_counts is not None and abs(count) >= self.full_scale_counts:
+                    over = True
+        return tuple(counts), over
+
+    @cached_property
+    def _channels(self) -> tuple[int, ...]:
+        return tuple(self.fields.index(name) for name in CHANNELS)
+
+    @cached_property
+    def _constants(self) -> tuple[tuple[int, int], ...]:
+        return tuple((self.fields.index(name), value) for name, value in self.constant.items())
+
+    @cached_property
+    def _overload_at(self) -> int | None:
+        return None if self.overload is None else self.fields.index(self.overload[0])
 
 
 class Assembler:

@@ -5,60 +5,55 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
 import time
-from collections import deque
 from dataclasses import replace
 
 import can
-import numpy as np
 
+from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
-from tactile_resonance.drivers.can_bus import Flow, one_line, open_bus
+from tactile_resonance.drivers.can_bus import Bus, Flow, Frame, SocketcandBus, one_line, open_bus
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, Command
 from tactile_resonance.drivers.force_config import ForceConfig
 
 ANSWER_WITHIN_S = 0.25
+"""Of a cell, on this machine's clock; of a simulated one on a machine that may be slow:"""
+SIMULATED_WITHIN_S = 10.0
 QUIET_S = 0.02
-KEPT_SAMPLES = 10000
-READER_HUNG_S = 0.25
 
 
 class CanWrench:
     """Wrenches of a cell on CAN, in its own frame (a `contact.interfaces.Cell`).
 
-    A thread waits for frames, joins them, stamps and checks each wrench. Silence is only declared by a
-    thread that found nothing waiting, so that a reader that was held up does not blame the cell.
+    `read` takes the frames that have come, joins them, stamps and checks each wrench. Silence is only
+    declared where nothing waited, so that a reader that was held up does not blame the cell.
 
     Parameters
     ----------
     config : ForceConfig
         Of kind can.
+    clock : Clock or None
+        On which wrenches are dated; this machine's where it is not given.
 
     Attributes
     ----------
-    received, lost : int
+    received : int
         Wrenches since `start`.
     """
 
-    def __init__(self, config: ForceConfig) -> None:
+    def __init__(self, config: ForceConfig, clock: Clock | None = None) -> None:
         if config.can is None:
             raise ValueError(f"kind: {config.kind!r}, expected can")
         self._config, self._can = config, config.can
+        self.clock: Clock = WallClock() if clock is None else clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
-        self._samples: deque[CellSample] = deque(maxlen=KEPT_SAMPLES)
-        self._clock = self._new_clock()
-        self._stamp_before_ns = 0
-        self._assembler = self._new_assembler()
-        self._bus: can.BusABC | None = None
-        self._thread: threading.Thread | None = None
-        self._ended = threading.Event()
+        self._bus: Bus | None = None
         self._fault: ForceError | None = None
-        self._alive_s = 0.0
-        self.received = 0
+        self._scale = [tuple(map(float, row)) for row in config.can.scale]
+        self._begin()
 
     @property
     def info(self) -> ForceInfo:
@@ -69,6 +64,11 @@ class CanWrench:
     def lost(self) -> int:
         """Wrenches of which a frame was missing since `start`."""
         return self._assembler.lost
+
+    @property
+    def local_port(self) -> int:
+        """Of the connection to a bus over TCP; 0 where there is none."""
+        return self._bus.local_port if isinstance(self._bus, SocketcandBus) else 0
 
     def start(self) -> None:
         """Open the bus, set the cell up and let it stream; also after a fault has ended.
@@ -81,24 +81,27 @@ class CanWrench:
         """
         self.close()
         self._fault = None
-        self._samples.clear()
         self._checks.restart()
-        self._clock = self._new_clock()
-        self._assembler = self._new_assembler()
-        self.received = 0
-        self._bus = open_bus(self._can.bus, self._where)
+        self._begin()
+        info, description = self._config.info, self._can.description
+        request = None
+        if description.request is not None:
+            assert description.command_id is not None
+            period_s = 1 / info.rate_hz
+            extended = description.extended_ids
+            request = (description.command_id, description.request, extended, period_s)
+        look_s = self._config.limits.silent_s / 2
+        self._bus = open_bus(self._can.bus, self._where, request, look_s)
         try:
-            self._set_up()
+            self._set_up(self._bus)
         except ForceError:
             self.close()
             raise
         except (can.CanError, OSError) as error:
             self.close()
             raise ForceError(ForceFault.LINK_LOST, f"{self._where}: {one_line(error)}") from error
-        self._ended.clear()
-        self._alive_s = time.monotonic()
-        self._thread = threading.Thread(target=self._receive, name="can_wrench", daemon=True)
-        self._thread.start()
+        now_s = self.clock.now_ns() * 1e-9
+        self._last_s, self._flow = now_s, Flow(info.rate_hz, now_s)
 
     def read(self) -> list[CellSample]:
         """Wrenches since the last call, oldest first, without waiting.
@@ -110,23 +113,30 @@ class CanWrench:
         """
         if self._fault is not None:
             raise self._fault
-        samples = []
-        while self._samples:
-            samples.append(self._samples.popleft())
-        if samples:
-            return samples
-        if self._thread is None:
+        if self._bus is None:
             raise ForceError(ForceFault.LINK_LOST, f"{self._where}: not started")
-        if time.monotonic() - self._alive_s > self._config.limits.silent_s + READER_HUNG_S:
-            raise ForceError(ForceFault.LINK_LOST, f"{self._where}: the interface hangs")
-        return []
+        try:
+            return self._read(self._bus)
+        except ForceError as error:
+            self._fault = error
+            raise
+        except Exception as error:  # each interface has errors of its own
+            text = f"{self._where}: {one_line(error)}"
+            self._fault = ForceError(ForceFault.LINK_LOST, text)
+            raise self._fault from error
+
+    def catch_up(self, frames: int) -> None:
+        """In simulated time: wait for the frames that a simulated bus has sent until now."""
+        bus = self._bus
+        if not isinstance(bus, SocketcandBus) or self._fault is not None:
+            return
+        with contextlib.suppress(OSError):  # found again by `read`
+            while bus.frames < frames:
+                bus.wait(0.1)
+                self._ahead += bus.read()
 
     def close(self) -> None:
         """Stop the stream and let the bus go."""
-        self._ended.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(1.0)
-        self._thread = None
         bus, self._bus = self._bus, None
         if bus is None:
             return
@@ -135,7 +145,9 @@ class CanWrench:
             if stop is not None and self._fault is None:
                 self._send(bus, stop.data)
         with contextlib.suppress(can.CanError, OSError):
-            bus.shutdown()
+            bus.close()
+
+    # parts of these
 
     @property
     def _where(self) -> str:
@@ -143,8 +155,14 @@ class CanWrench:
         address = ":".join(str(bus[key]) for key in ("host", "port", "channel") if key in bus)
         return f"{self._config.info.name} on {bus['interface']} {address}"
 
-    def _new_clock(self) -> ClockTracker:
-        return ClockTracker(self._can.shortest_delay_s, self._can.delay_std_s)
+    def _begin(self) -> None:
+        """Nothing has come yet."""
+        self._tracker = ClockTracker(self._can.shortest_delay_s, self._can.delay_std_s)
+        self._stamp_before_ns = 0
+        self._assembler = self._new_assembler()
+        self._ahead: list[Frame] = []  # taken from the bus, not yet looked at
+        self._last_stamp_s = math.inf
+        self.received = 0
 
     def _new_assembler(self) -> Assembler:
         # times of arrival scatter by more than a period: there only the order pairs frames
@@ -156,119 +174,93 @@ class CanWrench:
         if self._can.stamps == "arrival":
             return self._can.delay_std_s
         try:
-            return self._clock.relation().uncertainty_s
+            return self._tracker.relation().uncertainty_s
         except ValueError:
             return float("nan")
 
-    def _send(self, bus: can.BusABC, data: bytes) -> None:
+    def _send(self, bus: Bus, data: bytes) -> None:
         description = self._can.description
-        bus.send(
-            can.Message(
-                arbitration_id=description.command_id,
-                data=data,
-                is_extended_id=description.extended_ids,
-            )
-        )
+        assert description.command_id is not None
+        bus.send(description.command_id, data, description.extended_ids)
 
-    def _set_up(self) -> None:
+    def _set_up(self, bus: Bus) -> None:
         """Stop the cell, set it, start it."""
-        bus, description = self._bus, self._can.description
-        assert bus is not None
+        description, simulated = self._can.description, self.clock.simulated
+        within_s = SIMULATED_WITHIN_S if simulated else ANSWER_WITHIN_S
         if description.stop is not None:
             self._send(bus, description.stop.data)
-            deadline_s = time.monotonic() + ANSWER_WITHIN_S
+            deadline_s = time.monotonic() + within_s
             quiet_s = time.monotonic() + QUIET_S
             while time.monotonic() < quiet_s:
-                message = bus.recv(QUIET_S)
-                if message is None or not self._is_of_the_cell(message):
-                    continue  # the bus may be busy with others
-                quiet_s = time.monotonic() + QUIET_S
-                if quiet_s > deadline_s:
-                    raise ForceError(ForceFault.REFUSED, f"{self._where}: does not stop")
+                if any(map(self._is_of_the_cell, _frames(bus))):  # the bus may be busy with others
+                    quiet_s = time.monotonic() + QUIET_S
+                    if quiet_s > deadline_s:
+                        raise ForceError(ForceFault.REFUSED, f"{self._where}: does not stop")
         commands = list(description.setup)
         if description.rates:
             commands.append(description.rates[int(self._config.info.rate_hz)])
         for command in commands:
             self._send(bus, command.data)
             if command.reply:
-                self._await_reply(bus, command)
+                self._await_reply(bus, command, within_s)
         if description.start is not None:
             self._send(bus, description.start.data)
-        if description.request is not None:
-            self._send(bus, description.request)
         deadline_s = time.monotonic() + ANSWER_WITHIN_S
-        while time.monotonic() < deadline_s:
-            message = bus.recv(QUIET_S)
-            if message is not None and self._take(message):
-                return
-        raise ForceError(ForceFault.SILENT, f"{self._where}: sends no wrench")
+        while not simulated and not self._ahead:  # simulated time may stand still for now
+            frames = _frames(bus)
+            if any(map(self._is_of_the_cell, frames)):
+                self._ahead = frames
+            if time.monotonic() > deadline_s:
+                raise ForceError(ForceFault.SILENT, f"{self._where}: sends no wrench")
 
-    def _await_reply(self, bus: can.BusABC, command: Command) -> None:
+    def _await_reply(self, bus: Bus, command: Command, within_s: float) -> None:
         reply = self._can.description.reply
         assert reply is not None
         assembler = self._new_assembler()
-        deadline_s = time.monotonic() + ANSWER_WITHIN_S
+        deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s:
-            message = bus.recv(QUIET_S)
-            if message is None or not self._is_of_the_cell(message):
-                continue
-            whole = assembler.add(message.arbitration_id, message.data, message.timestamp)
-            if whole is None or whole[0] != command.data[0]:
-                continue
-            if whole[reply.result_byte] == reply.good:
-                return
-            code = whole[reply.error_byte]
-            reason = reply.errors.get(code, f"error {code}")
-            raise ForceError(ForceFault.REFUSED, f"{self._where}: {command.name}: {reason}")
+            for frame in filter(self._is_of_the_cell, _frames(bus)):
+                whole = assembler.add(frame.can_id, frame.data, frame.stamp_s)
+                if whole is None or whole[0] != command.data[0]:
+                    continue
+                if whole[reply.result_byte] == reply.good:
+                    return
+                code = whole[reply.error_byte]
+                reason = reply.errors.get(code, f"error {code}")
+                raise ForceError(ForceFault.REFUSED, f"{self._where}: {command.name}: {reason}")
         raise ForceError(ForceFault.SILENT, f"{self._where}: no answer to {command.name!r}")
 
-    def _receive(self) -> None:
-        """Body of the thread: until closed, or until a fault is found."""
-        bus, silent_s = self._bus, self._config.limits.silent_s
-        assert bus is not None
-        request = self._can.description.request
-        period_s = 1 / self._config.info.rate_hz
-        longest_s = silent_s if request is None else period_s
-        last_s = due_s = time.monotonic()
-        stamped, last_stamp_s = self._can.stamps == "adapter", math.inf
-        flow = Flow(self._config.info.rate_hz, last_s)
-        try:
-            while not self._ended.is_set():
-                left_s = last_s + silent_s - time.monotonic()
-                message = bus.recv(min(longest_s, max(0.0, left_s) + 1e-4))
-                now_s = self._alive_s = time.monotonic()
-                if request is not None and now_s >= due_s:
-                    due_s = max(due_s + period_s, now_s)
-                    self._send(bus, request)
-                if message is None:
-                    if now_s - last_s > silent_s:
-                        raise self._silence(bus, now_s - last_s)
-                elif message.is_error_frame:
-                    raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
-                elif self._take(message):
-                    last_s = now_s
-                    last_stamp_s = message.timestamp
-                elif stamped:
-                    # the bus is never empty, but its frames are already those of later
-                    last_stamp_s = min(last_stamp_s, message.timestamp)
-                    if message.timestamp - last_stamp_s > silent_s:
-                        raise self._silence(bus, message.timestamp - last_stamp_s)
-                if request is None and flow.short(now_s, self.received + self.lost):
-                    text = (
-                        f"{self._where}: {flow.rate_hz:.0f} wrenches/s of {1 / period_s:.0f} arrive"
-                    )
-                    raise ForceError(ForceFault.INCOMPLETE, f"{text}: the interface is too slow")
-        except ForceError as error:
-            self._fault = error
-        except Exception as error:  # each interface has errors of its own
-            text = f"{self._where}: {one_line(error)}"
-            self._fault = ForceError(ForceFault.LINK_LOST, text)
+    def _read(self, bus: Bus) -> list[CellSample]:
+        frames = self._ahead + bus.read()
+        self._ahead = []
+        samples: list[CellSample] = []
+        silent_s, stamped = self._config.limits.silent_s, self._can.stamps == "adapter"
+        for frame in frames:
+            if frame.error:
+                raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
+            if self._take(frame, samples):
+                self._last_stamp_s = frame.stamp_s
+            elif stamped:
+                # the bus is never empty, but its frames are already those of later
+                self._last_stamp_s = min(self._last_stamp_s, frame.stamp_s)
+                if frame.stamp_s - self._last_stamp_s > silent_s:
+                    raise self._silence(bus, frame.stamp_s - self._last_stamp_s)
+        now_s = self.clock.now_ns() * 1e-9
+        if samples:
+            self._last_s = now_s
+        elif bus.drained and now_s - self._last_s > silent_s:
+            raise self._silence(bus, now_s - self._last_s)
+        if self._can.description.request is None and self._flow.short(
+            now_s, self.received + self.lost
+        ):
+            text = f"{self._flow.rate_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
+            raise ForceError(
+                ForceFault.INCOMPLETE, f"{self._where}: {text}: the interface is too slow"
+            )
+        return samples
 
-    def _silence(self, bus: can.BusABC, since_s: float) -> ForceError:
-        """Whether the cell or the link is silent: on a dead link two sends fail.
-
-        A socketcand whose server has died gives no frames and raises nothing (python-can 4.6).
-        """
+    def _silence(self, bus: Bus, since_s: float) -> ForceError:
+        """Whether the cell or the link is silent: on a dead link two sends fail."""
         stop = self._can.description.stop
         text = f"{self._where}: silent for {since_s * 1e3:.0f} ms"
         if stop is not None:
@@ -280,47 +272,56 @@ class CanWrench:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
-    def _take(self, message: can.Message) -> bool:
-        """Whether this frame completed a wrench. Raises `ForceError`."""
-        if not self._is_of_the_cell(message):
+    def _take(self, frame: Frame, samples: list[CellSample]) -> bool:
+        """Whether this frame completed a wrench, which is added. Raises `ForceError`."""
+        if not self._is_of_the_cell(frame):
             return False
         lost = self._assembler.lost
-        whole = self._assembler.add(message.arbitration_id, message.data, message.timestamp)
+        whole = self._assembler.add(frame.can_id, frame.data, frame.stamp_s)
         if self._assembler.lost > lost:
             self._checks.lost()
         decoded = None if whole is None else self._can.description.decode(whole)
         if decoded is None:
             return False
         counts, full_scale = decoded
-        if np.isnan(counts).any():
-            name = CHANNELS[int(np.flatnonzero(np.isnan(counts))[0])]
-            raise ForceError(ForceFault.INVALID, f"{self._where}: {name} is no number")
-        wrench = self._can.scale @ counts
+        if math.isnan(sum(counts)):
+            name = next(n for n, c in zip(CHANNELS, counts, strict=True) if math.isnan(c))
+            raise ForceError(ForceFault.INVALID, f"{self._where}: {name} is not finite")
+        wrench = tuple([sum(map(float.__mul__, row, counts)) for row in self._scale])
         overload = self._checks.check(wrench, full_scale)
-        self._samples.append(CellSample(self._stamp_ns(message), wrench, overload))
+        samples.append(CellSample(self._stamp_ns(frame), wrench, overload))
         self.received += 1
         return True
 
-    def _is_of_the_cell(self, message: can.Message) -> bool:
+    def _is_of_the_cell(self, frame: Frame) -> bool:
         """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
         description = self._can.description
         return (
-            message.arbitration_id in description.frame_ids
-            and message.is_extended_id == description.extended_ids
-            and not message.is_remote_frame
-            and not message.is_error_frame
+            frame.can_id in description.frame_ids
+            and frame.extended == description.extended_ids
+            and not frame.remote
+            and not frame.error
         )
 
-    def _stamp_ns(self, message: can.Message) -> int:
-        arrival_ns = time.time_ns()
+    def _stamp_ns(self, frame: Frame) -> int:
+        arrival_ns = self.clock.now_ns() if self.clock.simulated else frame.arrival_ns
         if self._can.stamps == "arrival":
             delay_s = self._can.shortest_delay_s + self._config.latency_s
-            return arrival_ns - round(delay_s * 1e9)
-        self._clock.add(message.timestamp, arrival_ns)
-        stamp_ns = self._clock.relation().to_local_ns(message.timestamp)
+            # those that were taken together came one after the other
+            stamp_ns = max(arrival_ns - round(delay_s * 1e9), self._stamp_before_ns + 1)
+            self._stamp_before_ns = stamp_ns
+            return stamp_ns
+        self._tracker.add(frame.stamp_s, arrival_ns)
+        stamp_ns = self._tracker.relation().to_local_ns(frame.stamp_s)
         # a relation that has become better may be earlier by more than a period, but the order in which
         # the wrenches were taken is certain; a step is none of the relation's, and left to be seen
         if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:
             stamp_ns = self._stamp_before_ns + 1
         self._stamp_before_ns = stamp_ns
         return stamp_ns - round(self._config.latency_s * 1e9)
+
+
+def _frames(bus: Bus) -> list[Frame]:
+    """What comes within a moment."""
+    bus.wait(QUIET_S)
+    return bus.read()

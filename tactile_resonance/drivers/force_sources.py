@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from tactile_resonance.clock import Clock
 from tactile_resonance.contact.interfaces import Cell
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_force import TipForce
@@ -16,6 +17,7 @@ def force_source(
     config: ForceConfig,
     arm_state: Callable[[], ArmSample],
     *,
+    clock: Clock | None = None,
     arm_clock_std_s: Callable[[], float] | None = None,
     topic: Callable[[ForceConfig], Cell] | None = None,
 ) -> TipForce:
@@ -26,6 +28,8 @@ def force_source(
     config : ForceConfig
     arm_state : callable
         Newest state of the arm, without waiting.
+    clock : Clock or None
+        On which wrenches are dated; this machine's where it is not given.
     arm_clock_std_s : callable or None
         How well the arm's times are known [s].
     topic : callable or None
@@ -42,7 +46,7 @@ def force_source(
             from tactile_resonance.drivers.can_wrench import CanWrench
         except ImportError as error:
             raise ValueError("kind: can needs python-can: pip install python-can") from error
-        cell = CanWrench(config)
+        cell = CanWrench(config, clock)
     elif config.kind == "rtde":
         cell = RtdeWrench(config, arm_state, arm_clock_std_s)
     elif topic is None:

@@ -3,65 +3,117 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import os
+import select
+import threading
 import time
+from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tactile_resonance.clock import Clock, Demand, SimulatedClock, WallClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.contact.samples import ArmSample, Pose
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.drivers.rtde_stream import RtdeStream
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import ClientState
-from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
+from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Command, Seen
+from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, stop_fault
+from tactile_resonance.drivers.ur_states import StateReader
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
+# Without a new state for this long the link is given up; the library would do so after 2.5 s.
+GIVE_UP_S = 1.2
+# The first state comes within this, and so does a program of which the library says that it runs.
+BEGIN_S = 2.0
+# In simulated time, between two looks at an arm that is not connected.
+AWAY_S = 0.002
+# What does not answer for so long is named.
+SILENT_S = 1.0
 
 
 class UrArm:
-    """An arm whose client library runs in a process of its own.
+    """An arm whose states are read here and whose commands are given by ur_rtde, in a process of its own.
 
     A hang or an abort of the library ends that process and is reported here; the process ends with this
-    one. Whether the link is alive is judged by the age of the robot's time stamp and by the library's
-    ``isConnected`` together: after a loss each alone may look well.
+    one. Whether the link is alive is judged by the age of the robot's time stamp.
 
-    While the arm moves, some method must be called at least every `UrArmConfig.owner_timeout_s`:
-    otherwise the robot's watchdog is no longer fed and stops it.
+    While the arm moves, `state` must be called at least every `UrArmConfig.owner_timeout_s`: otherwise the
+    robot's watchdog is no longer fed and stops it.
 
     Parameters
     ----------
     config : UrArmConfig
+    time : str
+        ``HOST:PORT`` of a simulated bench's time; empty: the arm lives by this machine's clock.
     """
 
-    def __init__(self, config: UrArmConfig) -> None:
+    def __init__(self, config: UrArmConfig, time: str = "") -> None:
         self.config = config
+        self._time = time
+        self._clock: Clock = WallClock()
+        self._own: SimulatedClock | None = None  # in simulated time: asks for it
+        self._led: SimulatedClock | None = None  # and is told it, while a loop leads it
+        self._pending: Command | None = None  # goes with the next word on the time
+        self._until_ns = 0
+        self._said_s = self._heard_s = 0.0  # when the client was told something, the robot heard
         self._client: ClientProcess | None = None
+        self._stream: RtdeStream | None = None
+        self._states: StateReader | None = None
         self._number = 0
-        self._sent: dict[int, tuple[str, float]] = {}  # name and time [s] of what has no answer yet
+        self._sent: dict[int, tuple[bytes, float]] = {}  # kind and time [s] of what has no answer yet
         self._refused = 0
-        self._move = 0
+        self._reading, self._speaking = threading.Lock(), threading.Lock()
+
+    # what is known of it
+
+    @property
+    def clock(self) -> Clock:
+        """On which its states are dated."""
+        return self._clock
+
+    @property
+    def frames(self) -> int:
+        """In simulated time that is led: frames of the bus sent until now."""
+        return 0 if self._led is None else self._led.frames
+
+    @property
+    def waits_for(self) -> str:
+        """In simulated time that is led: what has not answered for a second, for people; empty: nothing."""
+        client, now_s = self._client, time.monotonic()
+        if self._led is None or client is None or now_s - self._said_s < SILENT_S:
+            return ""
+        if client.exchange.heard_ns != self._until_ns:
+            return "the arm's client process"
+        return "the simulated robot" if now_s - self._heard_s > SILENT_S else ""
 
     @property
     def clock_uncertainty_s(self) -> float:
-        """Standard deviation of `ArmSample.time_ns` against this machine's clock [s]."""
-        return self._fresh().clock_std_s
+        """Standard deviation of `ArmSample.time_ns` against `clock` [s]."""
+        self._fresh()
+        assert self._states is not None
+        return self._states.clock_std_s
 
     @property
     def rate_hz(self) -> float:
         """States received in the last second."""
-        return self._fresh().rate_hz
+        self._fresh()
+        assert self._states is not None
+        return self._states.rate_hz
 
     @property
     def client_pid(self) -> int | None:
         """Of the client's process; None while there is none."""
         return None if self._client is None else self._client.pid
 
+    # the contract
+
     def connect(self) -> None:
         """Connect, set TCP and payload, start the control program and its watchdog.
 
         After a stop that was released at the robot, the program is started again over the same
-        connection; after anything else the client process is replaced.
+        connection; after anything else everything is connected anew.
 
         Raises
         ------
@@ -69,24 +121,15 @@ class UrArm:
             LINK_LOST, NOT_REMOTE, REGISTERS_IN_USE, PROGRAM_NOT_STARTED, PROTECTIVE_STOP,
             EMERGENCY_STOP, PROGRAM_STOPPED (not powered), COMMAND_REFUSED, CLIENT_DIED.
         """
-        if self._client is not None:
-            try:
-                state = self._fresh()
-            except ArmError:
-                self.close()
-            else:
-                if motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is None:
-                    self._forget_commands()
-                    return
-                stop = stop_fault(state.safety_bits, state.robot_mode)
-                if stop is not None:  # not released yet; the connection is good
-                    raise ArmError(*stop)
-                self._ask({"name": "restart"})
-                self._forget_commands()
-                return
+        if self._client is not None and self._connect_again():
+            return
+        self._begin()
         self._client = ClientProcess(self.config)
-        self._ask({"name": "connect", "config": self.config.to_dict()})
-        self._forget_commands()
+        names = {"time": self._time, "time_name": self._time_name}
+        self._ask({"name": "connect", "config": self.config.to_dict(), **names})
+        self._guard()
+        if self._led is not None:
+            self._ask({"name": "lead"})
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -97,22 +140,11 @@ class UrArm:
             LINK_LOST, STALE, CLIENT_DIED; COMMAND_REFUSED once for each command that the robot
             refused, or where the client does not answer.
         """
-        client = self._fresh()
-        self._check_commands(client)
-        fault = motion_fault(client.safety_bits, client.robot_mode, client.runtime_state)
-        # the wall clock may be set; how long ago the state held is known by the monotonic one
-        age_ns = time.monotonic_ns() - client.state_ns
-        return ArmSample(
-            time_ns=time.time_ns() - age_ns,
-            robot_time_s=client.robot_time_s,
-            tip=Pose.from_vector(np.array(client.tip_pose)),
-            tip_velocity=np.array(client.tip_speed),
-            moving_allowed=fault is None,
-            message="" if fault is None else fault[1],
-            tool_wrench=np.array(client.tip_force),
-        )
+        sample = self._fresh()
+        self._check_commands()
+        return sample
 
-    def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
+    def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
         """Move the tip with a twist (6,) in the base [m/s, rad/s] until the next command.
 
         Raises
@@ -122,37 +154,23 @@ class UrArm:
         ValueError
             Where a figure is beyond the limits of the configuration; nothing is sent then.
         """
-        twist = np.asarray(twist, dtype=float)
-        if twist.shape != (6,) or not np.all(np.isfinite(twist)):
-            raise ValueError(f"twist: {twist}, expected 6 finite numbers")
+        values = tuple(map(float, twist))
+        if len(values) != 6 or not all(map(math.isfinite, values)):
+            raise ValueError(f"twist: {values}, expected 6 finite numbers")
+        config, (x, y, z, a, b, c) = self.config, values
         for name, value, most in (
-            ("speed", float(np.linalg.norm(twist[:3])), self.config.max_speed_m_s),
-            ("turn", float(np.linalg.norm(twist[3:])), self.config.max_turn_rad_s),
+            ("speed", math.sqrt(x * x + y * y + z * z), config.max_speed_m_s),
+            ("turn", math.sqrt(a * a + b * b + c * c), config.max_turn_rad_s),
         ):
             if value > most:
                 raise ValueError(f"{name}: {value:g}, the configuration allows {most:g}")
         self._check_acceleration(acceleration_m_s2)
-        self._command("speed", [twist.tolist(), float(acceleration_m_s2)])
-
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Begin a straight move of the tip to a pose in the base. Raises as `speed`."""
-        vector = pose.vector
-        if not np.all(np.isfinite(vector)):
-            raise ValueError(f"pose: {vector}, expected 6 finite numbers")
-        if not 0 < speed_m_s <= self.config.max_speed_m_s:
-            raise ValueError(
-                f"speed: {speed_m_s:g}, the configuration allows {self.config.max_speed_m_s:g}"
-            )
-        self._check_acceleration(acceleration_m_s2)
-        self._move = self._command(
-            "move", [vector.tolist(), float(speed_m_s), float(acceleration_m_s2)]
-        )
-
-    def moving(self) -> bool:
-        """Whether the last `move` is still under way. Raises as `state`."""
-        client = self._fresh()
-        self._check_commands(client)
-        return client.moving or client.done < self._move
+        self._fresh()
+        self._check_commands()
+        assert self._states is not None
+        if self._states.fault is not None:
+            raise ArmError(*self._states.fault)
+        self._send(Command(SPEED, twist=values, acceleration=float(acceleration_m_s2)))
 
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop; works at any time and raises only where the link is dead, or for a wrong figure.
@@ -165,77 +183,296 @@ class UrArm:
         except ArmError as error:
             if error.fault is not ArmFault.STALE:
                 raise
-        self._send("stop", [float(deceleration_m_s2)])
+        self._send(Command(STOP, acceleration=float(deceleration_m_s2)))
 
     def close(self) -> None:
         """Stop the arm and its program and end the client; never raises."""
         if self._client is not None:
             self._client.end()
-            self._client = None
+        self._forget()
+        self.follow()
+        if self._own is not None:
+            self._own.close()
+            self._own, self._clock = None, WallClock()
+
+    # simulated time, led by a loop
+
+    def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:
+        """Let simulated time go on as `wait_until` says; on the wall clock nothing is to be led.
+
+        Parameters
+        ----------
+        bus_port : callable
+            Local port of the connection to the bus of a load cell, of which `frames` tells; 0: none.
+        """
+        if self._time:
+            name = self._time_name
+            led = SimulatedClock(self._time, f"{name}: loop", told_with=name)
+            self._clock = self._led = led
+            self._bus_port = bus_port
+            self._name_ports()
+            self._ask({"name": "lead"})
+            led.refresh()
+            self._begin_states()
+            self._wait_for_first()
+
+    def follow(self) -> None:
+        """Leave the time to itself."""
+        if self._led is None:
+            return
+        pending, self._pending = self._pending, None
+        if self._client is not None and pending is not None:
+            self._client.send(pending)
+        self._led.close()
+        self._led, self._clock = None, _Asked(self._own) if self._own else WallClock()
+        if self._client is not None:
+            self._ask({"name": "follow"})
+
+    def wait_until(
+        self, time_ns: int, demand: Demand, while_waiting: Callable[[], None] | None = None
+    ) -> None:
+        """Let simulated time go on up to a time and wait for that, and for the robot's state at it.
+
+        What was commanded before is with the robot by then.
+        """
+        led, client = self._led, self._client
+        assert led is not None
+        if client is None:  # nobody holds the time: it goes on, and this thread looks again soon
+            time.sleep(AWAY_S)
+            led.ask_ns()
+            return
+        command, self._pending = self._pending or Command(NOTHING), None
+
+        def check() -> None:
+            client.check()
+            client.exchange.beat()
+            self._read()  # a robot whose time stands says so
+            if while_waiting is not None:
+                while_waiting()
+
+        try:
+            with self._speaking:
+                self._until_ns, self._said_s = time_ns, time.monotonic()
+                client.send(command._replace(until_ns=time_ns, demand=int(demand)))
+            while led.now_ns() < time_ns:
+                led.wait_told(check)
+            self._catch_up(led.robot_ns)
+        except ArmError:  # told by `state`
+            time.sleep(AWAY_S)
+            led.ask_ns()
+
+    def hurry(self) -> None:
+        """Let a wait that stands still end: something is under way now. From any thread."""
+        client = self._client
+        if self._led is not None and client is not None:
+            with contextlib.suppress(ArmError), self._speaking:
+                client.send(Command(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
+
+    # parts of these
+
+    @property
+    def _time_name(self) -> str:
+        return f"client of the arm, process {os.getpid()}"
+
+    def _connect_again(self) -> bool:
+        """Start the program again where the connection is good; False where all is to be made anew."""
+        assert self._client is not None
+        try:
+            self._fresh()
+        except ArmError:
+            self._client.end()
+            self._forget()
+            return False
+        assert self._states is not None
+        if self._states.fault is None:
+            self._forget_commands()
+            return True
+        self._check_stop()
+        self._states.guard(False)
+        self._ask({"name": "restart"})
+        self._guard()
+        return True
+
+    def _begin(self) -> None:
+        """Hear the robot, and that nothing forbids motion."""
+        try:
+            if self._time and self._own is None:
+                self._own = SimulatedClock(self._time, f"{self._time_name}: owner")
+                self._clock = _Asked(self._own)
+            self._stream = RtdeStream(self.config.host, self.config.rate_hz)
+            self._begin_states()
+            if self._led is not None:
+                self._name_ports()
+            self._wait_for_first()
+            self._check_stop()
+        except ConnectionError as error:
+            self._forget()
+            raise ArmError(ArmFault.LINK_LOST, str(error)) from error
+        except ArmError:
+            self._forget()
+            raise
+
+    def _begin_states(self) -> None:
+        assert self._stream is not None
+        guarded = self._states is not None
+        self._states = StateReader(self._stream, self._clock)
+        self._states.guard(guarded)
+
+    def _name_ports(self) -> None:
+        assert self._led is not None
+        assert self._stream is not None
+        self._led.ports(self._stream.local_port, self._bus_port())
+
+    def _guard(self) -> None:
+        """See that the program runs; from now on no other counts as ours."""
+        assert self._states is not None
+        self._wait_for(
+            lambda states: states.newest.runtime_state == PROGRAM_PLAYING,
+            "the program ended as soon as it ran",
+            ArmFault.PROGRAM_NOT_STARTED,
+        )
+        self._states.guard(True)
+        self._forget_commands()
+
+    def _wait_for_first(self) -> None:
+        self._wait_for(lambda states: states.newest is not None, "no state of the robot comes")
+
+    def _wait_for(
+        self,
+        condition: Callable[[StateReader], bool],
+        otherwise: str,
+        fault: ArmFault = ArmFault.LINK_LOST,
+    ) -> None:
+        assert self._stream is not None
+        assert self._states is not None
+        deadline = time.monotonic() + BEGIN_S
+        while not condition(self._states):
+            if time.monotonic() > deadline:
+                raise ArmError(fault, otherwise)
+            select.select([self._stream], [], [], 0.05)
+            self._read()
+
+    def _check_stop(self) -> None:
+        """Raise where something forbids motion whatever program runs."""
+        assert self._states is not None
+        newest = self._states.newest
+        assert newest is not None
+        stop = stop_fault(newest.safety_bits, newest.robot_mode)
+        if stop is not None:  # not released yet; the connection is good
+            raise ArmError(*stop)
 
     def _ask(self, request: dict) -> None:
         assert self._client is not None
         try:
-            self._client.ask(request)
-        except ArmError:  # it has ended
-            self._client = None
+            self._client.ask(request, self._read)
+        except ArmError as error:  # it has ended
+            runs = self._states is not None and self._states.newest is not None
+            runs = runs and self._states.newest.runtime_state == PROGRAM_PLAYING
+            self._forget()
+            if request["name"] == "connect" and "not ready" in str(error) and runs:
+                # the library asks it to end in a register that the program may not read, and waits for ever
+                text = "another program runs there and does not end; stop it at the robot"
+                raise ArmError(
+                    ArmFault.PROGRAM_NOT_STARTED, f"{str(error)[len('arm: ') :]}: {text}"
+                ) from error
             raise
 
-    def _command(self, name: str, values: list) -> int:
-        client = self._fresh()
-        self._check_commands(client)
-        fault = motion_fault(client.safety_bits, client.robot_mode, client.runtime_state)
-        if fault is not None:
-            raise ArmError(*fault)
-        return self._send(name, values)
-
-    def _send(self, name: str, values: list) -> int:
+    def _send(self, command: Command) -> None:
         assert self._client is not None
         self._number += 1
-        self._client.send({"name": name, "number": self._number, "values": values})
-        self._sent[self._number] = (name, time.monotonic())
-        return self._number
+        command = command._replace(number=self._number)
+        self._sent[self._number] = (command.kind, time.monotonic())
+        if self._led is not None:
+            self._pending = command  # with the next word on the time
+        else:
+            self._client.send(command)
 
-    def _fresh(self) -> ClientState:
+    def _read(self) -> None:
+        """Take the states that have come."""
+        assert self._states is not None
+        try:
+            with self._reading:  # a loop may wait for a time while another thread connects
+                if self._states.read():
+                    self._heard_s = time.monotonic()
+        except ConnectionError as error:
+            if self._client is not None:
+                self._client.end()
+            self._forget()
+            text = f"the connection to {self.config.host} is lost"
+            raise ArmError(ArmFault.LINK_LOST, text) from error
+
+    def _catch_up(self, robot_ns: int) -> None:
+        """Wait for the state that the bench has sent."""
+        assert self._stream is not None
+        assert self._states is not None
+        self._read()
+        while (newest := self._states.newest) is not None:
+            if round(newest.robot_time_s * 1e9) >= robot_ns:
+                return
+            select.select([self._stream], [], [], 0.1)
+            self._read()
+
+    def _fresh(self) -> ArmSample:
         """Return the newest state, and show the client that its owner lives."""
-        if self._client is None:
+        if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        client = self._client.state()
-        if client is None or not client.connected:
-            raise ArmError(ArmFault.LINK_LOST, f"the connection to {self.config.host} is lost")
-        age_s = (time.monotonic_ns() - min(client.state_ns, client.received_ns)) * 1e-9
-        if age_s > self.config.max_state_age_s:
+        self._client.check()
+        self._read()
+        states, config = self._states, self.config
+        sample = states.sample
+        assert sample is not None
+        age_s = (self._clock.now_ns() - sample.time_ns) * 1e-9
+        seen = Seen.FRESH if age_s <= config.max_state_age_s else Seen(0)
+        if states.fault is not None:
+            seen |= Seen.FAULTY | (Seen.REVIVED if states.revived else Seen(0))
+        self._client.exchange.beat(seen)
+        if age_s > GIVE_UP_S:
+            self._client.end()
+            self._forget()
+            raise ArmError(ArmFault.LINK_LOST, f"the connection to {config.host} is lost")
+        if age_s > config.max_state_age_s:
             raise ArmError(
                 ArmFault.STALE,
-                f"the newest state of {self.config.host} is {age_s * 1e3:.0f} ms old, accepted are "
-                f"{self.config.max_state_age_s * 1e3:.0f} ms",
+                f"the newest state of {config.host} is {age_s * 1e3:.0f} ms old, accepted are "
+                f"{config.max_state_age_s * 1e3:.0f} ms",
             )
-        return client
+        return sample
 
-    def _check_commands(self, client: ClientState) -> None:
-        sent = self._sent
-        self._sent = {number: each for number, each in sent.items() if number > client.done}
-        if client.refused > self._refused:
-            self._refused = client.refused
-            if (
-                motion_fault(client.safety_bits, client.robot_mode, client.runtime_state)
-                is not None
-            ):
+    def _check_commands(self) -> None:
+        assert self._client is not None
+        assert self._states is not None
+        if not self._sent:
+            return
+        exchange, sent = self._client.exchange, self._sent
+        done = exchange.done
+        for number in [number for number in sent if number <= done]:
+            name = {SPEED: "speed", STOP: "stop"}[sent.pop(number)[0]]
+            if number != exchange.refused or number <= self._refused:
+                continue
+            self._refused = number
+            if self._states.fault is not None:
                 return  # a stop is why; the state tells it
-            name = sent[client.refused][0] if client.refused in sent else "an earlier command"
-            said = "" if self._client is None else self._client.last_error()
+            said = self._client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
-        for name, sent_s in self._sent.values():
-            if time.monotonic() - sent_s > ANSWER_S:
-                raise ArmError(
-                    ArmFault.COMMAND_REFUSED, f"no answer to {name} after {ANSWER_S:g} s"
-                )
+        if self._led is None and sent:
+            oldest_s = next(iter(sent.values()))[1]
+            if time.monotonic() - oldest_s > ANSWER_S:
+                text = f"no answer to a command after {ANSWER_S:g} s"
+                raise ArmError(ArmFault.COMMAND_REFUSED, text)
 
     def _forget_commands(self) -> None:
         self._sent.clear()
-        self._refused, self._move = self._number, 0
+        self._pending = None
+        self._refused = self._number
         if self._client is not None:
-            self._client.beat()
+            self._client.exchange.beat()
+
+    def _forget(self) -> None:
+        """Nothing is connected any more."""
+        self._client = self._states = None
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
 
     def _check_acceleration(self, value: float) -> None:
         if not 0 < value <= self.config.max_acceleration_m_s2:
@@ -243,3 +480,22 @@ class UrArm:
                 f"acceleration: {value:g}, the configuration allows above 0 to "
                 f"{self.config.max_acceleration_m_s2:g}"
             )
+
+
+class _Asked:
+    """Simulated time of which nobody tells: it is asked for."""
+
+    simulated = True
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock = clock
+
+    def now_ns(self) -> int:
+        return self._clock.ask_ns()
+
+    def wait_until(self, time_ns: int) -> None:
+        while self.now_ns() < time_ns:
+            time.sleep(0.002)
+
+    def ros_ns(self, time_ns: int) -> int:
+        return time_ns

@@ -1,51 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
 """Client process of `UrArm`: the only place where ur_rtde runs.
 
-Started as ``python -m tactile_resonance.drivers.ur_client COMMANDS PAGE`` with two open descriptors. It
-ends by itself when its owner's end of COMMANDS closes, and before the library's own time-out of 2.5 s,
-which may abort the process, can come.
+Started as ``python -m tactile_resonance.drivers.ur_client COMMANDS PAGE`` with two open descriptors. It does
+what its owner says and keeps the robot's watchdog quiet; states are the owner's to read. It ends by itself
+when the owner's end of COMMANDS closes.
+
+In simulated time it takes part in the bench's time: while the owner leads, time goes on as far as each
+command says; else as far as the watchdog is fed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import select
 import signal
 import socket
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import zip_longest
 from typing import NoReturn
 
+from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import (
     EXIT_BROKEN,
-    EXIT_LINK_LOST,
     EXIT_ORDERLY,
+    SPEED,
+    STOP,
+    Command,
     Exchange,
+    Seen,
 )
-from tactile_resonance.drivers.ur_motion import OvertakenError
-from tactile_resonance.drivers.ur_requests import OwnerGoneError, Requests
 from tactile_resonance.drivers.ur_session import Session
-from tactile_resonance.drivers.ur_states import StateReader
 
-# Without a new state for this long the link is given up; the library would do so after 2.5 s.
-GIVE_UP_S = 1.2
+LONGEST_MESSAGE = 8192
+# No command is given to a robot of which the owner has seen nothing for so long.
+HEALTHY_S = 0.1
 REFUSAL_S = 0.008
+# An orderly end that the library holds up is given up.
+LEAVE_WITHIN_S = 0.5
+
+
+class OwnerGoneError(Exception):
+    """The owner's end is closed: nobody asks any more."""
 
 
 class Client:
     """Does what the owner asks for, and keeps the robot's watchdog quiet meanwhile."""
 
     def __init__(self, commands: socket.socket, exchange: Exchange) -> None:
-        self._requests = Requests(commands)
-        self._exchange = exchange
+        self._commands, self._exchange = commands, exchange
         self._opened: Session | None = None  # kept where it failed: see `Session.open`
         self._session: Session | None = None
-        self._fed_s = 0.0
+        self._clock: SimulatedClock | None = None
+        self._led = False  # the owner says how far simulated time may go
+        self._fed_ns = 0  # when the watchdog was fed, in simulated time or this machine's
+        self._until_ns = 0  # up to when simulated time may go on
         # number and deceleration of a stop that the robot has not taken yet
         self._owed: tuple[int, float] | None = None
 
@@ -53,139 +69,208 @@ class Client:
         """Serve until the owner is gone."""
         try:
             while True:
-                session = self._session
-                pause_s = 1.0 if session is None else 1.0 / (3 * session.config.watchdog_hz)
-                request = self._requests.take(pause_s)
-                if request is not None:
-                    self._execute(request)
+                for message in self._wait():
+                    if message[:1] == b"{":
+                        self._request(json.loads(message))
+                    else:
+                        self._obey(Command.unpack(message))
                 if self._session is not None:
                     self._keep_alive(self._session)
         except OwnerGoneError:
             self._leave()
 
-    def _execute(self, request: dict) -> None:
-        name, number = request["name"], request.get("number", 0)
-        if name == "connect":
-            self._answer(lambda: self._connect(UrArmConfig.from_dict(request["config"])))
-            return
+    # what the owner says
+
+    def _wait(self) -> list[bytes]:
+        """Messages of the owner, without velocities that a later command has overtaken; waits a while for one."""
+        session, channels = self._session, [self._commands]
+        pause_s = None if session is None else 1.0 / (3 * session.config.watchdog_hz)
+        if self._clock is not None and session is not None:
+            pause_s = None  # by the bench's time
+            if not self._led:
+                channels.append(self._clock)  # type: ignore[arg-type]
+        select.select(channels, [], [], pause_s)
+        messages: list[bytes] = []
+        while True:
+            try:
+                data = self._commands.recv(LONGEST_MESSAGE, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""
+            if not data:
+                raise OwnerGoneError
+            messages.append(data)
+        return [
+            message
+            for message, later in zip_longest(messages, messages[1:], fillvalue=b"")
+            if message[:1] != SPEED or later[:1] not in (SPEED, STOP)
+        ]
+
+    def _obey(self, command: Command) -> None:
         session = self._session
         assert session is not None
-        if name == "restart":
-            self._answer(lambda: self._restart(session))
-        elif name == "stop":
-            (deceleration,) = request["values"]
+        if command.kind == STOP:
             # whatever becomes of the stop itself, no velocity is said again
-            session.motion.rest(deceleration)
-            self._owed = number, deceleration
+            session.motion.rest(command.acceleration)
+            self._owed = command.number, command.acceleration
             self._pay(session)
-        else:
-            done = self._do(session, name, request["values"])
+        elif command.kind == SPEED:
+            done = self._do(lambda: session.motion.speed(command.twist, command.acceleration))
             if done:
                 self._owed = None
-            session.states.report(number, done)
+            self._exchange.report(command.number, done)
+        if command.until_ns and self._clock is not None:
+            # the owner speaks when the time that he said last has come
+            if command.kind == SPEED:
+                self._fed_ns = self._until_ns
+            elif command.until_ns - self._fed_ns > 0.5e9 / session.config.watchdog_hz:
+                self._feed(session)
+                self._fed_ns = self._until_ns
+            self._until_ns = command.until_ns
+            self._clock.hold(command.until_ns, Demand(command.demand), session.motion.packets)
+            self._exchange.hear(command.until_ns)
 
-    def _answer(self, action: Callable[[], None]) -> None:
+    def _request(self, request: dict) -> None:
+        """Do what the owner waits for, and answer."""
+        name = request["name"]
+        actions: dict[str, Callable[[], None]] = {
+            "connect": lambda: self._connect(request),
+            "restart": self._restart,
+            "lead": lambda: self._lead(True),
+            "follow": lambda: self._lead(False),
+        }
         try:
-            action()
+            with self._time_passes(name in ("connect", "restart")):
+                actions[name]()
             answer: dict = {"ok": True}
         except ArmError as error:
-            answer = {
-                "ok": False,
-                "fault": error.fault.value,
-                "message": str(error)[len("arm: ") :],
-            }
-        self._requests.answer(answer)
+            text = str(error)[len("arm: ") :]
+            answer = {"ok": False, "fault": error.fault.value, "message": text}
+        self._commands.send(json.dumps(answer).encode())
 
-    def _connect(self, config: UrArmConfig) -> None:
-        self._opened = session = Session(config, self._exchange, self._requests.stop_waits)
+    def _connect(self, request: dict) -> None:
+        config = UrArmConfig.from_dict(request["config"])
+        if request["time"]:
+            self._clock = SimulatedClock(request["time"], request["time_name"])
+            self._clock.free(Demand.REAL)
+        self._opened = session = Session(config, self._clock)
         session.open()
         self._session = session
-        threading.Thread(target=self._publish, args=(session.states,), daemon=True).start()
-        session.guard()
 
-    def _restart(self, session: Session) -> None:
-        session.restart()
+    def _restart(self) -> None:
+        assert self._session is not None
+        self._session.restart()
         self._owed = None
 
-    def _do(self, session: Session, name: str, values: list) -> bool:
+    def _lead(self, led: bool) -> None:
+        self._led = led
+        self._stand()
+
+    @contextlib.contextmanager
+    def _time_passes(self, wanted: bool) -> Iterator[None]:
+        """Let simulated time go on while the library waits for the robot; it stands afterwards."""
+        if self._clock is not None and wanted:
+            self._clock.free(Demand.REAL)
         try:
-            done = session.listening and session.motion.execute(name, values)
-        except OvertakenError:
-            done = True  # the stop that came will be answered
-        except OwnerGoneError:
-            raise
+            yield
+        finally:
+            if wanted:
+                self._stand()
+
+    def _stand(self) -> None:
+        """Simulated time stands until the next word of whoever leads it."""
+        if self._clock is None or self._session is None:
+            return
+        self._session.motion.packets = 0
+        self._until_ns = self._clock.ask_ns()
+        self._clock.hold(self._until_ns, Demand.NONE, 0)
+        self._clock.ask_ns()  # whoever leads has been told by now
+
+    # what the robot is told
+
+    @property
+    def _healthy(self) -> bool:
+        """The owner sees a robot that may be told something; he says nothing where he is away."""
+        seen_s = self._exchange.silence_s()
+        return seen_s < HEALTHY_S and Seen.FRESH in self._exchange.seen
+
+    def _do(self, action: Callable[[], bool]) -> bool:
+        try:
+            done = action()
         except Exception as error:  # the library raises what it likes; the owner hears of it
-            print(f"{name}: {error}", file=sys.stderr)
+            print(f"{action}: {error}", file=sys.stderr)
             done = False
         if not done:
             # a stop that is why shows in the states a cycle or two later than in the refusal
             time.sleep(REFUSAL_S)
-        _note_moving(session)
         return done
 
     def _pay(self, session: Session) -> None:
         """Tell the robot of the stop that it has not taken yet, once it listens."""
-        if self._owed is None or not session.states.healthy:
+        if self._owed is None or not self._healthy:
             return
-        number, deceleration = self._owed
-        if session.listening:
-            done = self._do(session, "stop", [deceleration])
-            session.states.report(number, done)
+        (number, deceleration), seen = self._owed, self._exchange.seen
+        if Seen.FAULTY not in seen:
+            done = self._do(lambda: session.motion.stop(deceleration))
+            self._exchange.report(number, done)
             if done:
                 self._owed = None
             return
-        session.states.report(number, True)  # nothing runs that could be stopped
-        if session.states.revived:
+        self._exchange.report(number, True)  # nothing runs that could be stopped
+        if Seen.REVIVED in seen and self._do(lambda: session.motion.stop(deceleration)):
             # a program that went on, or began, without us finds the old velocity in its register
-            with contextlib.suppress(Exception):
-                if session.motion.execute("stop", [deceleration]):
-                    self._owed = None
+            self._owed = None
 
     def _keep_alive(self, session: Session) -> None:
         """Keep the watchdog quiet while nothing moves or the owner lives."""
         config, motion = session.config, session.motion
-        _note_moving(session)
-        if session.faulty and self._owed is None and motion.commanded:
+        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
+        if faulty and self._owed is None and motion.commanded:
             # what was under way is not to go on, should the program do so
             motion.rest(config.max_acceleration_m_s2)
             self._owed = 0, config.max_acceleration_m_s2
         self._pay(session)
-        fresh = self._exchange.silence_s() < config.owner_timeout_s
-        if not fresh and motion.commanded:
+        if self._clock is not None:
+            if not self._led:
+                self._follow_time(session)
             return
-        if time.monotonic() - self._fed_s > 1.0 / (3 * config.watchdog_hz):
-            session.feed()
-            self._fed_s = time.monotonic()
+        if motion.commanded and self._exchange.silence_s() > config.owner_timeout_s:
+            return
+        now_ns = time.monotonic_ns()
+        if now_ns - self._fed_ns > 1e9 / (3 * config.watchdog_hz):
+            self._feed(session)
+            self._fed_ns = now_ns
 
-    def _publish(self, states: StateReader) -> NoReturn:
-        """Hand out states; end the process where none comes or the owner is gone."""
-        try:
-            while True:
-                states.poll()
-                if states.silence_s > GIVE_UP_S or not states.connected:
-                    states.lose()
-                    os._exit(EXIT_LINK_LOST)
-                if states.polls % 100 == 0 and self._requests.owner_gone():
-                    # the commands' thread stops the arm, but may itself hang
-                    threading.Timer(0.5, os._exit, (EXIT_ORDERLY,)).start()
-                time.sleep(0.0005)
-        except Exception:
-            traceback.print_exc()
-            os._exit(EXIT_BROKEN)  # without states nothing may go on
+    def _feed(self, session: Session) -> None:
+        """Keep the watchdog quiet, where somebody listens to that."""
+        told_faulty = self._healthy and Seen.FAULTY in self._exchange.seen
+        if not told_faulty and session.listening:
+            with contextlib.suppress(Exception):
+                session.motion.feed()
+
+    def _follow_time(self, session: Session) -> None:
+        """Let simulated time go on from one feeding to the next."""
+        assert self._clock is not None
+        self._clock.refresh()
+        now_ns = self._clock.now_ns()
+        if now_ns >= self._until_ns:
+            self._feed(session)
+            self._fed_ns = now_ns
+            self._until_ns = now_ns + round(1e9 / (3 * session.config.watchdog_hz))
+            self._clock.hold(self._until_ns, Demand.NONE, session.motion.packets)
 
     def _leave(self) -> NoReturn:
         """The owner is gone: stop the arm where that is possible, and end."""
+        threading.Timer(LEAVE_WITHIN_S, os._exit, (EXIT_ORDERLY,)).start()
         session = self._session
-        if session is not None and session.states.healthy:
-            with contextlib.suppress(Exception):
-                session.motion.execute("stop", [session.config.max_acceleration_m_s2])
+        with contextlib.suppress(Exception):
+            if self._clock is not None:
+                self._clock.free(Demand.REAL)
+            if session is not None and session.listening:
+                session.motion.stop(session.config.max_acceleration_m_s2)
                 session.control.stopScript()
         os._exit(EXIT_ORDERLY)  # the library's destructors wait half a second each
-
-
-def _note_moving(session: Session) -> None:
-    """A move whose program has ended is not under way any more."""
-    session.states.note_moving(session.motion.moving and not session.faulty)
 
 
 def main() -> NoReturn:
@@ -193,7 +278,11 @@ def main() -> NoReturn:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the owner decides when to end
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     commands = socket.socket(fileno=int(sys.argv[1]))
-    Client(commands, Exchange(int(sys.argv[2]))).run()
+    try:
+        Client(commands, Exchange(int(sys.argv[2]))).run()
+    except Exception:
+        traceback.print_exc()
+        os._exit(EXIT_BROKEN)
 
 
 if __name__ == "__main__":

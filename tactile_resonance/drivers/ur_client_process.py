@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process in which ur_rtde runs, as its owner sees it: requests, commands, states, and why it is gone."""
+"""The process in which ur_rtde runs, as its owner sees it: requests, commands, and why it is gone."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from importlib.util import find_spec
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, ClientState, Exchange
-from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING
+from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, Command, Exchange
 
 GRACE_S = 1.5
 # Of what ur_rtde 1.6.5 writes when it finds its connection lost.
@@ -28,6 +29,11 @@ class ClientProcess:
     Parameters
     ----------
     config : UrArmConfig
+
+    Attributes
+    ----------
+    exchange : Exchange
+        The page that it shares with this process.
 
     Raises
     ------
@@ -44,8 +50,8 @@ class ClientProcess:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with tempfile.TemporaryFile() as page, theirs:
             page.truncate(SIZE)
-            self._exchange = Exchange(page.fileno())
-            self._exchange.beat()
+            self.exchange = Exchange(page.fileno())
+            self.exchange.beat()
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the client
             self._commands = ours
             self._process = subprocess.Popen(
@@ -68,36 +74,34 @@ class ClientProcess:
         """Of the process."""
         return self._process.pid
 
-    def beat(self) -> None:
-        """Show the client that its owner lives."""
-        self._exchange.beat()
-
-    def state(self) -> ClientState | None:
-        """Newest state, None before the first; a sign of life too. Raises ArmError where the client is gone."""
-        self._exchange.beat()
+    def check(self) -> None:
+        """Raise `ArmError` where the client is gone."""
         if self._process.poll() is not None:
             raise self._death()
-        return self._exchange.read()
 
-    def send(self, command: dict) -> None:
+    def send(self, command: Command) -> None:
         """Send a command and do not wait. Raises ArmError where the client is gone."""
         try:
-            self._commands.send(json.dumps(command).encode(), socket.MSG_DONTWAIT)
+            self._commands.send(command.pack(), socket.MSG_DONTWAIT)
         except OSError as error:
             raise self._death() from error
 
-    def ask(self, request: dict) -> None:
-        """Send a request and wait for its answer. Raises ArmError where it fails: the client is ended then."""
+    def ask(self, request: dict, meanwhile: Callable[[], None]) -> None:
+        """Send a request and wait for its answer; `meanwhile` is called again and again.
+
+        Raises ArmError where it fails: the client is ended then.
+        """
+        deadline = time.monotonic() + self._connect_timeout_s
         try:
             self._commands.send(json.dumps(request).encode())
-            ready, _, _ = select.select([self._commands], [], [], self._connect_timeout_s)
-            data = self._commands.recv(8192) if ready else None
+            while not select.select([self._commands], [], [], 0.02)[0]:
+                meanwhile()
+                if time.monotonic() > deadline:
+                    self._kill()
+                    raise ArmError(ArmFault.LINK_LOST, self._late)
+            data = self._commands.recv(8192)
         except OSError:
             data = b""
-        if data is None:
-            late = self._late(request["name"])
-            self._kill()
-            raise late
         if not data:
             death = self._death()
             self._kill()
@@ -124,21 +128,12 @@ class ClientProcess:
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()
-        for resource in (self._commands, self._exchange, self._errors):
+        for resource in (self._commands, self.exchange, self._errors):
             resource.close()
 
-    def _late(self, request: str) -> ArmError:
-        """Why a request has no answer in time."""
-        text = f"{self._host} is not ready after {self._connect_timeout_s:g} s"
-        client = self._exchange.read()  # while it connects: the state that it found
-        running = client is not None and client.runtime_state == PROGRAM_PLAYING
-        if request == "connect" and running:
-            # the library asks it to end in a register that the program may not read, and waits for ever
-            return ArmError(
-                ArmFault.PROGRAM_NOT_STARTED,
-                f"{text}: another program runs there and does not end; stop it at the robot",
-            )
-        return ArmError(ArmFault.LINK_LOST, text)
+    @property
+    def _late(self) -> str:
+        return f"{self._host} is not ready after {self._connect_timeout_s:g} s"
 
     def _death(self) -> ArmError:
         """Why the client process is gone."""

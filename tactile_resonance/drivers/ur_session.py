@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot made ready: connected over ur_rtde, its program started, TCP, payload and watchdog set.
+"""A robot made ready: ur_rtde connected, its program started, TCP, payload and watchdog set.
 
 Only the client process of `UrArm` imports this: the library may hang, and may abort the process.
 """
@@ -8,23 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import dashboard_client
 import rtde_control
-import rtde_receive
 
+from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import Exchange
 from tactile_resonance.drivers.ur_motion import Motion
-from tactile_resonance.drivers.ur_safety import motion_fault, stop_fault
-from tactile_resonance.drivers.ur_states import VARIABLES, StateReader
 from tactile_resonance.processes import take_priority
 
-RTDE_PORT = 30004
+# The library watches the robot in a thread that wakes for every state; commands need no more than this, and at
+# 500 Hz it takes a sixth of a processor core.
+CONTROL_HZ = 50.0
 # A constructor of the library may hang with Python's lock held; the kernel then ends this process.
 HANG_S = 20
 # From clearing the command register to sending a program that reads it, by another connection.
@@ -32,33 +30,26 @@ CLEARING_S = 0.05
 
 
 class Session:
-    """Connections to one robot; nothing is connected before `open`.
+    """The library's connection to one robot; nothing is connected before `open`.
 
     Parameters
     ----------
     config : UrArmConfig
-    exchange : Exchange
-        Where states go.
-    overtaken : callable
-        Whether a stop has come in the meantime.
+    clock : SimulatedClock or None
+        In simulated time: it goes on while the library waits for the robot.
 
     Attributes
     ----------
     config : UrArmConfig
-    states : StateReader
     control : rtde_control.RTDEControlInterface
     motion : Motion
     """
 
-    states: StateReader
     control: rtde_control.RTDEControlInterface
     motion: Motion
 
-    def __init__(
-        self, config: UrArmConfig, exchange: Exchange, overtaken: Callable[[], bool]
-    ) -> None:
-        self.config = config
-        self._exchange, self._overtaken = exchange, overtaken
+    def __init__(self, config: UrArmConfig, clock: SimulatedClock | None) -> None:
+        self.config, self._clock = config, clock
 
     def open(self) -> None:
         """Connect, start the program, prepare it. Raises `ArmError`, see `UrArm.connect`.
@@ -71,39 +62,17 @@ class Session:
                 take_priority(config.realtime_priority)
             except ValueError as error:
                 raise ArmError(ArmFault.COMMAND_REFUSED, f"realtime_{error}") from error
-        round_trip_s = _round_trip_s(config.host)
+        self._check_remote()
         with _bounded():
             try:
-                receive = rtde_receive.RTDEReceiveInterface(config.host, config.rate_hz, VARIABLES)
-            except Exception as error:
-                raise ArmError(ArmFault.LINK_LOST, f"{config.host}: {error}") from error
-        self.states = StateReader(receive, self._exchange, round_trip_s)
-        self.states.wait_for_first()
-        self._check_modes()
-        with _bounded():
-            try:
-                self.control = rtde_control.RTDEControlInterface(config.host, config.rate_hz)
+                self.control = rtde_control.RTDEControlInterface(config.host, CONTROL_HZ)
             except Exception as error:
                 raise _named(config.host, error) from error
-        self.states.watch(self.control)
-        self.motion = Motion(self.control, self._overtaken)
         self._prepare()
-
-    @property
-    def faulty(self) -> bool:
-        """Whether the newest state forbids motion."""
-        state = self.states.state()
-        return motion_fault(state.safety_bits, state.robot_mode, state.runtime_state) is not None
-
-    @property
-    def listening(self) -> bool:
-        """Whether the program would take a command: the library waits for one that does not."""
-        return self.states.healthy and not self.faulty
 
     def restart(self) -> None:
         """Upload the program again, after a stop has been released. Raises `ArmError`."""
-        self._check_modes()
-        self.states.unguard()
+        self._check_remote()
         # the velocity of the moment when the program ended still stands in the command register, and a
         # new program would follow it; what the library does not send to a stopped program clears it
         self.control.kickWatchdog()
@@ -117,21 +86,13 @@ class Session:
                     ArmFault.PROGRAM_NOT_STARTED, "the program was sent again and does not run"
                 )
             time.sleep(0.01)
-        self.motion = Motion(self.control, self._overtaken)
         self._prepare()
-        self.guard()
 
-    def guard(self) -> None:
-        """From now on no program but the one that runs counts as ours. Raises `ArmError`."""
-        if not self.states.guard():
-            raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program ended as soon as it ran")
-        # its watchdog counts since it was set, and no state told until now that it listens
-        self.feed()
-
-    def feed(self) -> None:
-        """Keep the robot's watchdog quiet, where it listens."""
-        if self.listening:  # never a command on a dead link
-            self.motion.feed()
+    @property
+    def listening(self) -> bool:
+        """Whether the program would take a command, as far as the library knows."""
+        control = self.control
+        return control.isConnected() and control.isProgramRunning()
 
     def _prepare(self) -> None:
         """Set TCP, payload and watchdog, and see that they were taken."""
@@ -148,14 +109,26 @@ class Session:
             config.payload_kg, list(config.payload_cog_m)
         ):
             raise ArmError(ArmFault.COMMAND_REFUSED, f"setPayload {config.payload_kg} was refused")
+        self._settle()
+        self._limit_time()
         if not control.setWatchdog(config.watchdog_hz):
             raise ArmError(ArmFault.COMMAND_REFUSED, "setWatchdog was refused")
+        self._limit_time()
+        self.motion = Motion(control)
+        self.motion.feed()
 
-    def _check_modes(self) -> None:
-        state = self.states.state()
-        problem = stop_fault(state.safety_bits, state.robot_mode)
-        if problem is not None:
-            raise ArmError(*problem)
+    def _settle(self) -> None:
+        """In simulated time: let the library see that the program is ready for the next command."""
+        if self._clock is not None:
+            self._clock.wait_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ), Demand.REAL)
+
+    def _limit_time(self) -> None:
+        """A watchdog counts as soon as it is set: simulated time waits for the library before it expires."""
+        if self._clock is not None:
+            limit_ns = self._clock.ask_ns() + round(0.75e9 / self.config.watchdog_hz)
+            self._clock.hold(limit_ns, Demand.REAL)
+
+    def _check_remote(self) -> None:
         config = self.config
         if not config.check_dashboard:
             return
@@ -175,22 +148,6 @@ class Session:
                 ArmFault.NOT_REMOTE,
                 f"{config.host} is not in remote control: switch it on the pendant",
             )
-
-
-def _round_trip_s(host: str) -> float:
-    """Least time of three TCP connections [s]."""
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        try:
-            socket.create_connection((host, RTDE_PORT), timeout=2.0).close()
-        except (OSError, ValueError) as error:  # ValueError: what no name or address can be
-            reason = getattr(error, "strerror", None) or error
-            raise ArmError(
-                ArmFault.LINK_LOST, f"no robot answers at {host}, port {RTDE_PORT}: {reason}"
-            ) from error
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated time as a control loop leads it, one period after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tactile_resonance.clock import Demand
+from tactile_resonance.contact.interfaces import Cell
+from tactile_resonance.drivers.can_wrench import CanWrench
+from tactile_resonance.drivers.ur_arm import UrArm
+
+
+class LedClock:
+    """A `Clock` that goes on as the loop says, with whom arm and cell have delivered what they have.
+
+    Parameters
+    ----------
+    arm : UrArm
+        Connected; closing this clock leaves its time to itself again.
+    cell : Cell
+    while_waiting : callable
+        Called every tenth of a second of this machine's time while simulated time stands; what it raises ends
+        the wait.
+    """
+
+    simulated = True
+
+    def __init__(self, arm: UrArm, cell: Cell, while_waiting: Callable[[], None]) -> None:
+        self._arm, self._while_waiting = arm, while_waiting
+        self._cell = cell if isinstance(cell, CanWrench) else None
+        arm.lead(self._bus_port)
+        if self._cell is not None:
+            self._cell.clock = arm.clock
+
+    def now_ns(self) -> int:
+        """Time now [ns]."""
+        return self._arm.clock.now_ns()
+
+    def ros_ns(self, time_ns: int) -> int:
+        """The same: simulated time is ROS time."""
+        return time_ns
+
+    def own_ns(self, ros_ns: int) -> int:
+        """The same."""
+        return ros_ns
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Let time go on to a time, and wait for what the robot and the cell have sent until then."""
+        self._arm.wait_until(time_ns, demand, self._while_waiting)
+        if self._cell is not None:
+            self._cell.catch_up(self._arm.frames)
+
+    def hurry(self) -> None:
+        """End a wait in which nothing needed time: something does now. From any thread."""
+        self._arm.hurry()
+
+    def close(self) -> None:
+        """Leave the time to itself."""
+        self._arm.follow()
+
+    def _bus_port(self) -> int:
+        return 0 if self._cell is None else self._cell.local_port
