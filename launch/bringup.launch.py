@@ -11,7 +11,8 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
-from tactile_resonance.simulation.plant_defaults import HOST, PATIENT, TABLE_IN_BASE
+from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.simulation.plant_defaults import HOST, TABLE_IN_BASE
 
 PACKAGE = "tactile_resonance"
 STREAM = ("excitation_node", "frf_node", "poles_node")
@@ -35,9 +36,10 @@ def generate_launch_description():
         DeclareLaunchArgument(
             "robot",
             default_value="true",
-            choices=["true", "false"],
-            description="Whether a robot brings the tip to the tissue; otherwise the tip is taken to be "
-            "where tcp_pose says.",
+            choices=["true", "ideal", "false"],
+            description="true: a robot brings the tip to the tissue. ideal: with use_mock_hardware, contact is "
+            "ideal and costs nothing, behind the same actions and topics. false: the tip is taken to be where "
+            "tcp_pose says.",
         ),
         DeclareLaunchArgument(
             "robot_ip",
@@ -66,11 +68,11 @@ def generate_launch_description():
             description="Folder that receives the runs; empty: tactile_resonance/runs in $ROS_HOME.",
         ),
         DeclareLaunchArgument(
-            "patient",
+            "real_time",
             default_value="false",
             choices=["true", "false"],
-            description="Simulated robot and load cell only: their data may be 60 ms old, for a machine "
-            "without real-time priority or with much else to do.",
+            description="With use_mock_hardware: on the wall clock, for tests of load and limits. Otherwise in "
+            "simulated time (/clock, use_sim_time), in which a slow machine takes longer and nothing else.",
         ),
         DeclareLaunchArgument(
             "static_transforms",
@@ -112,38 +114,46 @@ def _nodes(context):
     def given(name):
         return LaunchConfiguration(name).perform(context)
 
-    mock, robot = given("use_mock_hardware") == "true", given("robot") == "true"
-    patient = given("patient") == "true"
-    if patient and not mock:
-        raise ValueError("patient:=true is for use_mock_hardware:=true: never for a robot")
-    if patient and given("force_config") != "can_simulated.yaml":
-        raise ValueError("patient:=true brings a force_config of its own, another was given")
+    mock, robot = given("use_mock_hardware") == "true", given("robot")
+    if robot == "ideal" and not mock:
+        raise ValueError("robot:=ideal is for use_mock_hardware:=true: there is no robot behind it")
+    simulated_time = mock and given("real_time") == "false"
     host = given("robot_ip") or (HOST if mock else "")
     simulated_cell = host if mock and given("force_config") == "can_simulated.yaml" else ""
+    time_server = {"time_server": f"{host}:{TIME_PORT}" if simulated_time else ""}
     own = {
         "fake_hardware_node": {
             "scene": given("scene"),
-            "robot_host": host if robot else "",
+            "robot_host": host if robot == "true" else "",
+            "serve_contact": robot == "ideal",
             "table_in_base": TABLE_IN_BASE,
+            "base_frame": given("base_frame"),
+            **time_server,
+        },
+        "excitation_node": {
+            # without robot and bench nobody measures the force
+            "contact_source": "force_over" if mock or robot == "true" else "tcp_pose",
+            **time_server,
         },
         "contact_node": {
             "robot_host": host,
             "base_frame": given("base_frame"),
             "force_config": given("force_config"),
             "force_host": simulated_cell,
-            **(PATIENT if patient else {}),
+            **time_server,
         },
         "scan_node": {
-            "contact": "robot" if robot else "none",
+            "contact": "none" if robot == "false" else "robot",
             "run_folder": given("run_folder"),
             "base_frame": given("base_frame"),
-            **({"table_in_base": TABLE_IN_BASE} if mock and robot else {}),
+            **({"table_in_base": TABLE_IN_BASE} if mock and robot != "false" else {}),
+            **time_server,
         },
     }
     names = [
         *(["fake_hardware_node"] if mock else []),
         *STREAM,
-        *(["contact_node"] if robot else []),
+        *(["contact_node"] if robot == "true" else []),
         *("pole_map_node", "scan_node"),
     ]
     own["manager_node"] = {"nodes": names}
@@ -153,7 +163,12 @@ def _nodes(context):
             executable=name,
             name=name,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("params_file"), own.get(name, {})],
+            parameters=[
+                LaunchConfiguration("params_file"),
+                {"use_sim_time": simulated_time, **own.get(name, {})},
+            ],
+            # a clock of its own for each namespace: two benches do not share their time
+            remappings=[("/clock", "clock")],
             output="screen",
             respawn=True,  # the manager brings up again what was started anew
             respawn_delay=1.0,
@@ -161,7 +176,7 @@ def _nodes(context):
         for name in [*names, "manager_node"]
     ]
     wanted = []
-    if mock and robot and given("static_transforms") == "true":
+    if mock and robot != "false" and given("static_transforms") == "true":
         wanted.append(_table_in_base(given("base_frame"), given("table_frame")))
     if given("rviz") == "true":
         view = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "pole_map.rviz"])
@@ -171,6 +186,8 @@ def _nodes(context):
                 executable="rviz2",
                 namespace=LaunchConfiguration("namespace"),
                 arguments=["-d", view],
+                parameters=[{"use_sim_time": simulated_time}],
+                remappings=[("/clock", "clock")],
             )
         )
     for node in wanted:

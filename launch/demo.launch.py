@@ -38,19 +38,13 @@ def generate_launch_description():
             default_value="",
             description="Of the session, as YAML: {temperature_c: 21.5, tip_wetness: wet, adhesion: none}.",
         ),
-        DeclareLaunchArgument(
-            "patient",
-            default_value="true",
-            choices=["true", "false"],
-            description="Data of the simulated robot and load cell may be 60 ms old instead of 20 and 10.",
-        ),
     ]
     # whatever else bring-up can be told goes through to it: namespace, robot_ip, rviz, record ...
     bringup = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "bringup.launch.py"])),
         launch_arguments={
             "use_mock_hardware": "true",
-            **{name: LaunchConfiguration(name) for name in ("scene", "patient")},
+            "scene": LaunchConfiguration("scene"),
         }.items(),
     )
     goal = Node(

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a surgery stack takes in two sensors: bring-up twice, in two namespaces, a topic remapped.
 
-Copy it into the stack. Here both sensors are simulated, each with a robot of its own, which takes 1.2 processor
-cores with its control loop: on a machine with fewer than four add robot:=false.
+Copy it into the stack. Here both sensors are simulated, each with a robot of its own in a time of its own.
 """
 
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
@@ -24,14 +23,6 @@ def generate_launch_description():
     """
     arguments = [
         DeclareLaunchArgument(
-            "patient",
-            default_value="true",
-            choices=["true", "false"],
-            description="Data of simulated robots and load cells may be 60 ms old; false for hardware.",
-        ),
-    ]
-    arguments += [
-        DeclareLaunchArgument(
             f"{name}_robot_ip", default_value=ip, description=f"Address of the {name} robot."
         )
         for name, ip in SENSORS.items()
@@ -49,7 +40,6 @@ def _sensor(name):
                 PythonLaunchDescriptionSource(bringup),
                 launch_arguments={
                     "namespace": name,
-                    "patient": LaunchConfiguration("patient"),
                     "robot_ip": LaunchConfiguration(f"{name}_robot_ip"),
                     "table_frame": f"{name}_table",
                     "base_frame": f"{name}_base",

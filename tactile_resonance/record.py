@@ -63,8 +63,8 @@ class Contact:
     Attributes
     ----------
     force_n, force_std_n : float
-        Normal force on the tissue, positive in compression, and its standard deviation [N]; NaN where
-        unknown.
+        Mean normal force on the tissue over what it belongs to, positive in compression, and the standard
+        deviation of that mean [N]; NaN where unknown.
     position_m : (3,) tuple or None
         Position of the tip; None where unknown.
     orientation_xyzw : (4,) tuple
@@ -72,7 +72,11 @@ class Contact:
     frame_id : str
         Frame of position and orientation.
     time_ns : int
-        When the pose was taken (UNIX time) [ns].
+        When the pose was taken (ROS time) [ns].
+    coverage : float
+        Fraction of that time in which forces were measured.
+    reason : str
+        Why the force is unknown; empty where it is known.
     """
 
     force_n: float = float("nan")
@@ -81,6 +85,8 @@ class Contact:
     orientation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     frame_id: str = ""
     time_ns: int = 0
+    coverage: float = 0.0
+    reason: str = ""
 
 
 @dataclass(frozen=True)

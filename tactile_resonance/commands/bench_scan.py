@@ -13,14 +13,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import (
-    HOST,
-    PATIENT,
-    PATIENT_S,
-    PRIORITY,
-    TABLE_IN_BASE,
-)
+from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, TABLE_IN_BASE
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
@@ -29,11 +24,12 @@ NODES = (
     *("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),
     *("contact_node", "pole_map_node", "scan_node"),
 )
-# Without real-time priority what computes gives way to what lives by milliseconds: the simulated robot and
-# the control loop.
+# On the wall clock, without real-time priority, what computes gives way to what lives by milliseconds: the
+# simulated robot and the control loop.
 COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
 NICENESS = 10
-START_WITHIN_S = 90.0
+START_WITHIN_S = 300.0  # they come up in seconds; a machine with much else to do takes longer
+INTERRUPTED = 130
 SCAN_WITHIN_S = 24 * 3600.0
 
 
@@ -48,8 +44,8 @@ class Job:
         127.x.y.z of the simulated robot.
     seed : int
     resume : bool
-    hardware_limits : bool
-        Data may be no older than is accepted of hardware.
+    real_time : bool
+        On the wall clock; else in simulated time, as fast as this machine computes.
     notes : str
         Of the session, in place of the scene's.
     """
@@ -59,7 +55,7 @@ class Job:
     host: str
     seed: int = 1
     resume: bool = False
-    hardware_limits: bool = False
+    real_time: bool = False
     notes: str = ""
 
 
@@ -71,10 +67,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help=f"127.x.y.z of the simulated robot (default: {HOST})",
     )
     parser.add_argument(
-        "--hardware-limits",
+        "--real-time",
         action="store_true",
-        help="let data of the simulated robot and load cell be no older than is accepted of hardware (20 and "
-        "10 ms, not 60): on an idle machine with real-time priority",
+        help="on the wall clock, as with hardware: what this machine is too slow for is late, and repeated "
+        "(default: simulated time, in which a slow machine takes longer and nothing else)",
     )
 
 
@@ -106,7 +102,7 @@ def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
         folder.resolve(),
         options.robot_host,
         options.seed,
-        hardware_limits=options.hardware_limits,
+        real_time=options.real_time,
         notes=_checked_notes(options.notes),
     )
 
@@ -133,61 +129,82 @@ def run_job(job: Job) -> int:
     content = read_scan_scene(job.scene)  # what is wrong in it is said before anything is started
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # both end the nodes in order, even where a shell made this process ignore Ctrl-C
-        signal.signal(number, signal.default_int_handler)
+    ended = _Ended()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
-        f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}"
+        f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
+        flush=True,
     )
     priority = may_take_priority(PRIORITY)
-    if not priority:
+    if job.real_time and not priority:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
-    if not job.hardware_limits:
-        print(
-            f"data of the simulated robot and load cell may be {1e3 * PATIENT_S:g} ms old, "
-            "more than is accepted of hardware (--hardware-limits)"
-        )
     work = job.output.with_name(job.output.name + ".work")
     parameters = _parameters(job, bool(content.tissue_classes), work)
+    computing = () if priority or not job.real_time else COMPUTING
     with NodeProcesses(work / "log") as nodes:
-        nodes.bring_up(
-            NODES, parameters, niceness=dict.fromkeys(() if priority else COMPUTING, NICENESS)
-        )
+        nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
         try:
-            result = _scan(nodes, job)
+            result = _scan(nodes, job, ended)
         except RuntimeError as error:
             raise ValueError(f"{error} (logs in {work / 'log'})") from error
+    ended.check()
+    ended.at_once()  # every file of a report is whole or not there
     report.run(argparse.Namespace(run_folder=job.output))
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
     return 0 if result.outcome == type(result).COMPLETE else 1
 
 
+class _Ended:
+    """Whether somebody has asked this process to end: noted, and heeded where nothing is cut in two.
+
+    Both signals end the nodes in order, even where a shell made this process ignore Ctrl-C.
+    """
+
+    def __init__(self) -> None:
+        self._asked = self._at_once = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def check(self) -> None:
+        """Raise `KeyboardInterrupt` where it was asked for."""
+        if self._asked:
+            raise KeyboardInterrupt
+
+    def at_once(self) -> None:
+        """From now on nothing is under way that would have to be ended first."""
+        self._at_once = True
+
+    def _note(self, *_: object) -> None:
+        self._asked = True
+        if self._at_once:
+            print("tactile_resonance: interrupted", file=sys.stderr)
+            sys.stdout.flush()
+            os._exit(INTERRUPTED)
+
+
 def _parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
     """Of each node, beside their defaults."""
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
-    return {
+    simulated = not job.real_time
+    time_server = {"time_server": f"{job.host}:{TIME_PORT}" if simulated else "''"}
+    own: dict[str, dict[str, object]] = {
         "fake_hardware_node": {
+            **time_server,
             "scene": job.scene,
             "robot_host": job.host,
             "table_in_base": table,
             "seed": job.seed,
         },
-        "excitation_node": {"record_folder": work / "records"},
-        "contact_node": {
-            "robot_host": job.host,
-            "force_host": job.host,
-            **({} if job.hardware_limits else PATIENT),
-        },
+        "excitation_node": {"record_folder": work / "records", **time_server},
+        "contact_node": {"robot_host": job.host, "force_host": job.host, **time_server},
         "pole_map_node": {"classes_file": job.scene if classes else "''"},
-        "scan_node": {"table_in_base": table},
+        "scan_node": {"table_in_base": table, **time_server},
     }
+    return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}
 
 
-def _scan(nodes: NodeProcesses, job: Job) -> Scan.Result:
+def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> Scan.Result:
     # only here: the command answers --help, and says what is missing, without ROS
-    from tqdm import tqdm
-
     from tactile_resonance.action import Scan
     from tactile_resonance.nodes.scan_client import ScanClient
 
@@ -198,19 +215,15 @@ def _scan(nodes: NodeProcesses, job: Job) -> Scan.Result:
         seed=job.seed,
         notes=job.notes,
     )
-    with ScanClient(nodes.check) as client:
+
+    def check() -> None:
+        ended.check()
+        nodes.check()
+
+    with ScanClient(check) as client:
         client.wait_until_up(START_WITHIN_S)
-        with tqdm(unit="point", file=sys.stderr, leave=False, disable=None) as bar:
-
-            def show(feedback: Scan.Feedback) -> None:
-                bar.total = feedback.points
-                bar.set_description(f"point {feedback.point + 1}: {feedback.phase}", refresh=False)
-                if feedback.repeats:
-                    bar.set_postfix_str(f"{feedback.repeats} repeated", refresh=False)
-                bar.update(feedback.finished - bar.n)
-                bar.refresh()
-
-            result = client.scan(goal, show, SCAN_WITHIN_S)
+        with _Bar() as bar:
+            result = client.scan(goal, bar.show, SCAN_WITHIN_S)
         stalls = client.details("fake_hardware_node").get("simulator stalls")
     if result.outcome == Scan.Result.REFUSED:
         raise ValueError(f"scan: {result.message}")
@@ -221,3 +234,38 @@ def _scan(nodes: NodeProcesses, job: Job) -> Scan.Result:
     if stalls:
         print(f"the simulation itself stood still for more than 10 ms: {stalls} times")
     return result
+
+
+class _Bar:
+    """How far a scan is: a bar on a terminal, a line for each point elsewhere."""
+
+    def __init__(self) -> None:
+        from tqdm import tqdm
+
+        self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None)
+        self._begun_s, self._finished = time.monotonic(), -1
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def show(self, feedback: Scan.Feedback) -> None:
+        """Take what the scan tells."""
+        bar = self._bar
+        if feedback.waiting_for:
+            bar.write(f"waiting for {feedback.waiting_for}", file=sys.stdout)
+        if bar.disable:
+            if feedback.finished != self._finished:
+                self._finished = feedback.finished
+                seconds = time.monotonic() - self._begun_s
+                print(f"{feedback.finished} of {feedback.points} points after {seconds:.0f} s")
+            sys.stdout.flush()
+            return
+        bar.total = feedback.points
+        bar.set_description(f"point {feedback.point + 1}: {feedback.phase}", refresh=False)
+        if feedback.repeats:
+            bar.set_postfix_str(f"{feedback.repeats} repeated", refresh=False)
+        bar.update(feedback.finished - bar.n)
+        bar.refresh()

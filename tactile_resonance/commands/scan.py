@@ -42,5 +42,5 @@ def _resume(options: argparse.Namespace) -> int:
     run = options.output.resolve()
     scene = run / "scene.yaml"
     return run_job(
-        Job(scene, run, options.robot_host, resume=True, hardware_limits=options.hardware_limits)
+        Job(scene, run, options.robot_host, resume=True, real_time=options.real_time)
     )

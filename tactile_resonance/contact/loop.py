@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.goal import Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, ForceError, ForceSource
@@ -23,16 +21,8 @@ STOP_AGAIN_NS = 50_000_000
 """A stop that holds is told again after so long, at least once, and until the arm is seen to rest."""
 
 
-class Clock(Protocol):
-    """The clock of the samples: the machine's, or virtual time."""
-
-    def now_ns(self) -> int:
-        """Time now [ns]."""
-        ...
-
-    def wait_until(self, time_ns: int) -> None:
-        """Return at a time, or at once where it has passed."""
-        ...
+IDLE_PERIODS = 10
+"""While nothing is under way, only every so many periods are run."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +36,6 @@ class Cycle:
     late_s: float
     bias_n: NDArray[np.float64]  # (3,) of the last tare, not taken off the wrenches
     fault: ArmError | ForceError | None  # what a device raised in this cycle
-
-
-class WallClock:
-    """The machine's clock, that of `WrenchSample` and `ArmSample`."""
-
-    def now_ns(self) -> int:
-        """Time now [ns]."""
-        return time.time_ns()
-
-    def wait_until(self, time_ns: int) -> None:
-        """Sleep until a time; at once where it has passed."""
-        left = time_ns - time.time_ns()
-        if left > 0:
-            time.sleep(left * 1e-9)
 
 
 class ContactLoop:
@@ -89,6 +65,7 @@ class ContactLoop:
         self._arm, self._force, self._clock = arm, force, clock
         self._listener = listener
         self._next_ns = clock.now_ns()
+        self._seen: ArmSample | None = None  # the arm, in the newest cycle
         self._refused: ArmError | None = None  # what a command raised, told in the next cycle
         self._stopped_ns: int | None = None
         self._owed: Command | None = None  # a stop of which the arm has not been seen to rest
@@ -96,10 +73,7 @@ class ContactLoop:
 
     def start(self, goal: ContactGoal) -> None:
         """Begin a contact; raises ``ValueError`` where the controller refuses it."""
-        arm = None
-        with contextlib.suppress(ArmError):  # then the first cycle tells it
-            arm = self._arm.state()
-        self.controller.start(goal, self._clock.now_ns(), arm)
+        self.controller.start(goal, self._clock.now_ns(), self._seen)
 
     def make(self, goal: ContactGoal) -> ContactResult:
         """Begin a contact and run until it is reached, or has failed and stands still."""
@@ -127,10 +101,16 @@ class ContactLoop:
         self.wait()
         self.run_period()
 
+    @property
+    def demand(self) -> Demand:
+        """Whether what is under way needs simulated time to pass."""
+        controller = self.controller
+        stays = controller.settled or controller.state is State.HOLD
+        return Demand.NONE if stays else Demand.FAST
+
     def wait(self) -> None:
         """Wait for the next period; requests may be made meanwhile."""
-        # where the clock is set back the next period is not the one that was planned
-        self._clock.wait_until(min(self._next_ns, self._clock.now_ns() + self._period_ns()))
+        self._clock.wait_until(self._next_ns, self.demand)
 
     def run_period(self) -> None:
         """Read both devices, decide, command."""
@@ -138,10 +118,9 @@ class ContactLoop:
         now = self._clock.now_ns()
         late_ns = now - self._next_ns
         self.cycles += 1
-        if abs(late_ns) > period_ns:
-            self.overruns += late_ns > 0
+        if late_ns > period_ns:
+            self.overruns += 1
             self._next_ns = now  # periods that are lost are not made up for
-        self._next_ns += period_ns
         fault: ArmError | ForceError | None = self._refused
         self._refused = None
         arm, wrenches = None, []
@@ -153,6 +132,7 @@ class ContactLoop:
             wrenches = self._force.read()
         except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
+        self._seen = arm
         # the arm keeps a velocity, so a stop is told until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed
         try:
@@ -165,10 +145,11 @@ class ContactLoop:
             )
             self._stopped_ns = None
         else:
-            if self._owed is not None and abs(now - self._owed_ns) > STOP_AGAIN_NS and _rests(arm):
+            if self._owed is not None and now - self._owed_ns > STOP_AGAIN_NS and _rests(arm):
                 self._owed = None
+        state = self.controller.state
+        self._next_ns += period_ns * (IDLE_PERIODS if state is State.IDLE else 1)
         if self._listener is not None:
-            state = self.controller.state
             bias_n = self.controller.bias_n
             self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, bias_n, fault))
 
@@ -182,7 +163,7 @@ class ContactLoop:
             return
         if command.twist is not None:
             self._arm.speed(command.twist, command.acceleration_m_s2)
-        elif self._stopped_ns is None or abs(now - self._stopped_ns) > STOP_AGAIN_NS:
+        elif self._stopped_ns is None or now - self._stopped_ns > STOP_AGAIN_NS:
             self._stopped_ns = now
             self._arm.stop(command.acceleration_m_s2)
 

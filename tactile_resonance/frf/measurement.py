@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,9 @@ from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.streaming import FrfStream
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Origin, Record
+
+LEAST_COVERAGE = 0.8
+"""Of the time of a measurement its force must be known."""
 
 
 class MeasurementFrf:
@@ -55,7 +60,7 @@ class MeasurementFrf:
         self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._first: Record | None = None
         self._last: Record | None = None
-        self._forces_n: list[float] = []
+        self._forces: list[tuple[float, float, float]] = []  # mean, deviation [N], length [s] of each block
         self.saturated = False
 
     def add(self, record: Record, excitation: Excitation) -> FRF:
@@ -127,7 +132,7 @@ class MeasurementFrf:
         return replace(frf, status=status, message=message)
 
     def origin(self) -> Origin:
-        """Where the FRF comes from: middle of the acquisition, last pose, mean force.
+        """Where the FRF comes from: middle of the acquisition, last pose, force over all blocks.
 
         Raises
         ------
@@ -138,10 +143,11 @@ class MeasurementFrf:
             raise ValueError("records: none so far, expected at least 1")
         last = self._last.origin
         end_ns = last.time_ns + round(self._last.duration_s * 1e9)
+        force_n, force_std_n = mean_force(self._forces)
         return replace(
             last,
             time_ns=(self._first.origin.time_ns + end_ns) // 2,
-            contact=replace(last.contact, force_n=float(np.mean(self._forces_n))),
+            contact=replace(last.contact, force_n=force_n, force_std_n=force_std_n),
         )
 
     def _take(self, stream: FrfStream, realisation: int, u: np.ndarray, y: np.ndarray) -> None:
@@ -200,7 +206,8 @@ class MeasurementFrf:
         if self._first is None:
             self._first = record
         self._last = record
-        self._forces_n.append(record.origin.contact.force_n)
+        contact = record.origin.contact
+        self._forces.append((contact.force_n, contact.force_std_n, record.duration_s))
         for channel, name in ((record.actuator, "actuator"), (record.sensor, "sensor")):
             if channel.saturated:
                 self.saturated = True
@@ -209,3 +216,25 @@ class MeasurementFrf:
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
+
+
+def mean_force(blocks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
+    """Mean force over blocks and its standard deviation [N].
+
+    Parameters
+    ----------
+    blocks : sequence of (mean [N], its standard deviation [N], length [s])
+        NaN where unknown; errors of different blocks are independent.
+
+    Returns
+    -------
+    force_n, force_std_n : float
+        NaN where the force of more than a fifth of the time is unknown, or one of the deviations.
+    """
+    known = [block for block in blocks if math.isfinite(block[0])]
+    length_s = sum(block[2] for block in known)
+    if not known or length_s < LEAST_COVERAGE * sum(block[2] for block in blocks):
+        return math.nan, math.nan
+    mean_n = sum(force * seconds for force, _, seconds in known) / length_s
+    variance = sum((std * seconds) ** 2 for _, std, seconds in known)
+    return mean_n, math.sqrt(variance) / length_s

@@ -6,8 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rclpy.node import Node
-
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -17,6 +15,7 @@ from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.fields import require
+from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.processes import may_take_priority, take_priority
@@ -80,10 +79,18 @@ PARAMETERS = (
     ),
 )
 
+SIMULATED_S = 60.0
+"""For a connection to a simulated robot in simulated time, by the machine's clock."""
 
-def take_realtime(node: Node) -> int:
-    """Priority that this thread, and those it starts, has from now on; 0 where it is not permitted."""
+
+def take_realtime(node: ManagedNode) -> int:
+    """Priority that this thread, and those it starts, has from now on; 0 where it is not permitted.
+
+    In simulated time nothing is late, and none is taken.
+    """
     (priority,) = values(node, "realtime_priority")
+    if node.time_server:
+        return 0
     if priority and may_take_priority(priority):
         take_priority(priority)
         return priority
@@ -95,11 +102,15 @@ def take_realtime(node: Node) -> int:
     return 0
 
 
-def make_arm(node: Node, priority: int) -> UrArm:
+def make_arm(node: ManagedNode, priority: int) -> UrArm:
     """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
     name, host = values(node, "robot_config", "robot_host")
     config = read_ur_config(_path(name))
     config = replace(config, host=host or config.host)
+    if node.time_server:
+        # it costs nothing there, and what a slow machine needs to connect is no fault
+        config = replace(config, connect_timeout_s=max(config.connect_timeout_s, SIMULATED_S))
+        return UrArm(replace(config, realtime_priority=0), node.time_server)
     return UrArm(replace(config, realtime_priority=config.realtime_priority or priority))
 
 
@@ -121,7 +132,7 @@ def require_arm_allows(config: UrArmConfig, parameters: ContactParameters, limit
         require(value <= most, name, value, f"at most {field} = {most:g} of robot_config")
 
 
-def make_force_source(node: Node, arm: UrArm) -> TipForce:
+def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
     """The force source that the parameters name, not started yet; ValueError where they are wrong."""
     name, host = values(node, "force_config", "force_host")
     config = read_force_config(Path(name).expanduser())
@@ -129,9 +140,12 @@ def make_force_source(node: Node, arm: UrArm) -> TipForce:
         if config.can is None:
             raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")
         config = replace(config, can=replace(config.can, bus={**config.can.bus, "host": host}))
+    if config.kind == "topic" and node.time_server:
+        raise ValueError(f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN")
     return force_source(
         config,
         arm.state,
+        clock=arm.clock,
         arm_clock_std_s=lambda: arm.clock_uncertainty_s,
         topic=lambda asked: TopicWrench(node, asked),
     )

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Sequence
 
 from rcl_interfaces.msg import SetParametersResult
@@ -27,20 +26,23 @@ from tactile_resonance.nodes.contact_messages import contact_goal, feedback_mess
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.force_service import ForceService
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
+    TIME_SERVER,
     Parameter(
-        "publish_every",
-        5,
-        "Pose, wrench and state are published every so many cycles of the loop; the wrench is the mean since "
-        "the last one.",
-        1,
-        500,
+        "publish_rate_hz",
+        50.0,
+        "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench is "
+        "the mean since the last one.",
+        1.0,
+        500.0,
+        read_only=True,
     ),
     Parameter(
         "touch_from_poles",
@@ -85,9 +87,10 @@ class ContactNode(ManagedNode):
 
     def configure(self) -> None:
         """Connect arm and force source."""
-        frame_id, self._base_frame = values(self, "frame_id", "base_frame")
-        (every,) = values(self, "publish_every")
-        self._topics = ContactTopics(self, frame_id, self._base_frame, every)
+        names = ("frame_id", "base_frame", "publish_rate_hz")
+        frame_id, self._base_frame, rate_hz = values(self, *names)
+        self._topics = ContactTopics(self, frame_id, self._base_frame, rate_hz)
+        self._forces = ForceService(self, self._base_frame)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings, self._limits = self._read_parameters()
@@ -102,7 +105,11 @@ class ContactNode(ManagedNode):
         self._fault: ArmError | ForceError | None = None
         self._dead = self._polls = 0
         from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
-        self._touch = TouchFromPoles(false_alarm, self._tell_touch) if from_poles else None
+        clock = self._arm.clock
+        began_ns = clock.ros_ns(clock.now_ns())
+        self._touch = None
+        if from_poles:
+            self._touch = TouchFromPoles(false_alarm, self._tell_touch, began_ns)
         if from_poles:
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
@@ -123,7 +130,13 @@ class ContactNode(ManagedNode):
         gc.collect()
         gc.freeze()
         self._thread = ContactThread(
-            self._arm, self._force, self._settings, self._limits, self._tip, self._on_cycle
+            self._arm,
+            self._force,
+            self._settings,
+            self._limits,
+            self._tip,
+            self._on_cycle,
+            bool(self.time_server),
         )
 
     def deactivate(self) -> None:
@@ -132,6 +145,14 @@ class ContactNode(ManagedNode):
             self._thread.close()
             self._finish(self._thread.controller.result)
             self._thread = None
+
+    def working(self) -> bool:
+        """The loop moves on, where there is one."""
+        return self._thread is None or self._thread.alive
+
+    def waiting_for(self) -> str:
+        """What keeps simulated time from going on."""
+        return "" if self._thread is None else self._thread.waits_for
 
     def details(self) -> dict[str, str]:
         """Loop and devices."""
@@ -230,6 +251,8 @@ class ContactNode(ManagedNode):
         thread = self._thread
         if thread is None:
             return
+        self._topics.say_again()
+        self._forces.answer(thread.clock)
         if thread.error is not None:
             self._finish(None)
             self.fail(f"control loop ended: {thread.error!r}")
@@ -264,8 +287,9 @@ class ContactNode(ManagedNode):
         thread = self._thread
         if thread is None:
             return
+        now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
-            if self._touch.hear(message, thread.controller.state, time.time_ns()):
+            if self._touch.hear(message, thread.controller.state, now_ns):
                 self.get_logger().info("the resonance tells the first contact")
         except ValueError as error:
             self.health.error(f"poles: {error}")
@@ -275,9 +299,13 @@ class ContactNode(ManagedNode):
     def _on_cycle(self, cycle: Cycle) -> None:
         self._dead = self._dead + 1 if cycle.fault is not None else 0
         self._fault = cycle.fault
+        thread = self._thread
+        if thread is None:  # it is being made
+            return
         if self._touch is not None:
-            self._touch.moved(cycle.state, cycle.time_ns)
-        self._topics.take(cycle, self._thread)
+            self._touch.moved(cycle.state, thread.clock.ros_ns(cycle.time_ns))
+        self._forces.take(cycle, thread.controller)
+        self._topics.take(cycle, thread)
 
 
 def main() -> None:

@@ -8,16 +8,25 @@ import threading
 import time
 from collections.abc import Callable
 
+from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import Arm, ForceSource
-from tactile_resonance.contact.loop import ContactLoop, Cycle, WallClock
+from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.drivers.led_clock import LedClock
+from tactile_resonance.drivers.ur_arm import UrArm
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0
 POLL_S = 0.01
+# A loop of which nothing was seen for so long hangs.
+HUNG_S = 1.0
+
+
+class _EndedError(Exception):
+    """The loop is to end."""
 
 
 class ContactThread:
@@ -25,31 +34,52 @@ class ContactThread:
 
     Parameters
     ----------
-    arm, force : Arm, ForceSource
+    arm, force : UrArm, TipForce
         Connected and started.
     parameters, limits : ContactParameters, Limits
     tip : TipGeometry
     listener : callable
         Called with each cycle in the loop's thread; must return at once.
+    simulated : bool
+        The loop lives in simulated time and leads it; else on this machine's clock.
+
+    Attributes
+    ----------
+    clock : Clock
+        On which it dates what it sees.
     """
 
     def __init__(
         self,
-        arm: Arm,
-        force: ForceSource,
+        arm: UrArm,
+        force: TipForce,
         parameters: ContactParameters,
         limits: Limits,
         tip: TipGeometry,
         listener: Callable[[Cycle], None],
+        simulated: bool,
     ) -> None:
         self.controller = ContactController(parameters, limits, tip)
-        self.loop = ContactLoop(arm, force, WallClock(), self.controller, listener)
         self.error: Exception | None = None
         self._arm = arm
         self._lock = threading.Lock()
         self._running = True
+        self._alive_s = time.monotonic()
+        self._led = LedClock(arm, force.cell, self._stay) if simulated else None
+        self.clock: Clock = self._led or arm.clock
+        self.loop = ContactLoop(arm, force, self.clock, self.controller, listener)
         self._thread = threading.Thread(target=self._run, name="contact", daemon=True)
         self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the loop moves on, or waits for simulated time that stands."""
+        return time.monotonic() - self._alive_s < HUNG_S
+
+    @property
+    def waits_for(self) -> str:
+        """What keeps simulated time from going on, for people; empty: nothing of the arm."""
+        return self._arm.waits_for
 
     def configure(self, parameters: ContactParameters, limits: Limits) -> None:
         """Exchange parameters; ``ValueError`` unless idle."""
@@ -61,11 +91,13 @@ class ContactThread:
         with self._lock:
             self.controller.configure(parameters, limits)
             self.loop.start(goal)
+        self._hurry()
 
     def retract(self) -> None:
         """Draw the tip back, beginning with the next cycle."""
         with self._lock:
             self.controller.retract()
+        self._hurry()
 
     def tell_touch(self) -> bool:
         """Pass on that another sensor tells the first contact; whether that is new in an approach."""
@@ -89,14 +121,31 @@ class ContactThread:
         self._running = False
         self._thread.join()
 
+    def _hurry(self) -> None:
+        if self._led is not None:
+            self._led.hurry()
+
+    def _stay(self) -> None:
+        """Called while simulated time stands."""
+        self._alive_s = time.monotonic()
+        if not self._running:
+            raise _EndedError
+
     def _run(self) -> None:
         try:
             while self._running:
                 self.loop.wait()
                 with self._lock:
                     self.loop.run_period()
+                self._alive_s = time.monotonic()
+        except _EndedError:
+            pass
         except Exception as error:
             # nobody judges any more: first of all the arm stops
             with contextlib.suppress(Exception):
                 self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
             self.error = error
+        finally:
+            if self._led is not None:
+                with contextlib.suppress(Exception):
+                    self._led.close()

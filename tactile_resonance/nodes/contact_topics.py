@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import time
+
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
+from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.nodes.contact_messages import pose_message, state_message, wrench_message
@@ -13,9 +16,12 @@ from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import STREAM, RCLError
 
+SAID_AGAIN_S = 0.1
+"""While simulated time stands the state is told again, by this machine's clock."""
+
 
 class ContactTopics:
-    """Publishes every so many cycles, to those who listen.
+    """Publishes so often, and whenever the state changes, to those who listen.
 
     Parameters
     ----------
@@ -23,26 +29,33 @@ class ContactTopics:
         Whose publishers they are, until it is cleaned up.
     frame_id, base_frame : str
         Of the tip, of its poses.
-    every : int
-        Cycles.
+    rate_hz : float
+        By the loop's clock.
     """
 
-    def __init__(self, node: ManagedNode, frame_id: str, base_frame: str, every: int) -> None:
-        self._node, self._every = node, every
+    def __init__(
+        self, node: ManagedNode, frame_id: str, base_frame: str, rate_hz: float
+    ) -> None:
+        self._node, self._period_ns = node, round(1e9 / rate_hz)
         self._frame_id, self._base_frame = frame_id, base_frame
         self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._state = node.publish_on(msg.ContactState, "contact_state", STREAM)
         self._wrenches: list[WrenchSample] = []
-        self._unpublished = 0
+        self._next_ns = 0
+        self._before: State | None = None
+        self._newest: msg.ContactState | None = None
+        self._said_s = 0.0
 
-    def take(self, cycle: Cycle, thread: ContactThread | None) -> None:
-        """Take a cycle, in the loop's thread; `thread` is None while that is being made."""
+    def take(self, cycle: Cycle, thread: ContactThread) -> None:
+        """Take a cycle, in the loop's thread."""
         self._wrenches += cycle.wrenches
-        self._unpublished += 1
-        if self._unpublished < self._every:
+        changed = cycle.state is not self._before
+        if cycle.time_ns < self._next_ns and not changed:
             return
-        self._unpublished = 0
+        self._before = cycle.state
+        # in step with the clock, without making up for what a late loop has missed
+        self._next_ns = max(self._next_ns, cycle.time_ns - self._period_ns) + self._period_ns
         wrenches, self._wrenches = self._wrenches, []
         try:
             self._publish(wrenches, cycle, thread)
@@ -51,20 +64,27 @@ class ContactTopics:
             if self._node.context.ok():
                 raise
 
-    def _publish(
-        self, wrenches: list[WrenchSample], cycle: Cycle, thread: ContactThread | None
-    ) -> None:
-        if cycle.arm is not None and self._pose.get_subscription_count():
-            self._pose.publish(pose_message(cycle, self._base_frame))
-        if wrenches and self._wrench.get_subscription_count():
-            self._wrench.publish(wrench_message(wrenches, cycle, self._frame_id))
-        if self._state.get_subscription_count():
-            self._state.publish(self._state_message(cycle, thread))
+    def say_again(self) -> None:
+        """Tell the newest state to those who missed it, where nothing new was told for a while."""
+        if self._newest is not None and time.monotonic() - self._said_s > SAID_AGAIN_S:
+            self._say(self._newest)
 
-    def _state_message(self, cycle: Cycle, thread: ContactThread | None) -> msg.ContactState:
-        if thread is None:
-            return state_message(cycle, None, None, self._frame_id)
+    def _publish(
+        self, wrenches: list[WrenchSample], cycle: Cycle, thread: ContactThread
+    ) -> None:
+        ros_ns = thread.clock.ros_ns
+        if cycle.arm is not None and self._pose.get_subscription_count():
+            self._pose.publish(pose_message(cycle.arm, ros_ns, self._base_frame))
+        if wrenches and self._wrench.get_subscription_count():
+            self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
-        state = state_message(cycle, controller.estimate, controller.result, self._frame_id)
+        state = state_message(
+            cycle, ros_ns, controller.estimate, controller.result, self._frame_id
+        )
         state.cycles, state.overruns = loop.cycles, loop.overruns
-        return state
+        self._say(state)
+
+    def _say(self, state: msg.ContactState) -> None:
+        self._newest, self._said_s = state, time.monotonic()
+        if self._state.get_subscription_count():
+            self._state.publish(state)

@@ -96,6 +96,8 @@ def record_to_message(record: Record) -> msg.Record:
         else:
             _fill(getattr(message, f"{name}_v"), channel.samples, float)
     _write_origin(message, record.origin)
+    message.contact_coverage = float(record.origin.contact.coverage)
+    message.contact_reason = record.origin.contact.reason
     return message
 
 

@@ -8,13 +8,12 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from rclpy.node import Node
-
 from tactile_resonance.drivers.acquisition import AcquisitionDevice
 from tactile_resonance.drivers.nidaq import NiDaqDevice
 from tactile_resonance.drivers.nidaq_config import read_nidaq_config
 from tactile_resonance.drivers.replay import MeasurementSource, ReplayDevice
 from tactile_resonance.nodes.bench_device import BenchDevice
+from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.recording.store import RecordStore
 
@@ -53,7 +52,7 @@ PARAMETERS = (
 )
 
 
-def make_device(node: Node) -> AcquisitionDevice:
+def make_device(node: ManagedNode) -> AcquisitionDevice:
     """The device that the node's parameters name.
 
     Raises

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from tactile_resonance.nodes.running import STEADY
+
 PERIOD_S = 1.0
 # How long after an error a node still warns of it.
 ERROR_REMEMBERED_S = 10.0
@@ -53,7 +55,7 @@ class Health:
         self._error_s = float("-inf")
         self._reported_s = time.monotonic()
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(PERIOD_S, self._publish)
+        node.create_timer(PERIOD_S, self._publish, clock=STEADY)
 
     def saw(self, topic: str) -> None:
         """Count one message of a topic."""

@@ -7,41 +7,35 @@ import threading
 import time
 from dataclasses import replace
 
-import numpy as np
-from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.contact.force_history import ForceHistory
 from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes import devices, excitation_design
-from tactile_resonance.nodes.conversions import (
-    contact_from_message,
-    excitation_to_message,
-    record_to_message,
-    time_from_message,
-)
+from tactile_resonance.nodes import contact_source, devices, excitation_design
+from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
 from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, STREAM, run_node
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
 PARAMETERS = (
     *excitation_design.PARAMETERS,
     *devices.PARAMETERS,
+    contact_source.PARAMETER,
+    TIME_SERVER,
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
 
 
 # How long a client may take to fetch a result.
 RESULT_TIMEOUT_S = 900
-# A stream of forces that is late for a block: less than what a device's buffer holds.
-LATE_FORCES_S = 2.0
+# A device that is read shows life within this beyond the length of a block.
+HUNG_S = 2.0
 
 
 class NotReady(DeviceError):
@@ -55,9 +49,9 @@ class Cancelled(Exception):
 class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched) and `record`.
 
-    Every record is on disk before it is published. Records carry the tip pose heard last on
-    `tcp_pose` and the mean of `wrench` over the block, where the device is no replay. The device is
-    read in a thread of its own, so that its blocking calls never hold up the executor.
+    Every record is on disk before it is published. Records carry the place of the tip and the mean force
+    over the block, where the device is no replay; they never wait long for it. The device is read in a
+    thread of its own, so that its blocking calls never hold up the executor.
     """
 
     def __init__(self) -> None:
@@ -73,14 +67,12 @@ class ExcitationNode(ManagedNode):
         self.resources.callback(self._device.close)
         self._store: RecordStore | None = None
         self._has_store = False
-        self._pose = PoseStamped()
-        self._forces = ForceHistory()
+        self._contact = contact_source.make_contact_source(self)
         self._busy = threading.Lock()
         self._cancelled = threading.Event()
         self._measured: ServerGoalHandle | None = None
         self._measurements = 0
-        self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.listen(WrenchStamped, "wrench", self._on_wrench, SERIES)
+        self._read_by_s = float("inf")  # when a device that is read must have shown life
         server = ActionServer(
             self,
             Measure,
@@ -102,12 +94,9 @@ class ExcitationNode(ManagedNode):
             self._device.interrupt()
         return CancelResponse.ACCEPT
 
-    def _on_pose(self, message: PoseStamped) -> None:
-        self._pose = message
-
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        # +z is the outward surface normal: what the tissue does to the tip points along it
-        self._forces.add(time_from_message(message.header.stamp), message.wrench.force.z)
+    def working(self) -> bool:
+        """A device that does not come back from a block hangs."""
+        return time.monotonic() < getattr(self, "_read_by_s", float("inf"))
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
@@ -204,13 +193,13 @@ class ExcitationNode(ManagedNode):
         (timeout_s,) = values(self, "block_timeout_s")
         if store is not None:
             store.add_excitation(excitation)
-        self._excitations.publish(excitation_to_message(excitation, time.time_ns(), self._frame_id))
+        self._excitations.publish(excitation_to_message(excitation, self.ros_now_ns(), self._frame_id))
         try:
             self._device.arm(excitation)
             self._device.play()
             for _ in range(excitation.periods):
                 try:
-                    block = self._device.read_block(timeout_s)
+                    block = self._read_block(timeout_s)
                 except DeviceError as error:
                     if self._cancelled.is_set():
                         raise Cancelled from error
@@ -229,6 +218,15 @@ class ExcitationNode(ManagedNode):
                     raise DeviceError("device: stopped, the node was deactivated")
         finally:
             self._device.stop()
+
+    def _read_block(self, timeout_s: float) -> Block:
+        # in simulated time a block takes as long as it takes
+        if not self.time_server:
+            self._read_by_s = time.monotonic() + timeout_s + HUNG_S
+        try:
+            return self._device.read_block(timeout_s)
+        finally:
+            self._read_by_s = float("inf")
 
     def _record(self, block: Block, excitation: Excitation, info: DeviceInfo) -> Record:
         last_period = block.index == excitation.periods - 1
@@ -252,23 +250,12 @@ class ExcitationNode(ManagedNode):
                 frame_id=info.frame_id or self._frame_id,
                 label=excitation.label,
                 simulated=info.simulated,
-                contact=block.contact or self._contact(block.time_ns, excitation.period_s),
+                contact=block.contact or self._contact_over(block.time_ns, excitation.period_s),
             ),
         )
 
-    def _contact(self, start_ns: int, length_s: float) -> Contact:
-        """Force while the block was taken.
-
-        Where none was heard then: the last one, of unknown accuracy, from a source that tells changes
-        only; one that streams is late, on a busy machine by seconds, and waited for; if it is silent the
-        force is unknown, for the last one may be from before the contact.
-        """
-        end_ns = start_ns + round(length_s * 1e9)
-        self._forces.wait(start_ns, end_ns, LATE_FORCES_S)
-        force_n, std_n = self._forces.mean(start_ns, end_ns)
-        if np.isnan(force_n) and not self._forces.streams:
-            force_n = self._forces.newest()[1]
-        return contact_from_message(self._pose, force_n, std_n)
+    def _contact_over(self, start_ns: int, length_s: float) -> Contact:
+        return self._contact.over(start_ns, start_ns + round(length_s * 1e9))
 
 
 def _reason(error: Exception) -> str:

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
+from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.multisine import Excitation
@@ -27,10 +28,12 @@ from tactile_resonance.nodes.conversions import (
     time_message,
     truth_to_response,
 )
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
+from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
-from tactile_resonance.nodes.running import RESULTS, STREAM, TRUTHS, run_node
+from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, TRUTHS, run_node
 from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
 from tactile_resonance.simulation.bench import SimulatedBench
@@ -41,7 +44,7 @@ from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.truth import truth_of
-from tactile_resonance.srv import Play, Truth
+from tactile_resonance.srv import ForceOver, Play, Truth
 
 PARAMETERS = (
     Parameter(
@@ -54,7 +57,14 @@ PARAMETERS = (
         "robot_host",
         "",
         "Address 127.x.y.z at which a simulated robot with its load cell is started too; the tip is then "
-        "where that robot holds it. Empty: ideal contact wherever tcp_pose says.",
+        "where that robot holds it. Empty: ideal contact.",
+        read_only=True,
+    ),
+    Parameter(
+        "serve_contact",
+        False,
+        "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the tip "
+        "is wherever tcp_pose says.",
         read_only=True,
     ),
     Parameter(
@@ -63,16 +73,16 @@ PARAMETERS = (
         "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
         read_only=True,
     ),
-    Parameter("speed", 1.0, "Signal time over real time; 0: as fast as possible.", 0.0, 1e3),
+    TIME_SERVER,
     Parameter("seed", 1, "Seed of the simulated noise.", 1, 2**62),
     Parameter("noise", True, "Sensor noise."),
     Parameter("quantisation", True, "Converters that count and saturate."),
     Parameter("nonlinearity", False, "The sensor's static nonlinearity."),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
+    Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
 )
 
 
-ACKNOWLEDGED_WITHIN_S = 5.0
 PLANT_CHECK_S = 0.5
 LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
 
@@ -80,40 +90,51 @@ LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not m
 class FakeHardwareNode(ManagedNode):
     """Serves `bench/play`, `bench/stop` and `bench/get_truth`, hands out `bench/block`.
 
-    Without a robot the tip is where `tcp_pose` says, in ideal contact at the scene's force wherever there
-    is tissue; the force comes back on `wrench`. With one the tip is where the robot holds it, and the
-    contact that of the plant as an excitation begins: its force held from then on, the tissue creeping.
-    What the simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it
-    is put somewhere or an excitation begins; of a contact that creeps also with each block.
+    With a robot the tip is where the robot holds it, and the contact that of the plant as an excitation
+    begins: its force held from then on, the tissue creeping. Without one contact is ideal, at the scene's
+    force or the one asked for: wherever `tcp_pose` says, or where the action `make_contact` puts the tip,
+    which this node serves then; the force comes back on `wrench` and from the service `force_over`. What the
+    simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it is put
+    somewhere or an excitation begins; of a contact that creeps also with each block. In simulated time it
+    publishes `/clock`.
     """
 
     def __init__(self) -> None:
         super().__init__("fake_hardware_node", PARAMETERS)
         self._playing: threading.Thread | None = None
         self._stop = threading.Event()
+        self._player_clock: SimulatedClock | None = None
 
     def configure(self) -> None:
-        """Read the scene and make the sensor."""
+        """Read the scene, make the sensor and, where it is asked for, the robot."""
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
         scene_path = path if path.is_absolute() else share_path(scene)
         self._scene = read_scene(read_tissues(), scene_path)
         self._bench = SimulatedBench.from_configuration()
-        self._pose = PoseStamped()
+        self._stays = Stays()
         self._tip = BenchTip(None, 0.0, 1.0)
         self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self._truth = self.publish_on(msg.Poles, "bench/truth", TRUTHS)
-        host, table, seed = values(self, "robot_host", "table_in_base", "seed")
+        host, table, seed, serve = values(
+            self, "robot_host", "table_in_base", "seed", "serve_contact"
+        )
+        self._laid = LaidScene(self._scene, pose_of(table, "table_in_base"))
+        server = self.time_server
         if host:
-            pose = pose_of(table, "table_in_base")
-            self._laid = LaidScene(self._scene, pose)
-            self._plant = PlantChild(host, scene_path, table, seed)
+            if server and server != f"{host}:{TIME_PORT}":
+                raise ValueError(
+                    f"time_server: {server!r}, the robot at {host} serves {host}:{TIME_PORT}"
+                )
+            self._plant = PlantChild(host, scene_path, table, seed, bool(server))
             self.resources.callback(self._plant.close)
             self.every(PLANT_CHECK_S, self._check_plant)
-        else:
-            self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-            self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        elif server:
+            self.resources.callback(BenchServer(server).close)
+        self._now_ns = BenchNow(self, server)
+        if not host:
+            self._serve_ideal_contact(serve)
         self.serve(Play, "bench/play", self._on_play)
         self.serve(Trigger, "bench/stop", self._on_stop)
         self.serve(Truth, "bench/get_truth", self._on_truth)
@@ -128,19 +149,53 @@ class FakeHardwareNode(ManagedNode):
         """Silence the output."""
         self._silence()
 
+    def _serve_ideal_contact(self, by_action: bool) -> None:
+        if by_action:
+            base_frame, frame_id = values(self, "base_frame", "frame_id")
+            IdealContact(
+                self, self._stays, self._found_at, self._placed, self._now_ns, base_frame, frame_id
+            )
+        else:
+            self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
+            # whoever puts the tip somewhere waits until it is heard; others may tell as they like
+            self.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
+            self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+        self.serve(ForceOver, "force_over", self._stays.serve)
+
+    def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
+        """Depth that brings a force at a place in the base, and height of the surface above that place."""
+        tissue = self._laid.tissue_at(place_m)
+        if tissue is None:
+            return None
+        contact = BenchTip(tissue, force_n, 1.0).coupled(self._bench).contact
+        assert contact is not None
+        height_m, _ = self._laid.surface().height_of(place_m)
+        return float(contact.indentation_m), -float(height_m)
+
+    def _placed(self) -> None:
+        """The tip has been put somewhere by a goal."""
+        stay = self._stays.newest
+        point = stay.pose.pose.position
+        tissue = self._laid.tissue_at(np.array([point.x, point.y, point.z]))
+        self._put(BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0), stay.pose)
+
     def _on_pose(self, message: PoseStamped) -> None:
-        if message == self._pose:
+        if message == self._stays.newest.pose:
             return
-        self._pose = message
         position = message.pose.position
         tissue = self._scene.tissue_at((position.x, position.y, position.z))
-        self._tip = BenchTip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
+        tip = BenchTip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
+        self._stays.add(Stay(self._now_ns(), tip.force_n, message))
         wrench = WrenchStamped()
         wrench.header.stamp = message.header.stamp
         wrench.header.frame_id = self._frame_id
-        wrench.wrench.force.z = self._tip.force_n
+        wrench.wrench.force.z = tip.force_n
         self._wrench.publish(wrench)
-        self._publish_truth(message, self._tip)
+        self._put(tip, message)
+
+    def _put(self, tip: BenchTip, pose: PoseStamped) -> None:
+        self._tip = tip
+        self._publish_truth(pose, tip)
 
     def _publish_truth(self, pose: PoseStamped, tip: BenchTip, measurement_id: int = 0) -> None:
         modes = truth_of(tip.coupled(self._bench), ()).modes
@@ -181,9 +236,9 @@ class FakeHardwareNode(ManagedNode):
         tissue = self._laid.tissue_at(true.tip_m) if touching else None
         self._tip = BenchTip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
         x, y, z = true.tip_m.tolist()
-        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=time.time_ns())
-        self._pose = pose_to_message(place)
-        self._publish_truth(self._pose, self._tip)
+        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
+        self._stays.add(Stay(place.time_ns, true.force_n, pose_to_message(place)))
+        self._publish_truth(self._stays.newest.pose, self._tip)
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         if not self.active:
@@ -210,20 +265,23 @@ class FakeHardwareNode(ManagedNode):
                 int(entropy.generate_state(1, np.uint64)[0]),
                 effects,
             )
-        except ValueError as error:
+            self._silence()
+            start_ns = self._now_ns()
+            if self.time_server:
+                self._player_clock = SimulatedClock(self.time_server, "bench")
+        except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
         self._say_effort(run, excitation)
-        self._silence()
         self._stop = threading.Event()
         self._playing = threading.Thread(
             target=self._play,
-            args=(run, excitation, self._stop, self._pose, self._tip),
+            args=(run, excitation, start_ns, self._stop, self._stays.newest.pose, self._tip),
             name="bench",
             daemon=True,
         )
         self._playing.start()
-        response.accepted = True
+        response.accepted, response.start = True, time_message(start_ns)
         return response
 
     def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:
@@ -250,7 +308,7 @@ class FakeHardwareNode(ManagedNode):
                 since_s=request.hold_time_s or tip.since_s,
             ).coupled(self._bench)
             truth_to_response(truth_of(coupled, request.frequency_hz), response)
-        except ValueError as error:
+        except (ValueError, ClockLostError) as error:
             response.message = str(error)
         return response
 
@@ -261,14 +319,20 @@ class FakeHardwareNode(ManagedNode):
 
     def _silence(self) -> None:
         self._stop.set()
+        if self._player_clock is not None:
+            self._player_clock.interrupt()
         if self._playing is not None:
             self._playing.join()
             self._playing = None
+        if self._player_clock is not None:
+            self._player_clock.close()
+            self._player_clock = None
 
     def _play(
         self,
         run: BenchRun,
         excitation: Excitation,
+        start_ns: int,
         stop: threading.Event,
         pose: PoseStamped,
         tip: BenchTip,
@@ -278,13 +342,9 @@ class FakeHardwareNode(ManagedNode):
         A contact that creeps has its truth with every block: that of the middle of all blocks so far, with
         the stamp that their poles will have.
         """
-        (speed,) = values(self, "speed")
-        start_ns = time.time_ns()
         for block in run.play(excitation, excitation.periods):
-            if speed > 0:
-                due_ns = start_ns + round((block.index + 1) * excitation.period_s / speed * 1e9)
-                stop.wait(max(0, due_ns - time.time_ns()) / 1e9)
-            if stop.is_set():
+            due_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
+            if not self._wait_until(due_ns, stop):
                 return
             if tip.creeping:
                 half_s = (block.index + 1) * excitation.period_s / 2
@@ -293,9 +353,17 @@ class FakeHardwareNode(ManagedNode):
                 self._publish_truth(pose, middle, excitation.measurement_id)
             first_ns = start_ns + round(block.start_time_s * 1e9)
             self._blocks.publish(record_to_message(self._record(block, excitation, first_ns)))
-            if speed == 0:
-                # no clock holds the bench back: wait until readers have the block
-                self._blocks.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_WITHIN_S))
+
+    def _wait_until(self, due_ns: int, stop: threading.Event) -> bool:
+        """Wait for a time; whether what is played goes on."""
+        if self._player_clock is None:
+            stop.wait(max(0, due_ns - time.time_ns()) / 1e9)
+            return not stop.is_set()
+        try:
+            self._player_clock.sleep_until(due_ns)
+        except ClockLostError:
+            return False
+        return not stop.is_set()
 
     def _record(self, block: Block, excitation: Excitation, first_ns: int) -> Record:
         return Record(

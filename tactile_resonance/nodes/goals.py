@@ -1,72 +1,151 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals of actions, asked for and followed from a thread of one's own while nodes come and go."""
+"""Goals of actions, asked for and followed from a thread of one's own while nodes come and go.
+
+Every goal has an id that is given here, before anything is sent. So one whose answer is late, or lost, is
+asked for again under the same id, and is taken once; and one that is given up can be cancelled whether its
+answer came or not. No goal is left of which nobody knows.
+"""
 
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
+from unique_identifier_msgs.msg import UUID
 
-from tactile_resonance.nodes.publisher_watch import PublisherWatch
 from tactile_resonance.scan.hands import Check, Interrupted, NodeAway, PointFailed, ScanEnded
 
 POLL_S = 0.005
 # A node that was started anew needs so long at most until it takes goals again.
 TAKEN_WITHIN_S = 60.0
-ANSWER_WITHIN_S = 2.0
+# An answer that has not come by then may be lost: it is asked for again.
+ASK_AGAIN_S = 2.0
 # A measurement that is cancelled ends with its block.
 GOAL_ENDS_WITHIN_S = 15.0
+REFUSED_AGAIN_S = 0.05
+
+Poll = Callable[[], None]
+"""Called while waiting; raises where waiting has become pointless."""
 
 
-def send_goal(client: ActionClient, goal: Any, name: str, check: Check) -> ClientGoalHandle:
-    """Goal that was accepted; waits for a node that is being brought back."""
-    deadline = time.monotonic() + TAKEN_WITHIN_S
-    while time.monotonic() < deadline:
-        check()
-        if client.server_is_ready():
-            future = client.send_goal_async(goal)
-            if is_done(future, ANSWER_WITHIN_S) and future.result().accepted:
-                return future.result()
-        time.sleep(0.05)
-    raise ScanEnded(f"{name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
+@dataclass(frozen=True)
+class Goals:
+    """Goals of one action.
 
+    Parameters
+    ----------
+    client : ActionClient
+    name : str
+        Of the action, for messages.
+    pause : callable
+        Lets a time pass [s]; answers are taken meanwhile, by another thread or by this call.
+    """
 
-def follow_goal(
-    client: ActionClient,
-    handle: ClientGoalHandle,
-    node: str,
-    check: Check,
-    watch: PublisherWatch,
-    each_poll: Callable[[], None] = lambda: None,
-) -> Any:
-    """Result of a goal; one that is left for whatever reason is cancelled and waited for."""
-    future = handle.get_result_async()
-    try:
-        while not future.done():
-            if not client.server_is_ready():
-                raise NodeAway(f"{node} went away", f"{node} went away")
-            if topic := watch.renewed():
-                text = f"{topic}: who publishes it was started anew"
-                raise NodeAway(text, "node started anew")
+    client: ActionClient
+    name: str
+    pause: Callable[[float], None] = time.sleep
+
+    def send(
+        self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None = None
+    ) -> ClientGoalHandle:
+        """Goal that was accepted; waits for a node that is being brought back, and while it is refused.
+
+        Raises
+        ------
+        NodeAway
+            If the node goes away meanwhile.
+        ScanEnded
+            If none takes it.
+        """
+        deadline = time.monotonic() + TAKEN_WITHIN_S
+        while time.monotonic() < deadline:
             check()
-            each_poll()
-            time.sleep(POLL_S)
-    except (PointFailed, Interrupted):
-        # one that was started anew, or is gone, does not know the goal: there is no end to wait for
-        cancelled = handle.cancel_goal_async()
-        if is_done(cancelled, ANSWER_WITHIN_S) and cancelled.result().goals_canceling:
-            is_done(future, GOAL_ENDS_WITHIN_S)
-        raise
-    return future.result().result
+            if not self.client.server_is_ready():
+                self.pause(REFUSED_AGAIN_S)
+                continue
+            handle = self._send(goal, check, poll, feedback)
+            if handle is not None:
+                return handle
+            self.pause(REFUSED_AGAIN_S)
+        raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
+
+    def follow(self, handle: ClientGoalHandle, check: Check, poll: Poll) -> Any:
+        """Result of a goal; one that is left for whatever reason is cancelled and waited for."""
+        future = handle.get_result_async()
+        try:
+            while not future.done():
+                if not self.client.server_is_ready():
+                    raise NodeAway(f"{self.name}: its node went away", "node went away")
+                poll()
+                check()
+                self.pause(POLL_S)
+            if future.result().status == GoalStatus.STATUS_UNKNOWN:
+                raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
+        except (PointFailed, Interrupted):
+            # one that was started anew, or is gone, does not know the goal: there is no end to wait for
+            cancelled = handle.cancel_goal_async()
+            if self._done(cancelled, ASK_AGAIN_S) and cancelled.result().goals_canceling:
+                self._done(future, GOAL_ENDS_WITHIN_S)
+            raise
+        return future.result().result
+
+    def _send(
+        self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None
+    ) -> ClientGoalHandle | None:
+        """Handle of a goal that was taken; None where it was refused."""
+        goal_id = UUID(uuid=list(uuid.uuid4().bytes))
+
+        def ask() -> Future:
+            return self.client.send_goal_async(goal, feedback, goal_uuid=goal_id)
+
+        futures = [ask()]
+        asked_s = time.monotonic()
+        try:
+            while True:
+                answers = [future.result() for future in futures if future.done()]
+                taken = next((answer for answer in answers if answer.accepted), None)
+                if taken is not None:
+                    return taken
+                if futures[-1].done():
+                    # of one that was asked for twice a refusal may mean that it is known already
+                    refused = futures[-1].result()
+                    return refused if len(futures) > 1 and self._known(refused) else None
+                if not self.client.server_is_ready():
+                    raise NodeAway(f"{self.name}: its node went away", "node went away")
+                if time.monotonic() - asked_s > ASK_AGAIN_S:
+                    futures.append(ask())
+                    asked_s = time.monotonic()
+                poll()
+                check()
+                self.pause(POLL_S)
+        except BaseException:
+            for future in futures:
+                future.add_done_callback(_cancel_if_taken)
+            raise
+
+    def _known(self, refused: ClientGoalHandle) -> bool:
+        """Whether the node has a goal of this id after all."""
+        result = refused.get_result_async()
+        if not self._done(result, ASK_AGAIN_S):
+            return True  # it is under way
+        return result.result().status != GoalStatus.STATUS_UNKNOWN
+
+    def _done(self, future: Future, timeout_s: float) -> bool:
+        """Wait for it; whether it came."""
+        deadline = time.monotonic() + timeout_s
+        while not future.done() and time.monotonic() < deadline:
+            self.pause(POLL_S)
+        return future.done()
 
 
-def is_done(future: Future, timeout_s: float) -> bool:
-    """Wait for it; whether it came."""
-    deadline = time.monotonic() + timeout_s
-    while not future.done() and time.monotonic() < deadline:
-        time.sleep(POLL_S)
-    return future.done()
+def _cancel_if_taken(future: Future) -> None:
+    """A goal that nobody follows any more does not go on."""
+    if not future.cancelled() and future.exception() is None and future.result().accepted:
+        future.result().cancel_goal_async()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -13,14 +14,27 @@ from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import QoSProfile
+from rclpy.timer import Timer
 
+from tactile_resonance import msg
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
-from tactile_resonance.nodes.parameters import Parameter, declare
+from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.running import BEATS, STEADY
 
 # What a configuration may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
+
+BEAT_S = 0.2
+"""Between two signs of life, by this machine's clock."""
+
+TIME_SERVER = Parameter(
+    "time_server",
+    "",
+    "Address HOST:PORT of a simulated bench's time, in which the node then lives; empty: the machine's clock.",
+    read_only=True,
+)
 
 
 class ManagedNode(LifecycleNode):
@@ -28,7 +42,7 @@ class ManagedNode(LifecycleNode):
 
     `configure` makes publishers, subscriptions, services and devices through `publish_on`, `listen`,
     `serve` and `resources`; the way back undoes them in reverse order. What arrives while the node is
-    not active is dropped, and what it publishes then goes nowhere.
+    not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells that it works.
 
     Parameters
     ----------
@@ -43,6 +57,9 @@ class ManagedNode(LifecycleNode):
         self._failing = False
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
+        self._instance = int.from_bytes(os.urandom(7), "big")
+        self._beats = self.create_publisher(msg.Heartbeat, "heartbeat", BEATS)
+        self.steady_timer(BEAT_S, self._beat)
 
     # What a subclass says
 
@@ -59,6 +76,14 @@ class ManagedNode(LifecycleNode):
     def details(self) -> Mapping[str, str]:
         """Figures for the diagnostics beside rates and errors."""
         return {}
+
+    def working(self) -> bool:
+        """Whether threads of its own move on; the executor's does where this is asked."""
+        return True
+
+    def waiting_for(self) -> str:
+        """What its work waits for, for people; empty: nothing."""
+        return ""
 
     # What it sets up with
 
@@ -95,9 +120,22 @@ class ManagedNode(LifecycleNode):
         self.resources.callback(self.destroy_service, service)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Timer until the node is cleaned up; called while it is active."""
-        timer = self.create_timer(period_s, lambda: callback() if self.active else None)
+        """Timer until the node is cleaned up; called while it is active, by this machine's clock."""
+        timer = self.steady_timer(period_s, lambda: callback() if self.active else None)
         self.resources.callback(self.destroy_timer, timer)
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
+        """Timer by this machine's clock, whether time is simulated or not."""
+        return self.create_timer(period_s, callback, clock=STEADY)
+
+    def ros_now_ns(self) -> int:
+        """ROS time now [ns], simulated where `use_sim_time` says so."""
+        return int(self.get_clock().now().nanoseconds)
+
+    @property
+    def time_server(self) -> str:
+        """Address of the simulated time in which the node lives; empty: none."""
+        return str(values(self, TIME_SERVER.name)[0])
 
     def fail(self, reason: str) -> None:
         """Give up for a reason: back to unconfigured, from where the manager starts it anew."""
@@ -107,6 +145,17 @@ class ManagedNode(LifecycleNode):
             self.trigger_deactivate()
 
     # Its life
+
+    def _beat(self) -> None:
+        if self.working():
+            self._beats.publish(
+                msg.Heartbeat(
+                    node=self.get_fully_qualified_name(),
+                    state=self.state_name(),
+                    instance=self._instance,
+                    waiting_for=self.waiting_for(),
+                )
+            )
 
     def state_name(self) -> str:
         """Name of the present state."""

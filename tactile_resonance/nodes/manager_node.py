@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Parameter, declare, values
-from tactile_resonance.nodes.running import run_node
+from tactile_resonance.nodes.running import STEADY, run_node
 
 STREAM_NODES = ["excitation_node", "frf_node", "poles_node"]
 
@@ -86,7 +86,7 @@ class ManagerNode(Node):
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/shut_down", self._on_shut_down)
-        self.create_timer(TICK_S, self._tick)
+        self.create_timer(TICK_S, self._tick, clock=STEADY)
 
     def _managed(self, name: str) -> _Managed:
         return _Managed(

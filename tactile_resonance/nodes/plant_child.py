@@ -18,7 +18,8 @@ from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant_defaults import PRIORITY, READY
 from tactile_resonance.simulation.robot.control_port import order
 
-START_WITHIN_S = 30.0
+START_WITHIN_S = 90.0
+ANSWER_WITHIN_S = 10.0
 END_WITHIN_S = 3.0
 
 
@@ -35,7 +36,7 @@ class TrueContact:
     since_s : float
         How long the contact has lasted.
     stalls : int
-        How often the simulation has stood still for more than 10 ms.
+        How often the simulation has stood still on the wall clock for more than 10 ms.
     """
 
     tip_m: NDArray[np.float64]
@@ -54,6 +55,8 @@ class PlantChild:
     scene : Path
     table_in_base : six numbers
     seed : int
+    simulated_time : bool
+        Its time goes on as those who take part in it let it; else that of the wall clock.
 
     Raises
     ------
@@ -61,14 +64,22 @@ class PlantChild:
         If it does not come up; with what it printed.
     """
 
-    def __init__(self, host: str, scene: Path, table_in_base: Sequence[float], seed: int) -> None:
+    def __init__(
+        self,
+        host: str,
+        scene: Path,
+        table_in_base: Sequence[float],
+        seed: int,
+        simulated_time: bool,
+    ) -> None:
         self._host = host
+        pace = ["--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)]
         self._process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
                 *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
                 *(str(float(value)) for value in table_in_base),
-                *("--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)),
+                *(["--simulated-time"] if simulated_time else pace),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -107,7 +118,7 @@ class PlantChild:
         OSError
             If the plant does not answer.
         """
-        answer = order(self._host, "truth", timeout_s=1.0)
+        answer = order(self._host, "truth", timeout_s=ANSWER_WITHIN_S)
         return TrueContact(
             np.array(answer["tip_m"]),
             float(answer["normal_force_n"]),

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -22,6 +25,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from tactile_resonance.drivers.acquisition import DeviceError
 
 RCLError = rclpy_implementation.RCLError
+
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""This machine's, for what has to go on while simulated time stands."""
 
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
 RESULTS = QoSProfile(
@@ -62,25 +68,45 @@ STREAM = QoSProfile(
 NEWEST = QoSProfile(
     depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
 )
-# Wrenches where their mean over a time counts: two seconds of them may wait.
-SERIES = QoSProfile(
-    depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+# Where the tip is put, by those who put it there: the bench must hear it before it plays.
+PLACES = QoSProfile(
+    depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
 )
+# Of a recording: two seconds of what is published at 50 Hz may wait.
+SERIES = QoSProfile(
+    depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+# Signs of life.
+BEATS = QoSProfile(
+    depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+
+END_WITHIN_S = 20.0
+"""From being asked to end: a tip is drawn back meanwhile."""
 
 
 def run_node(make: Callable[[], Node]) -> None:
     """Spin one node until it is interrupted or ROS shuts down.
 
-    An interrupt ends it even where a shell started it in the background, interrupts ignored.
+    An interrupt ends it even where a shell started it in the background, interrupts ignored. A node that
+    does not end in time, because something in it hangs, is ended all the same.
     """
     interrupted = False
+
+    def end_in_time(*_: object) -> None:
+        limit = threading.Timer(END_WITHIN_S, os._exit, (1,))
+        limit.daemon = True
+        limit.start()
 
     def interrupt(*_: object) -> None:
         nonlocal interrupted
         interrupted = True
+        end_in_time()
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, end_in_time)
     try:
         with rclpy.init():
             node = make()

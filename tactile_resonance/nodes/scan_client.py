@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,9 +12,8 @@ from rclpy.action.client import ClientGoalHandle
 
 from tactile_resonance.action import Scan
 from tactile_resonance.nodes.client import NoAnswer, NodeClient
-
-TAKEN_WITHIN_S = 60.0
-ANSWER_WITHIN_S = 3.0
+from tactile_resonance.nodes.goals import Goals
+from tactile_resonance.scan.hands import NodeAway, ScanEnded
 
 
 class ScanClient(NodeClient):
@@ -34,7 +32,7 @@ class ScanClient(NodeClient):
 
     def join(self) -> None:
         """Client of the action, reader of the diagnostics."""
-        self._client = ActionClient(self._node, Scan, "scan")
+        self._goals = Goals(ActionClient(self._node, Scan, "scan"), "scan", self.spin)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
     def why(self) -> str:
@@ -62,19 +60,12 @@ class ScanClient(NodeClient):
 
     def start(self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None]) -> ClientGoalHandle:
         """Ask for a scan until the node takes it; one that was killed stays in the graph for seconds."""
-        deadline = time.monotonic() + TAKEN_WITHIN_S
-        while time.monotonic() < deadline:
-            if self._client.server_is_ready():
-                future = self._client.send_goal_async(
-                    goal, feedback_callback=lambda message: feedback(message.feedback)
-                )
-                asked_s = time.monotonic()
-                while not future.done() and time.monotonic() < asked_s + ANSWER_WITHIN_S:
-                    self.spin(0.05)
-                if future.done() and future.result().accepted:
-                    return future.result()
-            self.spin(0.1)
-        raise NoAnswer("scan: no node takes the goal")
+        try:
+            return self._goals.send(
+                goal, self._check, lambda: None, lambda message: feedback(message.feedback)
+            )
+        except (NodeAway, ScanEnded) as error:
+            raise NoAnswer(str(error)) from error
 
     def result(self, handle: ClientGoalHandle, timeout_s: float) -> Scan.Result:
         """Result of a scan."""

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
+from rclpy.duration import Duration
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
@@ -17,12 +18,12 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
-from tactile_resonance.nodes.goals import POLL_S, follow_goal, send_goal
+from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.publisher_watch import PublisherWatch
-from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.node_watch import Instances, NodeWatch
+from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
-from tactile_resonance.nodes.stream_nodes import StreamNodes
+from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
 from tactile_resonance.scan.hands import (
@@ -41,9 +42,11 @@ from tactile_resonance.scan.surface_search import Touch
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
+"""After its last block all of a measurement has come, on the machine's clock; in simulated time a slow machine
+may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
-PLACE_FOR_S = 0.2
+PLACED_WITHIN_S = 2.0
 # Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
 LEAST_TOUCH_STD_M = 2e-5
 
@@ -75,20 +78,38 @@ class NodeHands:
         table_in_base: Pose,
         base_frame: str,
         with_robot: bool,
+        scan_time: ScanTime,
     ) -> None:
         self._node = node
         self._recorder = recorder
         self._table = table_in_base
         self._base_frame = base_frame
+        self._time = scan_time
         self.free_air = with_robot
-        self._nodes = StreamNodes(node, (*STREAM_TOPICS, *([STATE_TOPIC] if with_robot else [])))
-        self._measure = ActionClient(node, Measure, "measure")
-        node.resources.callback(self._measure.destroy)
+        topics = (*STREAM_TOPICS, *([STATE_TOPIC] if with_robot else []))
+        self._nodes = NodeWatch(node, topics, scan_time.silent_s)
+        self._waited_for = ""
+        client = ActionClient(node, Measure, "measure")
+        node.resources.callback(client.destroy)
+        self._measure = Goals(client, "measure")
         self._tip: TipContact | None = None
         if with_robot:
-            self._tip = TipContact(node)
+            self._tip = TipContact(node, scan_time)
         else:
-            self._pose = node.publish_on(PoseStamped, "tcp_pose", STREAM)
+            self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
+
+    @property
+    def waiting_for(self) -> str:
+        """Who keeps the scan waiting, for people; empty: nobody."""
+        return self._waited_for
+
+    def now_s(self) -> float:
+        """Time by which durations count [s]."""
+        return self._time.now_s()
+
+    def begin(self, *integers: int) -> None:
+        """Simulated noise is that of these integers from now on."""
+        self._time.seed(*integers)
 
     def missing(self) -> str | None:
         """A node that points need and that is not at work."""
@@ -101,13 +122,14 @@ class NodeHands:
             self._place(pose)
             return
         with self._nodes.doubted_after(NodeAway):
-            self._tip.hold(pose, force_n, hold, check)
+            self._tip.hold(pose, force_n, hold, check, self._poll_of([STATE_TOPIC]))
 
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
         """Touch a point of the surface as it is expected and draw back; tell where the ball met it."""
         if self._tip is None:
             raise ScanEnded("surface.touch: nobody moves the tip (parameter contact is none)")
-        result = self._tip.touch(self._pose_of(point), force_n, check)
+        poll = self._poll_of([STATE_TOPIC])
+        result = self._tip.touch(self._pose_of(point), force_n, check, poll)
         way = np.array(point.normal) * (ball_radius_m + result.surface_m)
         x, y, z = (point.position_m + way).tolist()
         return Touch((x, y, z), max(result.surface_std_m, LEAST_TOUCH_STD_M), result.force_n)
@@ -143,6 +165,10 @@ class NodeHands:
         if not seen:
             raise PointFailed("measurement: it ended before its first block")
         poles, origin = poles_from_message(seen[-1])
+        touching = self._tip is not None and self._tip.touching
+        if touching and np.isnan(origin.contact.force_n):
+            reason = self._recorder.force_reason or "no record says why"
+            raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
             raise PointFailed("measurement: nobody told where the tip is (tcp_pose)")
         return Measured(poles, origin)
@@ -161,40 +187,50 @@ class NodeHands:
         if missing := self.missing():
             raise NodeAway(missing, "node away")
         touching = self._tip is not None and self._tip.touching
-        watch = PublisherWatch(self._node, (*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])))
+        poll = self._poll_of([*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])])
         seen: list[msg.Poles] = []
         stopping = [False]
+        news_s = [time.monotonic()]
 
         def take_poles() -> None:
             for message in self._new_poles():
                 seen.append(message)
-                if enough(poles_from_message(message)[0], len(seen)) and not stopping[0]:
+                news_s[0] = time.monotonic()
+                if stopping[0]:
+                    continue
+                if enough(poles_from_message(message)[0], len(seen)):
                     stopping[0] = True
                     handle.cancel_goal_async()
+                else:
+                    self._time.go()
 
         def each_poll() -> None:
             take_poles()
+            poll()
             if self._tip is not None:
                 self._tip.check()
+            if self._time.simulated and time.monotonic() - news_s[0] > self._time.silent_s:
+                raise PointDisturbed("no poles of a block came", "messages lost")
 
         deadline = time.monotonic() + DEVICE_BACK_WITHIN_S
         while True:
-            handle = send_goal(self._measure, goal, "measure", check)
-            result = follow_goal(self._measure, handle, "excitation_node", check, watch, each_poll)
+            # once before it, and once for each block that was judged: each handing over ends it
+            self._time.go()
+            handle = self._measure.send(goal, check, poll)
+            result = self._measure.follow(handle, check, each_poll)
             if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
                 break
             time.sleep(NOT_READY_POLL_S)
         if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
             raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
-        self._wait_for_results(result, watch, check)
+        self._wait_for_results(result, check, poll)
         take_poles()
         return seen
 
-    def _wait_for_results(
-        self, result: Measure.Result, watch: PublisherWatch, check: Check
-    ) -> None:
+    def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
         """Until every block's record, FRF and poles are in the recording."""
-        deadline = time.monotonic() + RESULTS_WITHIN_S
+        within_s = self._time.silent_s if self._time.simulated else RESULTS_WITHIN_S
+        deadline = time.monotonic() + within_s
         while True:
             counts = self._recorder.counts()
             if all(count >= result.blocks for count in counts):
@@ -203,14 +239,29 @@ class NodeHands:
                 f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
                 "came"
             )
-            if topic := watch.renewed():
-                raise NodeAway(f"{topic}: who publishes it was started anew; {came}", "node away")
-            if missing := self.missing():
-                raise NodeAway(f"{missing}; {came}", "node away")
             if time.monotonic() > deadline:
                 raise PointDisturbed(came, "messages lost")
+            try:
+                poll()
+            except NodeAway as error:
+                raise NodeAway(f"{error}; {came}", error.kind) from error
             check()
             time.sleep(POLL_S)
+
+    def _poll_of(self, topics: list[str]) -> Poll:
+        """Raises `NodeAway` where a node behind these topics is not at work any more."""
+        instances: Instances = self._nodes.instances(topics)
+
+        def poll() -> None:
+            self._waited_for = self._nodes.waited_for(instances)
+            problem = self._nodes.changed(instances)
+            if problem is None:
+                return
+            if self._time.simulated and "silent" in problem:
+                raise ScanEnded(f"{problem}; the run can be resumed")
+            raise NodeAway(problem, "node away")
+
+        return poll
 
     def _new_poles(self) -> list[msg.Poles]:
         messages = []
@@ -230,13 +281,11 @@ class NodeHands:
                 position_m=tuple(place.tolist()),
                 orientation_xyzw=(x, y, z, w),
                 frame_id=self._base_frame,
-                time_ns=time.time_ns(),
+                time_ns=self._node.ros_now_ns(),
             )
         )
 
     def _place(self, pose: PoseStamped) -> None:
-        """Say where the tip is, often enough for best effort to reach everybody."""
-        end_s = time.monotonic() + PLACE_FOR_S
-        while time.monotonic() < end_s:
-            self._pose.publish(pose)
-            time.sleep(PLACE_FOR_S / 10)
+        """Say where the tip is, until all who listen reliably have heard it."""
+        self._pose.publish(pose)
+        self._pose.wait_for_all_acked(Duration(seconds=PLACED_WITHIN_S))

@@ -21,11 +21,12 @@ from std_srvs.srv import Trigger
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
+from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
@@ -66,10 +67,12 @@ PARAMETERS = (
         read_only=True,
     ),
     Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
+    TIME_SERVER,
 )
 
 RESULT_TIMEOUT_S = 900
 FEEDBACK_EVERY_S = 0.2
+LOOK_EVERY_S = 0.5
 
 
 class ScanNode(ManagedNode):
@@ -82,10 +85,15 @@ class ScanNode(ManagedNode):
         """Listen to everything that a run records."""
         contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
         self._recorder = ScanRecorder(self)
+        self._time = ScanTime(self.time_server)
+        table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
         self._hands = NodeHands(
-            self, self._recorder, pose_of(table, "table_in_base"), base_frame, contact == "robot"
+            self, self._recorder, table_in_base, base_frame, robot, self._time
         )
         self._controls: Controls | None = None
+        self._goal: ServerGoalHandle | None = None
+        self._waited_for = ""
+        self.every(LOOK_EVERY_S, self._tell_waiting)
         self._busy = threading.Lock()
         self._progress: Progress | None = None
         for name, ask in {
@@ -151,6 +159,8 @@ class ScanNode(ManagedNode):
             result.message = "a scan is running, cancel it or wait for its result"
             return result
         self._controls, tell = Controls(), self._tell_of(goal)
+        self._goal = goal
+        self._time.begin()
         try:
             scene, plan, run, seed = self._prepare(goal.request, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
@@ -163,7 +173,8 @@ class ScanNode(ManagedNode):
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
         finally:
-            self._controls = self._progress = None
+            self._time.end()
+            self._controls = self._progress = self._goal = None
             self._busy.release()
         return result
 
@@ -250,6 +261,18 @@ class ScanNode(ManagedNode):
         notes = scene.notes.as_json()
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
+    def _tell_waiting(self) -> None:
+        """Say who keeps a scan waiting, once, to all who follow it."""
+        goal, progress = self._goal, self._progress
+        waited_for = self._hands.waiting_for if goal is not None else ""
+        who = waited_for.partition(",")[0]
+        if who == self._waited_for:
+            return
+        self._waited_for = who
+        if who and goal is not None and progress is not None:
+            self.get_logger().warning(f"the scan waits for {waited_for}")
+            goal.publish_feedback(_feedback(progress, waited_for))
+
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
         last = [("", -math.inf)]
 
@@ -289,8 +312,9 @@ def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
     return tuple(points)
 
 
-def _feedback(progress: Progress) -> Scan.Feedback:
+def _feedback(progress: Progress, waiting_for: str = "") -> Scan.Feedback:
     feedback = Scan.Feedback(
+        waiting_for=waiting_for,
         point=progress.point.index if progress.point else progress.finished,
         finished=progress.finished,
         points=progress.points,

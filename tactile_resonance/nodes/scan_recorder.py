@@ -55,10 +55,13 @@ class ScanRecorder:
     ----------
     poles : queue of Poles messages
         In the order of their arrival, for the scan's own thread.
+    force_reason : str
+        Why the force of a block is unknown, of the newest one of which it is; empty: of none.
     """
 
     def __init__(self, node: ManagedNode) -> None:
         self.poles: queue.SimpleQueue[msg.Poles] = queue.SimpleQueue()
+        self.force_reason = ""
         self._lock = threading.Lock()
         self._recording: Recording | None = None
         self._measurement_id = 0
@@ -71,6 +74,7 @@ class ScanRecorder:
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id
             self._counts.clear()
+            self.force_reason = ""
             while not self.poles.empty():
                 self.poles.get()
 
@@ -100,5 +104,7 @@ class ScanRecorder:
                 self._counts[topic] += 1
                 if topic == "poles":
                     self.poles.put(message)
+                elif topic == "record":
+                    self.force_reason = message.contact_reason or self.force_reason
 
         node.listen(recorded.kind, topic, heard, recorded.qos, raw=True)

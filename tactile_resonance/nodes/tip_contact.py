@@ -12,15 +12,14 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.goals import POLL_S, follow_goal, send_goal
+from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.publisher_watch import PublisherWatch
 from tactile_resonance.nodes.running import NEWEST
+from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
-    NodeAway,
     PointDisturbed,
     PointFailed,
     ScanEnded,
@@ -29,8 +28,7 @@ from tactile_resonance.scan.scene import Hold
 
 STATE_TOPIC = "contact_state"
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
-STATE_WITHIN_S = 1.0
-STATE_STALE_S = 2.0
+ASK_AGAIN_S = 1.0
 # What says nothing of the point: it comes again.
 DEVICE_CAUSES = frozenset(
     cause.value
@@ -47,6 +45,7 @@ class TipContact:
     Parameters
     ----------
     node : ManagedNode
+    scan_time : ScanTime
 
     Attributes
     ----------
@@ -54,36 +53,41 @@ class TipContact:
         The tip is on the tissue, or may be.
     """
 
-    def __init__(self, node: ManagedNode) -> None:
-        self._node = node
+    def __init__(self, node: ManagedNode, scan_time: ScanTime) -> None:
+        self._time = scan_time
         self.touching = True  # a scan that was killed may have left it there
         self._state: msg.ContactState | None = None
-        self._state_s = float("-inf")
         # the newest only: the recorder's may have to wait behind what else is recorded
         node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
-        self._contact = ActionClient(node, MakeContact, "make_contact")
-        node.resources.callback(self._contact.destroy)
+        client = ActionClient(node, MakeContact, "make_contact")
+        self._goals = Goals(client, "make_contact")
+        node.resources.callback(client.destroy)
         self._retract = node.create_client(Trigger, "retract")
         node.resources.callback(node.destroy_client, self._retract)
 
-    def hold(self, pose: PoseStamped, force_n: float, hold: Hold, check: Check) -> None:
+    def hold(
+        self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll
+    ) -> None:
         """Press there until the force is held."""
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
-        self._make(goal, check)
-        deadline = time.monotonic() + STATE_WITHIN_S
-        while self._state is None or self._state.state != msg.ContactState.STATE_HOLD:
-            if time.monotonic() > deadline:
-                self.check()
+        self._make(goal, check, poll)
+        while (state := self._state) is None or state.state != state.STATE_HOLD:
+            ended = state is not None and state.cause not in ("", Cause.NONE.value)
+            if state is not None and ended:
+                raise _failure(state)
+            poll()
             check()
             time.sleep(POLL_S)
 
-    def touch(self, pose: PoseStamped, force_n: float, check: Check) -> MakeContact.Result:
+    def touch(
+        self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
+    ) -> MakeContact.Result:
         """Touch and draw back; what is disturbed comes again."""
         disturbed = Disturbances()
         while True:
             try:
-                return self._make(MakeContact.Goal(pose=pose, force_n=force_n), check)
+                return self._make(MakeContact.Goal(pose=pose, force_n=force_n), check, poll)
             except PointDisturbed as error:
                 if not disturbed.again(error):
                     raise
@@ -95,43 +99,62 @@ class TipContact:
         if not self.touching:
             return
         deadline = time.monotonic() + RETRACT_WITHIN_S
-        asked_s = float("-inf")
         while time.monotonic() < deadline:
-            state = self._state
-            since_s = time.monotonic() - asked_s
-            if state is not None and state.state == state.STATE_IDLE and since_s < float("inf"):
+            self._time.go()
+            if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
                 self.touching = False
                 return
-            if since_s > 1.0 and self._retract.service_is_ready():
-                self._retract.call_async(Trigger.Request())
-                asked_s = time.monotonic()
-            time.sleep(POLL_S)
         raise ScanEnded(f"the tip was not drawn back within {RETRACT_WITHIN_S:g} s")
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
         state = self._state
-        if not self.touching or state is None:
-            return
-        silent_s = time.monotonic() - self._state_s
-        if silent_s > STATE_STALE_S:
-            text = f"contact_node: nothing heard of it for {silent_s:.1f} s"
-            raise NodeAway(text, "contact_node silent")
-        if state.state != state.STATE_HOLD:
+        if self.touching and state is not None and state.state != state.STATE_HOLD:
             raise _failure(state)
 
-    def _make(self, goal: MakeContact.Goal, check: Check) -> MakeContact.Result:
+    def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
+        # a contact that nobody knows of any more is ended first
+        state = self._state
+        self.touching = self.touching or (state is not None and state.state != state.STATE_IDLE)
+        self.retract()
         self.touching = True
-        watch = PublisherWatch(self._node, (STATE_TOPIC,))
-        handle = send_goal(self._contact, goal, "make_contact", check)
-        result = follow_goal(self._contact, handle, "contact_node", check, watch)
+        self._state = None
+        self._time.go()
+        result = self._goals.follow(self._goals.send(goal, check, poll), check, poll)
         if not result.reached:
             raise _failure(result)
         return result
 
+    def _ask_to_retract(self) -> bool:
+        """Whether contact_node takes the request; states from before its answer do not count."""
+        if not self._retract.service_is_ready():
+            time.sleep(POLL_S)
+            return False
+        answer = self._retract.call_async(Trigger.Request())
+        deadline = time.monotonic() + ASK_AGAIN_S
+        while not answer.done():
+            if time.monotonic() > deadline:
+                self._retract.remove_pending_request(answer)
+                return False
+            time.sleep(POLL_S)
+        self._state = None
+        if not answer.result().success:
+            time.sleep(0.05)
+        return bool(answer.result().success)
+
+    def _idle_within(self, seconds: float) -> bool:
+        """Whether the tip is told to be free; longer where it is on its way."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            state = self._state
+            if state is not None and state.state == state.STATE_IDLE:
+                return True
+            time.sleep(POLL_S)
+        return False
+
     def _on_state(self, message: msg.ContactState) -> None:
-        self._state, self._state_s = message, time.monotonic()
+        self._state = message
 
 
 def _failure(told: MakeContact.Result | msg.ContactState) -> PointFailed:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -31,12 +30,16 @@ class TouchFromPoles:
         Of one block.
     tell : callable
         Passes a touch on; whether it was new and of use.
+    now_ns : int
+        ROS time now [ns]: of what was before nothing is known.
     """
 
-    def __init__(self, false_alarm_probability: float, tell: Callable[[], bool]) -> None:
+    def __init__(
+        self, false_alarm_probability: float, tell: Callable[[], bool], now_ns: int
+    ) -> None:
         self._touch = PolesTouch(false_alarm_probability)
         self._tell = tell
-        self._air_ns = self._clear_ns = time.time_ns()
+        self._air_ns = self._clear_ns = now_ns
 
     def moved(self, state: State, now_ns: int) -> None:
         """Where the contact is, in every cycle of the loop."""

@@ -8,6 +8,7 @@ A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays
 from __future__ import annotations
 
 import array
+from dataclasses import replace
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -163,8 +164,13 @@ def origin_from_message(message: Any) -> Origin:
         frame_id=message.header.frame_id,
         label=message.label,
         simulated=message.simulated,
-        contact=contact_from_message(
-            message.tip_pose, message.contact_force_n, message.contact_force_std_n
+        contact=replace(
+            contact_from_message(
+                message.tip_pose, message.contact_force_n, message.contact_force_std_n
+            ),
+            # of records alone, and not of those of earlier versions
+            coverage=getattr(message, "contact_coverage", 0.0),
+            reason=getattr(message, "contact_reason", ""),
         ),
     )
 

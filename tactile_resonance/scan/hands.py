@@ -92,6 +92,14 @@ class Hands(Protocol):
 
     free_air: bool
 
+    def now_s(self) -> float:
+        """Time by which limits and durations of a scan count [s]: simulated, where the bench's is."""
+        ...
+
+    def begin(self, *integers: int) -> None:
+        """Let simulated noise follow from integers, three at the most, from now on; nothing else has any."""
+        ...
+
     def missing(self) -> str | None:
         """What points need and is not there now, for people; None: nothing. Asked with the tip free."""
         ...

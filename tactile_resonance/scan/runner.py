@@ -41,6 +41,8 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, ScanScene
 
 POLL_S = 0.05
+ATTEMPT_SEEDS = 1_000_003
+"""Between the seeds of two attempts at a point: beyond the points of a scan."""
 SKIPPED = "skipped on request"
 
 
@@ -79,14 +81,14 @@ class ScanRunner:
 
     def run(self) -> Summary:
         """Finish every point that is not; the references of free air are taken before and after."""
-        begun_s = time.monotonic()
+        begun_s = self._hands.now_s()
         message = ""
         try:
             self._hands.retract()
             self._reference(BEFORE)
             self._air = read_reference(self._run.content, BEFORE)
             while (point := self._next()) is not None:
-                spent_s = time.monotonic() - begun_s
+                spent_s = self._hands.now_s() - begun_s
                 if spent_s > self._scene.time_limits.scan_s:
                     raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
                 self._point(point)
@@ -141,7 +143,7 @@ class ScanRunner:
 
     def _point(self, point: ScanPoint) -> None:
         """One attempt at a point, finished with a result whatever happens, unless it shall be repeated."""
-        scene, begun_s = self._scene, time.monotonic()
+        scene, begun_s = self._scene, self._hands.now_s()
         decisions: list[Decision] = []
 
         def enough(poles: Poles, blocks: int) -> bool:
@@ -151,11 +153,14 @@ class ScanRunner:
 
         def check() -> None:
             self._controls.check()
-            if time.monotonic() - begun_s > scene.time_limits.point_s:
+            if self._hands.now_s() - begun_s > scene.time_limits.point_s:
                 raise PointFailed(f"time_limits.point_s: {scene.time_limits.point_s:g} s are over")
 
         with self._run.begin_point(point.index) as recording:
             measured, outcome, reason = None, Outcome.FAILED, ""
+            # a point that is repeated on request has phases and noise of its own
+            seed = self._seed + point.index + recording.attempt * ATTEMPT_SEEDS
+            self._hands.begin(self._seed, point.index, recording.attempt)
             try:
                 self._say(point, "contact")
                 self._hands.touch(point, scene.force_n, scene.hold, check)
@@ -163,7 +168,7 @@ class ScanRunner:
                 measured = self._hands.measure(
                     self._plan.measurement,
                     point.label,
-                    self._seed + point.index,
+                    seed,
                     enough,
                     recording,
                     check,
@@ -182,7 +187,7 @@ class ScanRunner:
                 outcome, reason = Outcome.SKIPPED, SKIPPED
             self._say(point, "retract")
             self._hands.retract()
-            duration_s = time.monotonic() - begun_s
+            duration_s = self._hands.now_s() - begun_s
             if measured is None:
                 result = unmeasured_result(
                     point,
@@ -232,7 +237,7 @@ class ScanRunner:
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
-        seed = self._seed + len(self._plan.points) + (name == AFTER)
+        place = len(self._plan.points) + (name == AFTER)
 
         def all_blocks(poles: Poles, blocks: int) -> bool:
             return False
@@ -241,12 +246,13 @@ class ScanRunner:
         while True:
             self._wait()
             self._say(None, "reference")
+            self._hands.begin(self._seed, place, 0)
             with self._run.begin_reference(name) as recording:
                 try:
                     self._hands.measure(
                         replace(self._plan.measurement, periods=self._scene.blocks.least),
                         "air",
-                        seed,
+                        self._seed + place,
                         all_blocks,
                         recording,
                         self._controls.check,

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who tells where the tip was and how hard it pressed while a block was taken."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Protocol
+
+from geometry_msgs.msg import PoseStamped
+
+from tactile_resonance.nodes.conversions import contact_from_message, time_message
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.node_watch import SIMULATED_SILENT_S
+from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.record import Contact
+from tactile_resonance.srv import ForceOver
+
+PARAMETER = Parameter(
+    "contact_source",
+    "force_over",
+    "Who tells where the tip was and how hard it pressed: the service force_over of contact_node (or of the "
+    "simulated bench), or the topic tcp_pose, where nobody measures the force.",
+    choices=("force_over", "tcp_pose"),
+    read_only=True,
+)
+
+ANSWER_WITHIN_S = 0.25
+"""A record waits no longer for its force, on the machine's clock; in simulated time nothing is late."""
+POLL_S = 5e-4
+
+
+class ContactSource(Protocol):
+    """Tells of an interval that has passed; called from a thread other than the executor's."""
+
+    def over(self, start_ns: int, end_ns: int) -> Contact:
+        """Contact from one ROS time to another [ns]; where the force is unknown it says why."""
+        ...
+
+
+def make_contact_source(node: ManagedNode) -> ContactSource:
+    """The source that the node's parameter names."""
+    (name,) = values(node, PARAMETER.name)
+    return MeasuredContact(node) if name == "force_over" else ToldPlace(node)
+
+
+class MeasuredContact:
+    """By the service `force_over`."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._client = node.create_client(ForceOver, "force_over")
+        node.resources.callback(node.destroy_client, self._client)
+        self._within_s = SIMULATED_SILENT_S if node.time_server else ANSWER_WITHIN_S
+
+    def over(self, start_ns: int, end_ns: int) -> Contact:
+        """See `ContactSource`."""
+        if not self._client.service_is_ready():
+            return Contact(reason=f"nobody serves {self._client.srv_name}")
+        request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
+        future = self._client.call_async(request)
+        deadline = time.monotonic() + self._within_s
+        while not future.done():
+            if time.monotonic() > deadline:
+                self._client.remove_pending_request(future)
+                return Contact(
+                    reason=f"no answer on {self._client.srv_name} within {self._within_s:g} s"
+                )
+            time.sleep(POLL_S)
+        told: ForceOver.Response = future.result()
+        contact = contact_from_message(told.tip_pose, told.force_n, told.force_std_n)
+        return replace(contact, coverage=told.coverage, reason=told.reason)
+
+
+class ToldPlace:
+    """By the topic `tcp_pose`: the force is measured by nobody."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._pose = PoseStamped()
+        node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+
+    def over(self, start_ns: int, end_ns: int) -> Contact:
+        """See `ContactSource`."""
+        nan = float("nan")
+        contact = contact_from_message(self._pose, nan, nan)
+        return replace(contact, reason="the force is not measured (contact_source)")
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self._pose = message

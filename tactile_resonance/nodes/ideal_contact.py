@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ideal contact, served as contact_node serves that of a robot: for those who integrate, without its 500 Hz.
+
+The tip is wherever a goal puts it, after a time, and the force is exactly the one asked for. There is no robot,
+no load cell and no control law behind it; what those do wrong is not to be seen here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from std_srvs.srv import Trigger
+
+from tactile_resonance import msg
+from tactile_resonance.action import MakeContact
+from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.nodes.goal_thread import in_thread
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.srv import ForceOver
+
+CONTACT_S = 0.5
+"""From a goal to the force that it asks for [s]: about as long as a robot that is near takes."""
+PUBLISH_S = 0.05
+MOST_STAYS = 1000
+
+
+@dataclass(frozen=True)
+class Stay:
+    """The tip somewhere, from a time on.
+
+    Attributes
+    ----------
+    since_ns : int
+        ROS time [ns].
+    force_n : float
+        0 in air.
+    pose : PoseStamped
+        With an empty frame where nobody has told.
+    """
+
+    since_ns: int
+    force_n: float
+    pose: PoseStamped
+
+
+class Stays:
+    """Where the tip was and how hard it pressed, and what follows for an interval."""
+
+    def __init__(self) -> None:
+        self._stays: deque[Stay] = deque([Stay(0, 0.0, PoseStamped())], maxlen=MOST_STAYS)
+
+    @property
+    def newest(self) -> Stay:
+        """The present one."""
+        return self._stays[-1]
+
+    def add(self, stay: Stay) -> None:
+        """The tip is somewhere else from now on."""
+        self._stays.append(stay)
+
+    def serve(
+        self, request: ForceOver.Request, response: ForceOver.Response
+    ) -> ForceOver.Response:
+        """The force over an interval, as the service `force_over` answers."""
+        start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
+        response.force_n = response.force_std_n = math.nan
+        if not start_ns < end_ns:
+            response.reason = "the interval is empty"
+            return response
+        total = seen_ns = 0.0
+        until_ns = end_ns
+        for stay in reversed(self._stays):
+            span_ns = max(0, until_ns - max(start_ns, stay.since_ns))
+            total, seen_ns = total + span_ns * stay.force_n, seen_ns + span_ns
+            if span_ns:
+                response.tip_pose = stay.pose
+            until_ns = min(until_ns, stay.since_ns)
+        response.coverage = seen_ns / (end_ns - start_ns)
+        response.force_n, response.force_std_n = total / seen_ns, 0.0
+        return response
+
+
+class IdealContact:
+    """Action `make_contact`, service `retract`; publishes `contact_state`, `tcp_pose`, `wrench`.
+
+    Parameters
+    ----------
+    node : ManagedNode
+        Whose they are, until it is cleaned up.
+    stays : Stays
+        Where it puts the tip.
+    force_at : callable
+        From a place (3,) in the base [m] and the force asked for [N]: the depth that brings it [m] and the
+        height of the surface above that place [m]; None where nothing is to be touched.
+    placed : callable
+        Called when the tip is put somewhere.
+    now_ns : callable
+        ROS time now [ns].
+    base_frame, frame_id : str
+    """
+
+    def __init__(
+        self,
+        node: ManagedNode,
+        stays: Stays,
+        force_at: Callable[[np.ndarray, float], tuple[float, float] | None],
+        placed: Callable[[], None],
+        now_ns: Callable[[], int],
+        base_frame: str,
+        frame_id: str,
+    ) -> None:
+        self._node, self._stays, self._force_at, self._placed = node, stays, force_at, placed
+        self._now_ns = now_ns
+        self._base_frame, self._frame_id = base_frame, frame_id
+        self._lock = threading.Lock()
+        self._drawn_back = threading.Event()
+        self._state, self._cause, self._message = "idle", "", ""
+        self._depth_m = math.nan
+        self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
+        self._poses = node.publish_on(PoseStamped, "tcp_pose", STREAM)
+        self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
+        node.serve(Trigger, "retract", self._on_retract)
+        node.every(PUBLISH_S, self._publish)
+        server = ActionServer(
+            node,
+            MakeContact,
+            "make_contact",
+            self._on_goal,
+            goal_callback=lambda _: GoalResponse.ACCEPT if node.active else GoalResponse.REJECT,
+            cancel_callback=self._on_cancel,
+        )
+        node.resources.callback(server.destroy)
+
+    async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
+        result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
+        if goal.is_cancel_requested:
+            goal.canceled()
+        elif result.reached:
+            goal.succeed()
+        else:
+            goal.abort()
+        return result
+
+    def _make(self, request: MakeContact.Goal) -> MakeContact.Result:
+        """Bring the tip there, taking as long as a contact takes."""
+        nan = math.nan
+        result = MakeContact.Result(cause="refused", force_n=nan, force_std_n=nan, depth_m=nan)
+        result.stiffness_n_per_m = result.surface_m = result.surface_std_m = nan
+        result.contact_s = result.total_s = result.peak_force_n = nan
+        if not self._lock.acquire(blocking=False):
+            result.message = "goal: a contact is under way"
+            return result
+        try:
+            result.message = self._refusal(request)
+            if result.message:
+                return result
+            self._drawn_back.clear()
+            self._say("approach", "", "")
+            began_ns = self._now_ns()
+            if not self._wait(CONTACT_S):
+                self._say("idle", "cancelled", "drawn back as asked for")
+                result.cause, result.message = self._cause, self._message
+                return result
+            place = request.pose.pose.position
+            found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
+            if found is None:
+                self._say("idle", "surface_missing", "nothing to touch there")
+                result.cause, result.message = self._cause, self._message
+                return result
+            self._depth_m, result.surface_m = found
+            now_ns = self._now_ns()
+            pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
+            pose.header.stamp = time_message(now_ns)
+            self._stays.add(Stay(now_ns, request.force_n, pose))
+            self._placed()
+            self._say("hold", "none", "")
+            result.reached, result.cause, result.depth_m = True, "none", self._depth_m
+            result.force_n, result.force_std_n = request.force_n, 0.0
+            result.peak_force_n, result.surface_std_m = request.force_n, 0.0
+            result.contact_s = result.total_s = (now_ns - began_ns) * 1e-9
+            return result
+        finally:
+            self._lock.release()
+
+    def _refusal(self, request: MakeContact.Goal) -> str:
+        """Why a goal is not taken; empty where it is."""
+        frame = request.pose.header.frame_id
+        if frame != self._base_frame:
+            return f"pose: in frame {frame!r}, accepted is {self._base_frame!r}"
+        if not 0 < request.force_n < math.inf:
+            return f"force_n: {request.force_n:g}, accepted is above 0"
+        if self._state != "idle":
+            return f"goal: refused in state {self._state}; accepted in idle"
+        return ""
+
+    def _wait(self, seconds: float) -> bool:
+        """Let time pass; False where the tip is to be drawn back meanwhile."""
+        server = self._node.time_server
+        if not server:
+            return not self._drawn_back.wait(seconds)
+
+        def check() -> None:
+            if self._drawn_back.is_set():
+                raise ClockLostError("drawn back")
+
+        try:
+            with contextlib.closing(SimulatedClock(server, "ideal contact")) as clock:
+                clock.wait_until(clock.now_ns() + round(seconds * 1e9), while_waiting=check)
+        except ClockLostError:
+            return False
+        return not self._drawn_back.is_set()
+
+    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
+        self._draw_back()
+        return CancelResponse.ACCEPT
+
+    def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._draw_back()
+        response.success = True
+        response.message = "asked; contact_state tells when it is idle"
+        return response
+
+    def _draw_back(self) -> None:
+        self._drawn_back.set()
+        if self._state == "hold":
+            now_ns = self._now_ns()
+            self._stays.add(Stay(now_ns, 0.0, self._stays.newest.pose))
+            self._depth_m = math.nan
+            self._placed()
+            self._say("idle", "cancelled", "drawn back as asked for")
+
+    def _say(self, state: str, cause: str, message: str) -> None:
+        self._state, self._cause, self._message = state, cause, message
+        self._publish()
+
+    def _publish(self) -> None:
+        now = time_message(self._now_ns())
+        stay = self._stays.newest
+        state = msg.ContactState(state=self._state, cause=self._cause, message=self._message)
+        state.header.stamp, state.header.frame_id = now, self._frame_id
+        holds = self._state == "hold"
+        state.force_n = stay.force_n if holds else math.nan
+        state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan
+        self._states.publish(state)
+        if stay.pose.header.frame_id:
+            pose = PoseStamped(header=stay.pose.header, pose=stay.pose.pose)
+            pose.header.stamp = now
+            self._poses.publish(pose)
+        wrench = WrenchStamped()
+        wrench.header.stamp, wrench.header.frame_id = now, self._frame_id
+        wrench.wrench.force.z = stay.force_n
+        self._wrenches.publish(wrench)

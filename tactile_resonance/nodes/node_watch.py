@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the nodes behind some topics are at work, from their signs of life."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from tactile_resonance import msg
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import BEATS
+
+SILENT_S = 1.5
+"""A node that was silent for longer hangs, or has ended [s of this machine's clock]."""
+SIMULATED_SILENT_S = 60.0
+"""In simulated time nothing is lost meanwhile: a node on a slow machine is waited for."""
+SAID_AFTER_S = 5.0
+"""Who is waited for is said after this."""
+
+
+@dataclass(frozen=True)
+class _Sign:
+    """The newest sign of life of a node."""
+
+    state: str
+    instance: int
+    heard_s: float
+    waiting_for: str = ""
+    waiting_since_s: float = 0.0
+
+
+Instances = dict[str, int]
+"""Of each node behind the topics, which start of it is at work."""
+
+
+class NodeWatch:
+    """Listens to the signs of life of those who publish some topics.
+
+    A publisher in the graph does not say that its node is there: one that was killed stays in it for as long
+    as its lease lasts, one that was started anew publishes nothing before it is active. A node that never
+    gave a sign of life, somebody else's, is taken to be at work while it publishes.
+
+    Parameters
+    ----------
+    node : ManagedNode
+    topics : sequence of str
+    silent_s : float
+        After so long without a sign of life a node is not at work.
+    """
+
+    def __init__(self, node: ManagedNode, topics: Sequence[str], silent_s: float) -> None:
+        self._node, self._topics, self._silent_s = node, tuple(topics), silent_s
+        self._lock = threading.Lock()
+        self._signs: dict[str, _Sign] = {}
+        self._said = ""
+        node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
+
+    def missing(self) -> str | None:
+        """A topic that nobody at work publishes, as a sentence; None: there is none."""
+        for topic in self._topics:
+            nodes = self._publishers(topic)
+            if not nodes:
+                return f"{topic}: nobody publishes it"
+            problems = [self._problem(node) for node in sorted(nodes)]
+            if all(problems):
+                return f"{topic}: {' and '.join(filter(None, problems))}"
+        return None
+
+    def instances(self, topics: Sequence[str]) -> Instances:
+        """Which starts of the nodes behind topics are at work now."""
+        names = {name for topic in topics for name in self._publishers(topic)}
+        with self._lock:
+            return {name: self._signs[name].instance for name in names if name in self._signs}
+
+    def changed(self, instances: Instances) -> str | None:
+        """Why one of these is not at work any more, as a sentence; None: all are."""
+        for name, instance in instances.items():
+            with self._lock:
+                sign = self._signs.get(name)
+            if sign is not None and sign.instance != instance:
+                return f"{name} was started anew"
+            if problem := self._problem(name):
+                return problem
+        return None
+
+    def waited_for(self, instances: Instances) -> str:
+        """Who of these has been silent for a while, or waits himself, for people; empty: nobody."""
+        now_s = time.monotonic()
+        for name in instances:
+            with self._lock:
+                sign = self._signs.get(name)
+            if sign is None:
+                continue
+            if now_s - sign.heard_s > SAID_AFTER_S:
+                return f"{name}, silent for {now_s - sign.heard_s:.0f} s"
+            if sign.waiting_for and now_s - sign.waiting_since_s > SAID_AFTER_S:
+                return f"{name}, which waits for {sign.waiting_for}"
+        return ""
+
+    @contextmanager
+    def doubted_after(self, error: type[Exception]) -> Iterator[None]:
+        """After such an error believe only what is told from then on: one of them may be another by now."""
+        try:
+            yield
+        except error:
+            with self._lock:
+                for name, sign in self._signs.items():
+                    self._signs[name] = _Sign("silent", sign.instance, sign.heard_s)
+            raise
+
+    def _problem(self, node: str) -> str:
+        """Why a node is not at work; empty where it is."""
+        with self._lock:
+            sign = self._signs.get(node)
+        if sign is None:
+            return ""
+        now_s = time.monotonic()
+        silent_s, waiting_s = now_s - sign.heard_s, now_s - sign.waiting_since_s
+        if silent_s > self._silent_s:
+            return f"{node} is silent for {silent_s:.1f} s"
+        if sign.waiting_for and waiting_s > self._silent_s:
+            return f"{node} waits for {sign.waiting_for}, which is silent for {waiting_s:.1f} s"
+        return "" if sign.state == "active" else f"{node} is {sign.state}, not active"
+
+    def _publishers(self, topic: str) -> set[str]:
+        """Names of the nodes that publish a topic."""
+        name = self._node.resolve_topic_name(topic)
+        infos = self._node.get_publishers_info_by_topic(name)
+        return {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+
+    def _on_beat(self, message: msg.Heartbeat) -> None:
+        now_s, since_s = time.monotonic(), 0.0
+        with self._lock:
+            before = self._signs.get(message.node)
+            if message.waiting_for:
+                same = before is not None and before.waiting_for == message.waiting_for
+                since_s = before.waiting_since_s if same and before is not None else now_s
+            self._signs[message.node] = _Sign(
+                message.state, message.instance, now_s, message.waiting_for, since_s
+            )

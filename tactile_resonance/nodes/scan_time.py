@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The time of a scan: the machine's, or that of a simulated bench, which the scan conducts."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.nodes.node_watch import SILENT_S, SIMULATED_SILENT_S
+
+
+class ScanTime:
+    """Says when simulated time may go on; on the machine's clock there is nothing to be said.
+
+    While a scan conducts, simulated time passes only where something needs it to: a contact on its way, a
+    block that is measured. It stands while nodes compute and while the scan decides.
+
+    Parameters
+    ----------
+    server : str
+        Address of the simulated time; empty: the machine's clock.
+
+    Attributes
+    ----------
+    simulated : bool
+    silent_s : float
+        After so long without a sign of life a node is given up [s of the machine's clock].
+    """
+
+    def __init__(self, server: str) -> None:
+        self._server = server
+        self.simulated = bool(server)
+        self.silent_s = SIMULATED_SILENT_S if server else SILENT_S
+        self._clock: SimulatedClock | None = None
+        self._offset_ns = self._last_ns = 0  # a bench that is started anew begins anew
+
+    def begin(self) -> None:
+        """Conduct; a bench that cannot be reached now is tried again by `go`."""
+        if self.simulated:
+            with contextlib.suppress(ClockLostError):
+                self._join()
+
+    def end(self) -> None:
+        """Conduct no more: time goes on at its own pace."""
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+
+    def now_s(self) -> float:
+        """Time for durations [s]; never goes back."""
+        if not self.simulated:
+            return time.monotonic()
+        if self._clock is not None:
+            try:
+                self._last_ns = self._clock.ask_ns() + self._offset_ns
+            except ClockLostError:
+                self.end()
+        return self._last_ns * 1e-9
+
+    def go(self) -> None:
+        """Let time go on as far as somebody needs it, until a device hands something over."""
+        if not self.simulated:
+            return
+        with contextlib.suppress(ClockLostError):
+            if self._clock is None:
+                self._join()
+            assert self._clock is not None
+            self._clock.go()
+            return
+        self.end()
+
+    def seed(self, *integers: int) -> None:
+        """Let the noise of the bench follow from integers, three at the most, from now on."""
+        if self._clock is not None:
+            try:
+                self._clock.seed(*integers)
+            except ClockLostError:
+                self.end()
+
+    def _join(self) -> None:
+        clock = self._clock = SimulatedClock(self._server, "scan_node", conducts=True)
+        self._offset_ns = max(self._offset_ns, self._last_ns - clock.now_ns())
