@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, CellSample, WrenchSample
 
 
 class Mount(str, Enum):
@@ -161,14 +161,6 @@ class Arm(Protocol):
 
     def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
         """Move the tip with a twist (6,) [m/s, rad/s] until the next command, without waiting."""
-        ...
-
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Begin a straight move of the tip to a pose, without waiting for its end."""
-        ...
-
-    def moving(self) -> bool:
-        """Whether the last `move` is still under way."""
         ...
 
     def stop(self, deceleration_m_s2: float) -> None:

@@ -142,15 +142,6 @@ class VirtualArm:
         if self._may_move():
             self._motion.speed(twist, acceleration_m_s2)
 
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Begin a straight move."""
-        if self._may_move():
-            self._motion.move(pose, speed_m_s, acceleration_m_s2)
-
-    def moving(self) -> bool:
-        """Whether the last move is still under way."""
-        return self._motion.moving()
-
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop."""
         self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
