@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The two devices that contact control needs: an arm and a force source.
 
-`drivers/` keeps these contracts on real protocols and on the wall clock, `simulation/` in lockstep
-virtual time.
+`drivers/` keeps these contracts on real protocols and in real time, `simulation/` in lockstep virtual
+time. The times of their samples are of the monotonic clock, or of the simulation's.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What counts as wrong in which state: the envelope, the forces, the clock and the time, in this order."""
+"""What counts as wrong in which state: the envelope, the forces and the time, in this order."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-
-CLOCK_BACK_NS = 1_000_000
-"""A clock that goes back by more was set: ages and times by it mean nothing for a moment [ns]."""
 
 
 class Judgement:
@@ -46,7 +43,6 @@ class Judgement:
         place: Place | None,
         wrenches: Sequence[WrenchSample],
         fault: ArmError | ForceError | None,
-        back_ns: int = 0,
     ) -> Breach | None:
         """The first thing that is wrong; in retraction and fault only what concerns the arm.
 
@@ -61,8 +57,6 @@ class Judgement:
             Since the last cycle, oldest first.
         fault : ArmError or ForceError or None
             What a device raised.
-        back_ns : int
-            By which the clock has gone back since the last cycle [ns].
         """
         if isinstance(fault, ArmError):
             return Breach(Cause.ARM_LINK, str(fault))
@@ -74,9 +68,6 @@ class Judgement:
             return None
         if isinstance(fault, ForceError):
             return Breach(Cause.FORCE_SOURCE, str(fault))
-        if back_ns > CLOCK_BACK_NS:
-            text = f"this machine's clock was set back by {back_ns * 1e-9:.3g} s"
-            return Breach(Cause.TIME, text)
         breach = taken or self._envelope.judge_motion(arm, place)
         if breach is None and state in TOUCHING and place.height_m < self._lowest_m:
             text = (

@@ -48,6 +48,8 @@ WISH_NS = 1_000_000_000
 class ContactController:
     """State machine, law and envelope of one tip.
 
+    All times are of one monotonic clock, that of the samples, or of a simulation's.
+
     Parameters
     ----------
     parameters : ContactParameters
@@ -75,7 +77,7 @@ class ContactController:
         self._observer = Observer(parameters, limits.stuck_samples)
         self._outcome = Outcome(self._observer, 0)
         self._height_m = 0.0
-        self._state_ns = self._now_ns = 0
+        self._state_ns = 0
         self._wish_retract = False
         self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 
@@ -180,13 +182,10 @@ class ContactController:
         """
         if self.state is State.IDLE or self.goal is None:
             return None
-        # how long a state has lasted does not change where the clock is set back
-        back_ns = max(0, self._now_ns - now_ns)
-        self._now_ns, self._state_ns = now_ns, self._state_ns - back_ns
         # of an arm whose place is no number nothing can be told but that
         place = None if arm is None or not is_finite(arm) else self._place(arm)
         breach = self._judgement.breach(
-            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault, back_ns
+            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
         )
         if breach is not None and self.state is State.FAULT:
             self._arm_was_bad = True  # nothing else counts in this state
@@ -221,7 +220,7 @@ class ContactController:
             self._enter(State.RETRACT, now_ns)
         elif self._wish_ns is None:
             self._wish_ns = now_ns
-        elif abs(now_ns - self._wish_ns) > WISH_NS:
+        elif now_ns - self._wish_ns > WISH_NS:
             self._wish_retract, self._wish_ns = False, None
 
     def _act(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
@@ -279,7 +278,7 @@ class ContactController:
         )
 
     def _enter(self, state: State, now_ns: int) -> None:
-        self.state, self._state_ns, self._now_ns = state, now_ns, now_ns
+        self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What force sensors and robots report: time-stamped wrenches and robot states."""
+"""What force sensors and robots report: time-stamped wrenches and robot states.
+
+Times are of the monotonic clock (``time.monotonic_ns``), or of a simulation's, which counts from 0.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class CellSample:
     Attributes
     ----------
     time_ns : int
-        When it was measured, on the clock of `WrenchSample`.
+        When it was measured.
     wrench : (6,) array
         What acts on the sensor, force [N] and torque about its origin [N m], in its own frame.
     overload : bool
@@ -66,7 +69,7 @@ class WrenchSample:
     Attributes
     ----------
     time_ns : int
-        When it was measured, on this machine's clock (``time.time_ns``; virtual time counts from 0).
+        When it was measured.
     force_n, torque_nm : (3,) arrays
         What the environment exerts on the tip [N], [N m], in the frame `tip`: pressing on tissue gives
         a positive z force.
@@ -87,7 +90,7 @@ class ArmSample:
     Attributes
     ----------
     time_ns : int
-        When it held, on the clock of `WrenchSample`.
+        When it held.
     robot_time_s : float
         The controller's own time stamp [s].
     tip : Pose

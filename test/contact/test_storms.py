@@ -90,11 +90,6 @@ def repaired(rig):
     rig.bench.arm.connect()
 
 
-def clock_set(rig, rng):
-    rig.clock.offset_ns += int(rng.choice([-3600, -1, -0.05, -0.005, 0.005, 0.05, 1, 3600]) * 1e9)
-    return lambda: None
-
-
 def unheard(rig, rng):
     rig.arm.deaf = True
     return lambda: setattr(rig.arm, "deaf", False)
@@ -166,7 +161,6 @@ FAULTS = {
     "pose aside": (of_samples("arm", moved_tip([0.02, 0, 0])), SHORT_S, True),
     "arm ahead": (late("arm", -1.0, -0.03), None, True),
     "arm late": (late("arm", 0.0, 0.05), None, True),
-    "clock set": (clock_set, None, True),
     "unheard": (unheard, SHORT_S, False),
     "tissue gone": (tissue_moved(-5e-3), None, False),
     "tissue up": (tissue_moved(3e-4), None, False),
