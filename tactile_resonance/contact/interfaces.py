@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.contact.samples import ArmSample, CellSample, WrenchSample
+from tactile_resonance.contact.vectors import Six
 
 
 class Mount(str, Enum):
@@ -29,7 +27,7 @@ class ForceFault(str, Enum):
 
     SILENT = "silent"
     STUCK = "stuck"
-    INVALID = "invalid"  # a value that is no number or outside of the sensor's range
+    INVALID = "invalid"  # a value that is not finite or outside of the sensor's range
     JUMP = "jump"  # a step that no contact makes: bias, sign
     OVERLOAD = "overload"
     INCOMPLETE = "incomplete"  # frames of a wrench lost more often than tolerated
@@ -159,8 +157,8 @@ class Arm(Protocol):
         """Newest state, without waiting. Raises `ArmError` where the link is dead or the state old."""
         ...
 
-    def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
-        """Move the tip with a twist (6,) [m/s, rad/s] until the next command, without waiting."""
+    def speed(self, twist: Six, acceleration_m_s2: float) -> None:
+        """Move the tip with a twist [m/s, rad/s] until the next command, without waiting."""
         ...
 
     def stop(self, deceleration_m_s2: float) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tactile_resonance.contact.envelope import Envelope, Place
-from tactile_resonance.contact.goal import TARED, TOUCHING, State
+from tactile_resonance.contact.goal import ENDED, TARED, TOUCHING, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters
@@ -30,9 +30,17 @@ class Judgement:
     def __init__(
         self, envelope: Envelope, observer: Observer, parameters: ContactParameters, start_ns: int
     ) -> None:
-        self._envelope, self._observer, self._parameters = envelope, observer, parameters
-        self._start_ns = start_ns
-        self._lowest_m = -parameters.search_m - envelope.limits.depth_m
+        self._envelope, self._observer, self._start_ns = envelope, observer, start_ns
+        limits = envelope.limits
+        self._lowest_m = -parameters.search_m - limits.depth_m
+        self._longest_s = {
+            State.TRAVEL: limits.travel_s,
+            State.TARE: 2 * parameters.tare_s + 2.0,
+            State.APPROACH: limits.approach_s,
+            State.CONTACT: limits.press_s,
+            State.SETTLE: limits.press_s,
+            State.HOLD: limits.hold_s,
+        }
 
     def breach(
         self,
@@ -64,7 +72,7 @@ class Judgement:
         if breach is not None or arm is None or place is None:
             return breach
         taken = self._observer.take(wrenches, arm.time_ns, place.height_m)
-        if state in (State.RETRACT, State.FAULT):
+        if state in ENDED:
             return None
         if isinstance(fault, ForceError):
             return Breach(Cause.FORCE_SOURCE, str(fault))
@@ -81,15 +89,7 @@ class Judgement:
         return breach or self._judge_time(state, since_s)
 
     def _judge_time(self, state: State, since_s: float) -> Breach | None:
-        limits, tare = self._envelope.limits, 2 * self._parameters.tare_s + 2.0
-        most = {
-            State.TRAVEL: limits.travel_s,
-            State.TARE: tare,
-            State.APPROACH: limits.approach_s,
-            State.CONTACT: limits.press_s,
-            State.SETTLE: limits.press_s,
-            State.HOLD: limits.hold_s,
-        }[state]
+        most = self._longest_s[state]
         if since_s <= most:
             return None
         if state is State.HOLD:

@@ -18,6 +18,8 @@ Turn = tuple[float, float, float, float, float, float, float, float, float]
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 NO_TURN: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_NAN = math.nan
+_UNKNOWN: Turn = (_NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
 
 
 def vector(values: Iterable[float]) -> Vector:
@@ -92,11 +94,13 @@ def turn_product(a: Turn, b: Turn) -> Turn:
 
 
 def turn_from_vector(rotation_rad: Vector) -> Turn:
-    """Return the rotation of a rotation vector [rad] (Rodrigues' formula)."""
+    """Return the rotation of a rotation vector [rad] (Rodrigues' formula); NaN where that is not finite."""
     x, y, z = rotation_rad
     angle = math.hypot(x, y, z)
     if angle == 0.0:
         return NO_TURN
+    if not angle < math.inf:
+        return _UNKNOWN
     # 1 - cos(angle) by half the angle: the difference has no digits left where the angle is small
     half = math.sin(angle / 2) / angle
     sine, versine = 2 * half * math.cos(angle / 2), 2 * half * half

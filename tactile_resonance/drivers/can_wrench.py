@@ -17,6 +17,7 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
+from tactile_resonance.contact.vectors import six
 from tactile_resonance.drivers.can_bus import Flow, one_line, open_bus
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, Command
 from tactile_resonance.drivers.force_config import ForceConfig
@@ -295,7 +296,7 @@ class CanWrench:
         if np.isnan(counts).any():
             name = CHANNELS[int(np.flatnonzero(np.isnan(counts))[0])]
             raise ForceError(ForceFault.INVALID, f"{self._where}: {name} is no number")
-        wrench = self._can.scale @ counts
+        wrench = six(self._can.scale @ counts)
         overload = self._checks.check(wrench, full_scale)
         self._samples.append(CellSample(self._stamp_ns(message), wrench, overload))
         self.received += 1

@@ -12,6 +12,7 @@ import numpy as np
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import ArmSample, CellSample
+from tactile_resonance.contact.vectors import rotated_back, turn_from_vector
 from tactile_resonance.drivers.force_config import ForceConfig
 
 
@@ -73,10 +74,8 @@ class RtdeWrench:
             return []
         self._robot_time_s, self._new_s = state.robot_time_s, now_s
         assert state.tool_wrench is not None
-        turn = state.tip.rotation
-        wrench = np.concatenate(
-            [turn.inv().apply(state.tool_wrench[:3]), turn.inv().apply(state.tool_wrench[3:])]
-        )
+        turn, (x, y, z, tx, ty, tz) = turn_from_vector(state.rotation_rad), state.tool_wrench
+        wrench = *rotated_back(turn, (x, y, z)), *rotated_back(turn, (tx, ty, tz))
         overload = self._checks.check(wrench)
         stamp_ns = state.time_ns - round(self._config.latency_s * 1e9)
         return [CellSample(stamp_ns, wrench, overload)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample, Pose
+from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import ClientState
@@ -105,11 +106,12 @@ class UrArm:
         return ArmSample(
             time_ns=time.time_ns() - age_ns,
             robot_time_s=client.robot_time_s,
-            tip=Pose.from_vector(np.array(client.tip_pose)),
-            tip_velocity=np.array(client.tip_speed),
+            position_m=vector(client.tip_pose[:3]),
+            rotation_rad=vector(client.tip_pose[3:]),
+            velocity=six(client.tip_speed),
             moving_allowed=fault is None,
             message="" if fault is None else fault[1],
-            tool_wrench=np.array(client.tip_force),
+            tool_wrench=six(client.tip_force),
         )
 
     def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:

@@ -77,9 +77,9 @@ def wrench_message(wrenches: Sequence[WrenchSample], cycle: Cycle, frame_id: str
     wrench = WrenchStamped()
     wrench.header.stamp = time_message((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
     wrench.header.frame_id = frame_id
-    count, parts = len(wrenches), wrench.wrench
-    force_n = sum(sample.force_n for sample in wrenches) / count - cycle.bias_n
-    torque_nm = sum(sample.torque_nm for sample in wrenches) / count
+    parts = wrench.wrench
+    force_n = np.mean([sample.force_n for sample in wrenches], axis=0) - cycle.bias_n
+    torque_nm = np.mean([sample.torque_nm for sample in wrenches], axis=0)
     parts.force.x, parts.force.y, parts.force.z = force_n.tolist()
     parts.torque.x, parts.torque.y, parts.torque.z = torque_nm.tolist()
     return wrench
@@ -92,7 +92,7 @@ def pose_message(cycle: Cycle, base_frame: str) -> PoseStamped:
     pose.header.stamp = time_message(cycle.arm.time_ns)
     pose.header.frame_id = base_frame
     place, turn = pose.pose.position, pose.pose.orientation
-    place.x, place.y, place.z = cycle.arm.tip.position_m.tolist()
+    place.x, place.y, place.z = cycle.arm.position_m
     turn.x, turn.y, turn.z, turn.w = cycle.arm.tip.rotation.as_quat().tolist()
     return pose
 

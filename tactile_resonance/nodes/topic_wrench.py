@@ -6,7 +6,6 @@ from __future__ import annotations
 import time
 from collections import deque
 
-import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -113,7 +112,7 @@ class TopicWrench:
         if not self._listening or self._fault is not None:
             return
         force, torque = message.wrench.force, message.wrench.torque
-        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        wrench = (force.x, force.y, force.z, torque.x, torque.y, torque.z)
         stamp_ns = time_from_message(message.header.stamp)
         try:
             self._check_stamp(stamp_ns)

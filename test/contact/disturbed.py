@@ -2,7 +2,7 @@
 """A contact whose arm and force source can be made to lie, and what must hold whatever they say."""
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ class Lying:
         return getattr(self._device, name)
 
     def _seen(self, sample):
-        return self.change(replace(sample, time_ns=sample.time_ns - self.late_ns))
+        return self.change(sample._replace(time_ns=sample.time_ns - self.late_ns))
 
 
 class LyingArm(Lying):

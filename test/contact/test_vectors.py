@@ -97,6 +97,14 @@ def test_no_rotation_is_exact():
     assert vector_from_turn(NO_TURN) == ZERO
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_no_rotation_and_no_error(value):
+    turn = turn_from_vector((0.1, value, 0.2))
+    assert np.isnan(turn).all()
+    assert np.isnan(vector_from_turn(turn)).all()
+    assert np.isnan(rotated(turn, (1.0, 2.0, 3.0))).all()
+
+
 @pytest.mark.parametrize("diagonal", [(1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
 def test_half_turns_about_the_axes_are_exact(diagonal):
     turn = tuple(np.diag(diagonal).astype(float).ravel().tolist())
