@@ -147,7 +147,7 @@ def _respond(arm: UrArm, sign: int) -> tuple[float, float]:
     commanded_ns = time.time_ns()
     arm.speed(np.array([0, 0, sign * SPEED_M_S, 0, 0, 0]), ACCELERATION_M_S2)
     end_s = time.monotonic() + LOST_S
-    while abs((sample := arm.state()).tip_velocity[2]) <= MOVED_M_S:
+    while abs((sample := arm.state()).velocity[2]) <= MOVED_M_S:
         if time.monotonic() > end_s:
             raise ValueError(f"benchmark robot: no motion within {LOST_S:g} s of a command")
         time.sleep(0.0001)

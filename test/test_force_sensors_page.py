@@ -31,10 +31,11 @@ def test_the_payload_is_found(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     turns = [[0, 0, 0], [0.9, 0, 0], [-0.9, 0, 0], [0, 0.9, 0], [0, -0.9, 0]]
     rotations = Rotation.from_rotvec(turns).as_matrix()
-    payload = Payload(0.06, np.array([0.0, 0.004, 0.03]))
+    payload = Payload(0.06, (0.0, 0.004, 0.03))
+    loads = np.array([payload.wrench(tuple(rotation.ravel())) for rotation in rotations])
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((5, 1000, 6)) * np.repeat([1e-3, 5e-5], 3)
-    readings = payload.wrench(rotations)[:, None] + [0.02, 0, 0.03, 0, 0, 0] + noise
+    readings = loads[:, None] + [0.02, 0, 0.03, 0, 0, 0] + noise
     np.savez("payload.npz", rotations=rotations, readings=readings)
     exec(compile(block_with("identify_payload"), str(PAGE), "exec"), {})
     text = capsys.readouterr().out
@@ -63,5 +64,5 @@ def test_the_cell_is_read(tmp_path, monkeypatch, capsys):
         ended.set()
         thread.join()
         bus.close()
-    lines = re.findall(r"^\d{19} \[", capsys.readouterr().out, re.MULTILINE)
+    lines = re.findall(r"^\d{19} \(", capsys.readouterr().out, re.MULTILINE)
     assert len(lines) > 500

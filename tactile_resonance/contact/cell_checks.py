@@ -6,11 +6,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from operator import gt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.vectors import Six
 
 FALSE_ALARM = 1e-12
 """Accepted probability that noise alone repeats a sample so often that it is called stuck."""
@@ -92,13 +93,13 @@ class CellChecks:
 
     def __init__(self, info: ForceInfo, range_nm: float, limits: CellLimits) -> None:
         self._limits = limits
-        self._range = np.repeat([info.range_n, range_nm], 3)
+        self._range = (*[info.range_n] * 3, *[range_nm] * 3)
         self._stuck_at = limits.stuck_samples or samples_until_stuck(info)
         self.restart()
 
     def restart(self) -> None:
         """Forget what was seen."""
-        self._last: NDArray[np.float64] | None = None
+        self._last: Six | None = None
         self._equal = self._over = 0
         self._recent: deque[bool] = deque(maxlen=LOST_WITHIN)
 
@@ -112,8 +113,8 @@ class CellChecks:
                 f"accepted are {self._limits.lost_tolerated}",
             )
 
-    def check(self, wrench: NDArray[np.float64], overload: bool = False) -> bool:
-        """Look at the next wrench (6,) of the sensor.
+    def check(self, wrench: Six, overload: bool = False) -> bool:
+        """Look at the next wrench of the sensor.
 
         Returns
         -------
@@ -126,13 +127,14 @@ class CellChecks:
             Invalid, overload, stuck or jump.
         """
         self._recent.append(False)
-        if not np.all(np.isfinite(wrench)):
-            axis = int(np.flatnonzero(~np.isfinite(wrench))[0])
-            raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is no number")
-        over = overload or bool(np.any(np.abs(wrench) > self._range))
+        if not all(map(math.isfinite, wrench)):
+            axis = next(k for k, value in enumerate(wrench) if not math.isfinite(value))
+            raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is not finite: {wrench[axis]}")
+        over = overload or any(map(gt, map(abs, wrench), self._range))
         self._over = self._over + 1 if over else 0
         if self._over >= self._limits.overload_samples:
-            axis = int(np.argmax(np.abs(wrench) / self._range))
+            shares = [abs(value) / most for value, most in zip(wrench, self._range, strict=True)]
+            axis = shares.index(max(shares))
             raise ForceError(
                 ForceFault.OVERLOAD,
                 f"{self._over} samples beyond the range; {_AXES[axis]} is {wrench[axis]:.4g}, "
@@ -141,11 +143,12 @@ class CellChecks:
         last, self._last = self._last, wrench
         if last is None:
             return over
-        step = wrench - last
-        self._equal = 0 if step.any() else self._equal + 1
+        self._equal = self._equal + 1 if wrench == last else 0
         if self._stuck_at is not None and self._equal + 1 >= self._stuck_at:
             raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
-        largest = float(np.abs(step[:3]).max())
+        largest = max(
+            abs(wrench[0] - last[0]), abs(wrench[1] - last[1]), abs(wrench[2] - last[2])
+        )
         if largest > self._limits.jump_n and not over:
             raise ForceError(
                 ForceFault.JUMP,

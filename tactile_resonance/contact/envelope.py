@@ -8,17 +8,13 @@ says wins. It is software on an ordinary computer, not a certified safety functi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.contact.vectors import ZERO, Six, Vector, dot
 
 WALL_TIME_S = 0.1
 """Towards a wall of the workspace the tip goes no faster than this brings it there [s]."""
@@ -33,13 +29,12 @@ SPEED_MARGIN = 1.5
 """A measured speed may exceed a limit by this factor: vibration and noise of the encoders."""
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Where the tip is with respect to the surface.
 
     Attributes
     ----------
-    normal : (3,) array
+    normal : tuple of 3 floats
         Out of the tissue, in the base.
     height_m : float
         Above the expected first touch, along the normal [m].
@@ -51,7 +46,7 @@ class Place:
         Height of the housing above the surface [m]; None where it is not watched.
     """
 
-    normal: FloatArray
+    normal: Vector
     height_m: float
     depth_m: float | None
     misalignment_rad: float
@@ -63,6 +58,11 @@ class Envelope:
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
+        self._least_upright = math.cos(limits.tilt_rad)
+        reach_m = WALL_TIME_S * limits.free_speed_m_s
+        # where no speed that is allowed is too much for the walls
+        self._amid_low_m = tuple(low + reach_m for low in limits.workspace.low_m)
+        self._amid_high_m = tuple(high - reach_m for high in limits.workspace.high_m)
 
     def judge_arm(self, now_ns: int, arm: ArmSample | None) -> Breach | None:
         """Whether the arm's data are fresh and good and it is where it may be."""
@@ -75,20 +75,20 @@ class Envelope:
             return Breach(Cause.ARM_STALE, text)
         if not arm.moving_allowed:
             return Breach(Cause.ARM_STOPPED, f"the arm may not move: {arm.message}")
-        place = arm.tip.position_m
         if not is_finite(arm):
-            return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is no number")
+            return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is not finite")
         box = limits.workspace
-        for axis, x, low, high in zip("xyz", place, box.low_m, box.high_m, strict=True):
-            if not low <= x <= high:
-                text = f"tip at {axis} = {x:.4f} m, workspace {low:g} to {high:g} m"
-                return Breach(Cause.WORKSPACE, text)
+        if not _inside(arm.position_m, box.low_m, box.high_m):
+            x, y, z = arm.position_m
+            text = f"tip at {x:.4f}, {y:.4f}, {z:.4f} m, workspace {box.low_m} to {box.high_m} m"
+            return Breach(Cause.WORKSPACE, text)
         # +z of the tip against the vertical: Rodrigues' formula for the one element needed
-        rx, ry, rz = (float(value) for value in arm.tip.rotation_rad)
-        angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+        rx, ry, rz = arm.rotation_rad
+        angle = math.hypot(rx, ry, rz)
         share = (rz / angle) ** 2 if angle > 0 else 1.0
-        upright = math.cos(angle) + (1 - math.cos(angle)) * share
-        if upright < math.cos(limits.tilt_rad):
+        cosine = math.cos(angle)
+        upright = cosine + (1 - cosine) * share
+        if upright < self._least_upright:
             tilt = math.acos(max(-1.0, upright))
             return Breach(
                 Cause.TILT, f"tip tilted by {tilt:.3f} rad, limit {limits.tilt_rad:g} rad"
@@ -102,7 +102,7 @@ class Envelope:
             text = f"{1e3 * place.depth_m:.2f} mm past the first touch, limit {1e3 * limits.depth_m:g} mm"
             return Breach(Cause.DEPTH, text)
         if place.height_m < limits.near_m:
-            inwards = -float(place.normal @ arm.tip_velocity[:3])
+            inwards = -dot(place.normal, arm.velocity[:3])
             if inwards > SPEED_MARGIN * limits.near_speed_m_s:
                 text = f"{1e3 * inwards:.1f} mm/s towards the surface near it"
                 return Breach(Cause.SPEED, f"{text}, limit {1e3 * limits.near_speed_m_s:g} mm/s")
@@ -120,7 +120,7 @@ class Envelope:
         stale = self.judge_force_age(now_ns, watch)
         if stale is not None:
             return stale
-        x, y, z = (float(value) for value in watch.force_n)
+        x, y, z = watch.force_n
         if z > limits.hard_force_n:
             text = f"{1e3 * z:.1f} mN on the tip, beyond the hard limit"
             return Breach(Cause.FORCE_HARD, f"{text} of {1e3 * limits.hard_force_n:g} mN")
@@ -148,59 +148,73 @@ class Envelope:
             return Breach(Cause.FORCE_STALE, f"{text}, limit {1e3 * limit:g} ms")
         return None
 
-    def bound(self, twist: FloatArray, position_m: FloatArray, place: Place) -> FloatArray:
-        """Return the twist (6,) [m/s, rad/s] with every part that breaks a limit taken back.
+    def bound(self, twist: Six, position_m: Vector, place: Place) -> Six:
+        """Return the twist [m/s, rad/s] with every part that breaks a limit taken back.
 
-        What is not a number stops the tip. Speeds shrink, they do not turn round; in contact the
-        parts along the surface and into it shrink apart.
+        What is not finite stops the tip. Speeds shrink, they do not turn round; in contact the parts
+        along the surface and into it shrink apart.
         """
         limits = self.limits
-        if not np.isfinite(twist).all():
-            return np.zeros(6)
-        velocity, angular = twist[:3].copy(), twist[3:].copy()
-        normal = place.normal
-        across = float(normal @ velocity)
+        if not math.isfinite(sum(twist)):
+            return *ZERO, *ZERO
+        x, y, z, turn_x, turn_y, turn_z = twist
+        nx, ny, nz = place.normal
+        across = nx * x + ny * y + nz * z
         if place.depth_m is not None:
-            along = velocity - across * normal
-            along *= _shrink(along, limits.lateral_speed_m_s)
+            x, y, z = x - across * nx, y - across * ny, z - across * nz
+            share = _shrink(math.hypot(x, y, z), limits.lateral_speed_m_s)
             if across < 0:
                 across = max(across, -limits.contact_speed_m_s)
                 if place.depth_m >= limits.depth_m:
                     across = 0.0
-            velocity = along + across * normal
-        across = float(normal @ velocity)
-        if across < -ROUNDING * float(np.linalg.norm(velocity)):
+            x, y, z = share * x + across * nx, share * y + across * ny, share * z + across * nz
+            across = nx * x + ny * y + nz * z
+        speed, most = math.hypot(x, y, z), limits.free_speed_m_s
+        if across < -ROUNDING * speed:
             # further up just so fast that it can slow down before it is near
             room = max(0.0, place.height_m - limits.near_m + REACTION_S * across)
-            most = math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room)
-            velocity *= _shrink(velocity, most)
-        velocity *= _shrink(velocity, limits.free_speed_m_s)
-        # the whole velocity shrinks before a wall, so that no other limit is broken by it
-        box = limits.workspace
-        for axis in range(3):
-            speed = velocity[axis]
-            wall = box.high_m[axis] if speed > 0 else box.low_m[axis]
-            room = max(0.0, (wall - position_m[axis]) * math.copysign(1, speed)) / WALL_TIME_S
+            most = min(most, math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room))
+        share = _shrink(speed, most)
+        x, y, z = share * x, share * y, share * z
+        if not _inside(position_m, self._amid_low_m, self._amid_high_m):
+            x, y, z = self._before_walls((x, y, z), position_m)
+        share = _shrink(math.hypot(turn_x, turn_y, turn_z), limits.angular_speed_rad_s)
+        return x, y, z, share * turn_x, share * turn_y, share * turn_z
+
+    def _before_walls(self, velocity_m_s: Vector, position_m: Vector) -> Vector:
+        """The whole velocity shrinks before a wall, so that no other limit is broken by it."""
+        box, (x, y, z) = self.limits.workspace, velocity_m_s
+        velocity = [x, y, z]
+        for axis in (0, 1, 2):
+            speed, place_m = velocity[axis], position_m[axis]
+            room = box.high_m[axis] - place_m if speed > 0 else place_m - box.low_m[axis]
+            room = max(0.0, room) / WALL_TIME_S
             if abs(speed) > room:
-                if abs(speed) <= ROUNDING * float(np.linalg.norm(velocity)):
+                if abs(speed) <= ROUNDING * math.hypot(*velocity):
                     velocity[axis] = 0.0  # along the wall: it stops nothing
                 else:
-                    velocity *= room / abs(speed)
-        angular *= _shrink(angular, limits.angular_speed_rad_s)
-        return np.concatenate([velocity, angular])
+                    velocity = [room / abs(speed) * part for part in velocity]
+        x, y, z = velocity
+        return x, y, z
 
 
 def _age(age_s: float) -> str:
     return f"{1e3 * age_s:.0f} ms old" if age_s > 0 else f"{-1e3 * age_s:.0f} ms ahead of the clock"
 
 
+def _inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
+    """Whether a place is in a box, its walls included."""
+    x, y, z = place_m
+    return (
+        low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]
+    )
+
+
 def is_finite(arm: ArmSample) -> bool:
-    """Whether pose and velocity of an arm are numbers."""
-    numbers = [arm.tip.position_m, arm.tip.rotation_rad, arm.tip_velocity]
-    return bool(np.isfinite(np.concatenate(numbers)).all())
+    """Whether pose and velocity of an arm are finite."""
+    return math.isfinite(sum(arm.position_m) + sum(arm.rotation_rad) + sum(arm.velocity))
 
 
-def _shrink(vector: FloatArray, most: float) -> float:
-    """Factor that brings a vector down to a length, 1 where it is within."""
-    length = math.sqrt(float(vector @ vector))
+def _shrink(length: float, most: float) -> float:
+    """Factor that brings a length down to the most that is allowed, 1 where it is within."""
     return 1.0 if length <= most else most / length

@@ -68,16 +68,21 @@ class TouchDetector:
     THRESHOLD = 5.0  # standard deviations: some 1e-7 false alarms per window
 
     def __init__(self, noise_n: float, tare_std_n: float) -> None:
-        self._limits = [
-            (n, self.THRESHOLD * math.sqrt(noise_n**2 / n + tare_std_n**2)) for n in self.WINDOWS
-        ]
-        self._recent: deque[float] = deque(maxlen=self.WINDOWS[-1])
+        self._limits_n = [
+            n * self.THRESHOLD * math.sqrt(noise_n**2 / n + tare_std_n**2) for n in self.WINDOWS
+        ]  # of the sums
+        self._sums_n = [0.0] * len(self.WINDOWS)
+        self._recent: deque[float] = deque(maxlen=self.WINDOWS[-1] + 1)
 
     def add(self, force_n: float) -> bool:
         """Take one more force; return whether there is contact."""
-        self._recent.append(force_n)
-        values = list(self._recent)
-        return any(len(values) >= n and sum(values[-n:]) / n > limit for n, limit in self._limits)
+        recent, sums = self._recent, self._sums_n
+        recent.append(force_n)
+        count, found = len(recent), False
+        for k, n in enumerate(self.WINDOWS):
+            sums[k] += force_n - recent[-n - 1] if count > n else force_n
+            found = found or (count >= n and sums[k] > self._limits_n[k])
+        return found
 
 
 class ContactFilter:
@@ -95,6 +100,13 @@ class ContactFilter:
         Unseen vibration of the tip [m] rms: at stiff tissue it adds to the noise.
     walk_per_sqrt_s : float
         Random walk of ln C [1/sqrt(s)]; that of its rate is five times as large per second.
+
+    Attributes
+    ----------
+    surface_m : float
+        Height of the tip at first touch [m].
+    c_rate_per_s : float
+        Relative change of C [1/s].
     """
 
     def __init__(
@@ -112,75 +124,98 @@ class ContactFilter:
         mean, covariance = touch_posterior(
             np.asarray(heights_m, float), np.asarray(forces_n, float), noise_n, beam_n_per_m
         )
-        self._x = [mean[0], mean[1], RATE_MEAN_PER_S]
-        self._p = np.zeros((3, 3))
-        self._p[:2, :2] = covariance
-        self._p[2, 2] = RATE_STD_PER_S**2
+        self.surface_m, self._ln_c = float(mean[0]), float(mean[1])
+        self.c_rate_per_s = RATE_MEAN_PER_S
+        # covariance of (surface, ln C, rate): its upper triangle, row by row
+        (p00, p01), (_, p11) = covariance.tolist()
+        self._p = (p00, p01, 0.0, p11, 0.0, RATE_STD_PER_S**2)
 
     @property
     def c(self) -> float:
         """C [N/m^1.5]."""
-        return math.exp(self._x[1])
-
-    @property
-    def c_rate_per_s(self) -> float:
-        """Relative change of C [1/s]."""
-        return self._x[2]
+        return math.exp(self._ln_c)
 
     def predict(self, dt_s: float) -> None:
         """Let time pass."""
-        # the rate dies out as relaxation does; what it adds is bounded, also over a clock set by an hour
-        keep = math.exp(-dt_s)
+        # the rate dies out as relaxation does; what it adds is bounded, however long nothing came
         adds_s = -math.expm1(-dt_s)
-        self._x[1] += self._x[2] * adds_s
-        self._x[2] *= keep
-        f = np.array([[1, 0, 0], [0, 1, adds_s], [0, 0, keep]])
-        self._p = f @ self._p @ f.T
+        keep = 1.0 - adds_s
+        self._ln_c += self.c_rate_per_s * adds_s
+        self.c_rate_per_s *= keep
+        # F P F' + Q with F = [[1, 0, 0], [0, 1, adds], [0, 0, keep]]
+        p00, p01, p02, p11, p12, p22 = self._p
         walk = self._walk**2 * dt_s
-        self._p[1, 1] += walk
-        self._p[2, 2] += 25 * walk
+        mixed = p12 + adds_s * p22
+        self._p = (
+            p00,
+            p01 + adds_s * p02,
+            keep * p02,
+            p11 + adds_s * (p12 + mixed) + walk,
+            keep * mixed,
+            keep * keep * p22 + 25 * walk,
+        )
 
     def update(self, height_m: float, force_n: float) -> float:
         """Take one force measured at a height of the tip; return its innovation in deviations."""
-        depth = self._x[0] - height_m
+        depth = self.surface_m - height_m
         expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
-        h = np.array([slope, per_ln_c, 0.0])
-        ph = self._p @ h
+        p00, p01, p02, p11, p12, p22 = self._p
+        # P h with h = (slope, per_ln_c, 0)
+        ph0 = p00 * slope + p01 * per_ln_c
+        ph1 = p01 * slope + p11 * per_ln_c
+        ph2 = p02 * slope + p12 * per_ln_c
         noise = self._noise_n**2 + (slope * self._vibration_m) ** 2
-        spread = float(h @ ph) + noise
-        gain = ph / spread
+        spread = slope * ph0 + per_ln_c * ph1 + noise
         error = force_n - expected
+        step = error / spread
         # a step of ln C beyond 1 is beyond what the linearisation stands for
-        scale = min(1.0, 1.0 / max(1e-12, abs(gain[1] * error)))
-        for n in range(3):
-            self._x[n] += float(gain[n]) * error * scale
-        self._p = self._p - np.outer(gain, ph)
+        if abs(ph1 * step) > 1.0:
+            step /= abs(ph1 * step)
+        self.surface_m += ph0 * step
+        self._ln_c += ph1 * step
+        self.c_rate_per_s += ph2 * step
+        gain0, gain1, gain2 = ph0 / spread, ph1 / spread, ph2 / spread
+        self._p = (
+            p00 - gain0 * ph0,
+            p01 - gain0 * ph1,
+            p02 - gain0 * ph2,
+            p11 - gain1 * ph1,
+            p12 - gain1 * ph2,
+            p22 - gain2 * ph2,
+        )
         return error / math.sqrt(spread)
+
+    def force_at(self, height_m: float) -> float:
+        """Return the force at a height of the tip [N]."""
+        return hertz.force(self.surface_m - height_m, self.c, self._beam)[0]
 
     def estimate(self, height_m: float) -> ContactEstimate:
         """Return what holds at a height of the tip."""
-        depth = self._x[0] - height_m
+        depth = self.surface_m - height_m
         expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
         return ContactEstimate(
             force_n=expected,
-            force_std_n=self.force_std(slope, per_ln_c),
+            force_std_n=self._force_std(slope, per_ln_c),
             stiffness_n_per_m=slope,
             depth_m=depth,
-            depth_std_m=math.sqrt(max(0.0, float(self._p[0, 0]))),
-            surface_m=self._x[0],
+            depth_std_m=math.sqrt(max(0.0, self._p[0])),
+            surface_m=self.surface_m,
         )
 
-    def height_for(self, force_n: float) -> tuple[float, float, float]:
-        """Return the height of the tip for a force [m], the stiffness there, the force's deviation."""
-        depth = hertz.depth(force_n, self.c, self._beam)
-        _, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
-        return self._x[0] - depth, slope, self.force_std(slope, per_ln_c)
+    def depth_for(self, force_n: float) -> float:
+        """Return the depth of the tip for a force [m]."""
+        return hertz.depth(force_n, self.c, self._beam)
 
-    def force_std(self, slope: float, per_ln_c: float) -> float:
+    def slope_at(self, depth_m: float) -> tuple[float, float]:
+        """Return the stiffness at a depth [N/m], and the standard deviation of the force there [N]."""
+        _, slope, per_ln_c = hertz.force(depth_m, self.c, self._beam)
+        return slope, self._force_std(slope, per_ln_c)
+
+    def _force_std(self, slope: float, per_ln_c: float) -> float:
         """Return the standard deviation of a force with these slopes [N]."""
-        p = self._p
-        variance = slope**2 * p[0, 0] + per_ln_c**2 * p[1, 1] + 2 * slope * per_ln_c * p[0, 1]
-        return math.sqrt(max(0.0, float(variance)))
+        p00, p01, _, p11, _, _ = self._p
+        variance = slope**2 * p00 + per_ln_c**2 * p11 + 2 * slope * per_ln_c * p01
+        return math.sqrt(max(0.0, variance))
 
 
 def touch_posterior(

@@ -4,16 +4,16 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections import deque
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.contact.vectors import ZERO, Vector
 
 RATE_WINDOW_NS = 10_000_000
-KEEP_NS = 200_000_000
+RECENT, LONGEST_GAP_NS = 64, 200_000_000
+"""So many forces are kept for the rate, none from before a longer gap [ns]."""
 
 
 class ForceWatch:
@@ -23,34 +23,40 @@ class ForceWatch:
     ----------
     stuck_samples : int
         So many equal forces along z in a row are a stuck sensor, or one at the end of its range.
+    mean_s : float
+        Over which the force is averaged [s].
 
     Attributes
     ----------
-    force_n : (3,) array
+    force_n : tuple of 3 floats
         Newest force at the tip, less the bias [N].
     peak_n : float
         Largest force along +z since the bias was set [N]; 0 before.
     """
 
-    def __init__(self, stuck_samples: int) -> None:
+    def __init__(self, stuck_samples: int, mean_s: float) -> None:
         self._stuck_samples = stuck_samples
         self._equal = 1
         self._last: WrenchSample | None = None
-        self._recent: deque[tuple[int, float]] = deque()  # time, force along z
-        self._bias_n: NDArray[np.float64] | None = None
-        self.force_n: NDArray[np.float64] = np.zeros(3)
+        self._times_ns: deque[int] = deque(maxlen=RECENT)
+        self._forces_n: deque[float] = deque(maxlen=RECENT)  # along z, at these times
+        self._mean = RunningMean(round(mean_s * 1e9))
+        self._bias_n: Vector | None = None
+        self.force_n: Vector = ZERO
         self.peak_n = 0.0
 
     @property
-    def bias_n(self) -> NDArray[np.float64]:
-        """What is taken off (3,) [N]; zeros before the tare."""
-        return np.zeros(3) if self._bias_n is None else self._bias_n
+    def bias_n(self) -> Vector:
+        """What is taken off [N]; zeros before the tare."""
+        return ZERO if self._bias_n is None else self._bias_n
 
-    def set_bias(self, bias_n: NDArray[np.float64]) -> None:
-        """Take what the sensor shows out of contact (3,) as 0; forget what came before."""
+    def set_bias(self, bias_n: Vector) -> None:
+        """Take what the sensor shows out of contact as 0; forget what came before."""
         self._bias_n = bias_n
-        self._recent.clear()
-        self.force_n = np.zeros(3)
+        self._times_ns.clear()
+        self._forces_n.clear()
+        self._mean.clear()
+        self.force_n = ZERO
         self.peak_n = 0.0
 
     def add(self, sample: WrenchSample, inertia_n: float = 0.0) -> Breach | None:
@@ -62,55 +68,93 @@ class ForceWatch:
         inertia_n : float
             Part of the force along z that is not of the contact [N].
         """
-        if sample.overload:
+        time_ns, (x, y, z), _, overload = sample
+        if overload:
             return Breach(Cause.FORCE_OVERLOAD, "the force sensor reports overload")
-        x, y, z = (float(value) for value in sample.force_n)
         if not math.isfinite(x + y + z):
-            return Breach(Cause.FORCE_INVALID, f"force is no number: {x}, {y}, {z} N")
-        last = self._last
-        if last is not None and sample.time_ns <= last.time_ns:
-            text = f"time of forces does not ascend: {sample.time_ns} after {last.time_ns} ns"
-            return Breach(Cause.FORCE_INVALID, text)
-        same = last is not None and z == float(last.force_n[2])
-        self._equal = self._equal + 1 if same else 1
+            return Breach(Cause.FORCE_INVALID, f"force is not finite: {x}, {y}, {z} N")
+        since_ns = 0
+        if self._last is not None:
+            since_ns = time_ns - self._last.time_ns
+            if since_ns <= 0:
+                text = f"time of forces does not ascend: {time_ns} after {self._last.time_ns} ns"
+                return Breach(Cause.FORCE_INVALID, text)
+            self._equal = self._equal + 1 if z == self._last.force_n[2] else 1
         self._last = sample
         if self._equal >= self._stuck_samples:
             text = f"{self._equal} equal forces in a row: the sensor is stuck"
             return Breach(Cause.FORCE_STUCK, text)
-        self.force_n = sample.force_n - [0.0, 0.0, inertia_n]
+        z -= inertia_n
         if self._bias_n is not None:
-            self.force_n -= self._bias_n
-            self.peak_n = max(self.peak_n, float(self.force_n[2]))
-        z = float(self.force_n[2])
-        self._recent.append((sample.time_ns, z))
-        while self._recent[0][0] < sample.time_ns - KEEP_NS:
-            self._recent.popleft()
+            bias_x, bias_y, bias_z = self._bias_n
+            x, y, z = x - bias_x, y - bias_y, z - bias_z
+            if z > self.peak_n:
+                self.peak_n = z
+        self.force_n = (x, y, z)
+        if since_ns > LONGEST_GAP_NS:
+            self._times_ns.clear()
+            self._forces_n.clear()
+        self._times_ns.append(time_ns)
+        self._forces_n.append(z)
+        self._mean.add(time_ns, z)
         return None
 
     def age_s(self, now_ns: int) -> float:
         """Age of the newest wrench [s]; infinite before the first."""
         return math.inf if self._last is None else (now_ns - self._last.time_ns) * 1e-9
 
-    def mean_n(self, window_s: float) -> float | None:
-        """Mean force along z over the last time [N]; None where less than that is there."""
-        if not self._recent:
-            return None
-        newest = self._recent[-1][0]
-        since = newest - round(window_s * 1e9)
-        if self._recent[0][0] > since:
-            return None
-        values = [force for time, force in self._recent if time > since]
-        return sum(values) / len(values)
+    @property
+    def mean_n(self) -> float | None:
+        """Mean force along z over the last `mean_s` [N]; None where less than that is there."""
+        return self._mean.value
 
     def rate_n_per_s(self) -> float | None:
         """Rise of the force along z over 10 ms [N/s], from means of three; None where too few."""
-        if len(self._recent) < 6:
+        times, forces = self._times_ns, self._forces_n
+        if len(times) < 6:
             return None
-        recent = list(self._recent)[-64:]
-        newest = recent[-3:]
-        then = sum(time for time, _ in newest) / 3 - RATE_WINDOW_NS
-        # the three samples nearest to 10 ms before
-        before = sorted(recent[:-3], key=lambda item: abs(item[0] - then))[:3]
-        span = (sum(t for t, _ in newest) - sum(t for t, _ in before)) / 3
-        rise = (sum(f for _, f in newest) - sum(f for _, f in before)) / 3
-        return rise / (span * 1e-9) if span >= RATE_WINDOW_NS / 2 else None
+        newest_ns = (times[-1] + times[-2] + times[-3]) / 3
+        then = newest_ns - RATE_WINDOW_NS
+        # the three samples nearest to 10 ms before, none of the newest: `first` is the oldest of them
+        first = min(bisect(times, then), len(times) - 6)
+        while first > 0 and abs(times[first - 1] - then) <= abs(times[first + 2] - then):
+            first -= 1
+        span = newest_ns - (times[first] + times[first + 1] + times[first + 2]) / 3
+        if span < RATE_WINDOW_NS / 2:
+            return None
+        before = forces[first] + forces[first + 1] + forces[first + 2]
+        return (forces[-1] + forces[-2] + forces[-3] - before) / 3 / (span * 1e-9)
+
+
+class RunningMean:
+    """Mean over the last time, of values that come one by one.
+
+    Parameters
+    ----------
+    window_ns : int
+    """
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        self._recent: deque[tuple[int, float]] = deque()
+        self._sum, self._full = 0.0, False
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self._recent.clear()
+        self._sum, self._full = 0.0, False
+
+    def add(self, time_ns: int, value: float) -> None:
+        """Take one more value, later than the others."""
+        recent = self._recent
+        recent.append((time_ns, value))
+        self._sum += value
+        since_ns = time_ns - self._window_ns
+        while recent[0][0] <= since_ns:
+            self._sum -= recent.popleft()[1]
+            self._full = True
+
+    @property
+    def value(self) -> float | None:
+        """The mean; None until values have come for longer than the window."""
+        return self._sum / len(self._recent) if self._full else None

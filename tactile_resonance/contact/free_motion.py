@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.move import REST, Move, failed
@@ -16,6 +13,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
+from tactile_resonance.contact.vectors import Vector
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
@@ -45,7 +43,7 @@ class FreeMotion:
     ) -> None:
         self._path, self._observer = path, observer
         self._parameters, self._limits = parameters, limits
-        self._travel_force: NDArray[np.float64] | None = None
+        self._travel_force_n: Vector | None = None
         self._still_ns = -1
         self._tare_ns = 0
         self.told_m: float | None = None
@@ -68,7 +66,7 @@ class FreeMotion:
 
     def tare(self, now_ns: int, arm: ArmSample) -> Move:
         """At rest for the zero of the force."""
-        speed = float(np.linalg.norm(arm.tip_velocity[:3]))
+        speed = math.hypot(*arm.velocity[:3])
         observer = self._observer
         if observer.taring:
             # not before: a tool on the cell has to come to rest
@@ -82,7 +80,7 @@ class FreeMotion:
                 self._still_ns = now_ns
             elif now_ns - self._still_ns > STILL_NS:
                 observer.begin_tare()
-                self._travel_force = None
+                self._travel_force_n = None
                 self._tare_ns = now_ns
         elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
             breach = observer.end_tare()
@@ -94,9 +92,9 @@ class FreeMotion:
     def _touched(self, where: str) -> Move | None:
         """What follows where something pushes: without a zero only a change tells that."""
         force_n = self._observer.watch.force_n
-        if self._travel_force is None:
-            self._travel_force = force_n.copy()
-        change = float(np.linalg.norm(force_n - self._travel_force))
+        if self._travel_force_n is None:
+            self._travel_force_n = force_n
+        change = math.dist(force_n, self._travel_force_n)
         if change <= max(TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL * self._parameters.cell_noise_n):
             return None
         return failed(Cause.SURFACE_EARLY, f"force changed by {1e3 * change:.1f} mN {where}")

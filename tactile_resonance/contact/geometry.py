@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import Turn, Vector, dot, rotated, turn_from_vector
 from tactile_resonance.fields import require
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,13 @@ class TipGeometry:
         require(0 <= tilt <= 1, "beam_tilt_rad", tilt, "0 to 1")
         require(0 <= self.housing_below_m < 1, "housing_below_m", self.housing_below_m, "0 to 1 m")
 
+    @cached_property
+    def housing_m(self) -> Vector:
+        """Lower edge of the housing from the ball's centre, in the frame `tip` [m]."""
+        rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
+        run = self.beam_length_m * math.cos(self.beam_tilt_rad)
+        return -run, 0.0, rise - self.housing_below_m
+
     def clearance(self, depth_m: float, surface_tilt_rad: float = 0.0) -> float:
         """Height of the housing above the undisturbed surface when pressed in [m].
 
@@ -57,41 +64,27 @@ class TipGeometry:
         surface_tilt_rad : float
             By which the surface may rise towards the clamp, against the normal expected [rad].
         """
-        rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
-        run = self.beam_length_m * math.cos(self.beam_tilt_rad)
-        return (
-            self.ball_radius_m
-            + rise
-            - self.housing_below_m
-            - depth_m
-            - run * math.tan(surface_tilt_rad)
-        )
+        back, _, up = self.housing_m
+        return self.ball_radius_m + up - depth_m + back * math.tan(surface_tilt_rad)
 
-    def housing_height(self, turn: FloatArray, normal: FloatArray, height_m: float) -> float:
+    def housing_height(self, turn: Turn, normal: Vector, height_m: float) -> float:
         """Height of the housing's lower edge above a plane [m].
 
         Parameters
         ----------
-        turn : (3, 3) array
+        turn : Turn
             Orientation of the frame `tip`.
-        normal : (3,) array
+        normal : tuple of 3 floats
             Of the plane, out of the tissue, length 1.
         height_m : float
             Of the tip above its first touch of the plane [m]; below 0 when pressed in.
         """
-        return float(self.ball_radius_m + height_m + normal @ self.housing_from_ball(turn))
-
-    def housing_from_ball(self, turn: FloatArray) -> FloatArray:
-        """The housing's lower edge (3,) from the ball's centre [m], `turn` (3, 3) as above."""
-        rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
-        run = self.beam_length_m * math.cos(self.beam_tilt_rad)
-        return (rise - self.housing_below_m) * turn[:, 2] - run * turn[:, 0]
+        return self.ball_radius_m + height_m + dot(normal, rotated(turn, self.housing_m))
 
     def worst_height(self, depth_m: float, off_rad: float) -> float:
         """The same at a depth, the clamp turned down by an angle about the ball [m]."""
-        cosine, sine = math.cos(off_rad), math.sin(off_rad)
-        turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
-        return self.housing_height(turn, np.array([0.0, 0.0, 1.0]), -depth_m)
+        turn = turn_from_vector((0.0, -off_rad, 0.0))
+        return self.housing_height(turn, (0.0, 0.0, 1.0), -depth_m)
 
 
 def touch_pose(
@@ -112,7 +105,7 @@ def touch_pose(
     Raises
     ------
     ValueError
-        If the normal is 0 or no number, or `towards` lies along it.
+        If the normal is 0 or not finite, or `towards` lies along it.
     """
     z, x = np.asarray(normal, dtype=float), np.asarray(towards, dtype=float)
     length = float(np.linalg.norm(z))

@@ -5,14 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.samples import Pose
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.contact.vectors import Six
 
 
 class State(str, Enum):
@@ -35,6 +32,9 @@ TOUCHING = (State.CONTACT, State.SETTLE, State.HOLD)
 TARED = (State.APPROACH, *TOUCHING)
 """States in which the zero of the force is known."""
 
+ENDED = (State.RETRACT, State.FAULT)
+"""States in which forces do not count any more."""
+
 
 @dataclass(frozen=True)
 class ContactGoal:
@@ -52,16 +52,15 @@ class ContactGoal:
     aim: Aim
 
 
-@dataclass(frozen=True)
-class Command:
-    """What the arm is told: a twist (6,) in the base and its acceleration limit, or to stop.
+class Command(NamedTuple):
+    """What the arm is told: a twist in the base and its acceleration limit, or to stop.
 
     Attributes
     ----------
-    twist : (6,) array or None
-        None: stop.
+    twist : tuple of 6 floats or None
+        [m/s, rad/s]; None: stop.
     acceleration_m_s2 : float
     """
 
-    twist: FloatArray | None
+    twist: Six | None
     acceleration_m_s2: float

@@ -28,16 +28,15 @@ def force(depth_m: float, c: float, beam_n_per_m: float = RIGID) -> tuple[float,
     if depth_m <= 0:
         return 0.0, 0.0, 0.0
     root = math.sqrt(depth_m)  # of u
+    share = 1.0
     if beam_n_per_m != RIGID:
-        # C y^3 + k y^2 = k d is convex and rising: Newton from the right falls to the root
-        for _ in range(30):
-            change = (c * root + beam_n_per_m) * root * root - beam_n_per_m * depth_m
-            change /= (3 * c * root + 2 * beam_n_per_m) * root
-            root -= change
-            if change <= 1e-9 * root:
-                break
+        # C y^3 + k y^2 = k d for the root y of u: a cubic in 1 / y without square, whose one positive
+        # solution is that of the cosine of a third of an angle (Viete), or of the hyperbolic one
+        bent = 1.5 * math.sqrt(3.0) * c * root / beam_n_per_m
+        third = math.cos(math.acos(bent) / 3) if bent < 1 else math.cosh(math.acosh(bent) / 3)
+        root *= 0.5 * math.sqrt(3.0) / third
+        share = beam_n_per_m / (1.5 * c * root + beam_n_per_m)
     tissue = 1.5 * c * root
-    share = 1.0 if beam_n_per_m == RIGID else beam_n_per_m / (tissue + beam_n_per_m)
     pressed = c * root**3
     return pressed, tissue * share, pressed * share
 
@@ -46,4 +45,4 @@ def depth(force_n: float, c: float, beam_n_per_m: float = RIGID) -> float:
     """Return the depth that the robot must go for a force [m]; 0 for no force."""
     if force_n <= 0:
         return 0.0
-    return float((force_n / c) ** (2 / 3) + force_n / beam_n_per_m)
+    return (force_n / c) ** (2 / 3) + force_n / beam_n_per_m

@@ -8,18 +8,17 @@ the business of `TipGeometry.worst_height`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import LIFTED_M, RIGHTING_S, TipPath
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.contact.vectors import cross, dot, rotated, scaled, turn_from_vector
 
 INSTANTS = 200
 """Of the turn that are looked at."""
@@ -60,26 +59,25 @@ def lowest_on_the_way(
     true height is not below. Lifting the tip from where it may press comes first and is not judged.
     """
     path = TipPath(goal, tip)
-    turn = path.turn(start)
-    angle = float(np.linalg.norm(turn))
+    turn, angle = path.turn_rad(start), path.off_rad(start)
     if angle <= limits.misalignment_rad / 2:
         return None
     began, standoff = path.height_m(start), parameters.standoff_m
     if path.must_lift(start, standoff):
         began = standoff - LIFTED_M
     target = path.turning_height_m(parameters, limits)
-    way = float(np.linalg.norm(path.place_at(target) - start.tip.position_m))
+    way = math.dist(path.place_at(target), start.position_m)
     # the rate falls off over the last bit; nobody turns faster than brings it there in RIGHTING_S
     rate = min(limits.angular_speed_rad_s, angle / RIGHTING_S)
     turned = np.linspace(0.0, angle, INSTANTS)  # (t,)
     time_s = turned / max(rate, 1e-9) + TURN_LATE_S
     share = np.minimum(1.0, parameters.travel_speed_m_s * time_s / max(way, 1e-9))
     height = began + min(0.0, target - began) * share  # (t,)
-    axis, rotation = turn / angle, start.tip.rotation.as_matrix()
-    edge = tip.housing_from_ball(rotation)  # (3,)
+    axis = scaled(1 / angle, turn)
+    edge = rotated(turn_from_vector(start.rotation_rad), tip.housing_m)
     # Rodrigues' formula, its part along the normal
-    out, across = float(path.normal @ edge), float(path.normal @ np.cross(axis, edge))
-    along = float(path.normal @ axis) * float(axis @ edge)
+    out, across = dot(path.normal, edge), dot(path.normal, cross(axis, edge))
+    along = dot(path.normal, axis) * dot(axis, edge)
     swept = out * np.cos(turned) + across * np.sin(turned) + along * (1 - np.cos(turned))
     housing = tip.ball_radius_m + height + swept
     lowest = int(np.argmin(housing))

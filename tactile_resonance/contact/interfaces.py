@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The two devices that contact control needs: an arm and a force source.
 
-`drivers/` keeps these contracts on real protocols and on the wall clock, `simulation/` in lockstep
-virtual time.
+`drivers/` keeps these contracts on real protocols and in real time, `simulation/` in lockstep virtual
+time. The times of their samples are of the monotonic clock, or of the simulation's.
 """
 
 from __future__ import annotations
@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, CellSample, WrenchSample
+from tactile_resonance.contact.vectors import Six
 
 
 class Mount(str, Enum):
@@ -29,7 +27,7 @@ class ForceFault(str, Enum):
 
     SILENT = "silent"
     STUCK = "stuck"
-    INVALID = "invalid"  # a value that is no number or outside of the sensor's range
+    INVALID = "invalid"  # a value that is not finite or outside of the sensor's range
     JUMP = "jump"  # a step that no contact makes: bias, sign
     OVERLOAD = "overload"
     INCOMPLETE = "incomplete"  # frames of a wrench lost more often than tolerated
@@ -159,16 +157,8 @@ class Arm(Protocol):
         """Newest state, without waiting. Raises `ArmError` where the link is dead or the state old."""
         ...
 
-    def speed(self, twist: NDArray[np.float64], acceleration_m_s2: float) -> None:
-        """Move the tip with a twist (6,) [m/s, rad/s] until the next command, without waiting."""
-        ...
-
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Begin a straight move of the tip to a pose, without waiting for its end."""
-        ...
-
-    def moving(self) -> bool:
-        """Whether the last `move` is still under way."""
+    def speed(self, twist: Six, acceleration_m_s2: float) -> None:
+        """Move the tip with a twist [m/s, rad/s] until the next command, without waiting."""
         ...
 
     def stop(self, deceleration_m_s2: float) -> None:

@@ -1,20 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What counts as wrong in which state: the envelope, the forces, the clock and the time, in this order."""
+"""What counts as wrong in which state: the envelope, the forces and the time, in this order."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from tactile_resonance.contact.envelope import Envelope, Place
-from tactile_resonance.contact.goal import TARED, TOUCHING, State
+from tactile_resonance.contact.goal import ENDED, TARED, TOUCHING, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-
-CLOCK_BACK_NS = 1_000_000
-"""A clock that goes back by more was set: ages and times by it mean nothing for a moment [ns]."""
 
 
 class Judgement:
@@ -33,9 +30,17 @@ class Judgement:
     def __init__(
         self, envelope: Envelope, observer: Observer, parameters: ContactParameters, start_ns: int
     ) -> None:
-        self._envelope, self._observer, self._parameters = envelope, observer, parameters
-        self._start_ns = start_ns
-        self._lowest_m = -parameters.search_m - envelope.limits.depth_m
+        self._envelope, self._observer, self._start_ns = envelope, observer, start_ns
+        limits = envelope.limits
+        self._lowest_m = -parameters.search_m - limits.depth_m
+        self._longest_s = {
+            State.TRAVEL: limits.travel_s,
+            State.TARE: 2 * parameters.tare_s + 2.0,
+            State.APPROACH: limits.approach_s,
+            State.CONTACT: limits.press_s,
+            State.SETTLE: limits.press_s,
+            State.HOLD: limits.hold_s,
+        }
 
     def breach(
         self,
@@ -46,7 +51,6 @@ class Judgement:
         place: Place | None,
         wrenches: Sequence[WrenchSample],
         fault: ArmError | ForceError | None,
-        back_ns: int = 0,
     ) -> Breach | None:
         """The first thing that is wrong; in retraction and fault only what concerns the arm.
 
@@ -61,8 +65,6 @@ class Judgement:
             Since the last cycle, oldest first.
         fault : ArmError or ForceError or None
             What a device raised.
-        back_ns : int
-            By which the clock has gone back since the last cycle [ns].
         """
         if isinstance(fault, ArmError):
             return Breach(Cause.ARM_LINK, str(fault))
@@ -70,13 +72,10 @@ class Judgement:
         if breach is not None or arm is None or place is None:
             return breach
         taken = self._observer.take(wrenches, arm.time_ns, place.height_m)
-        if state in (State.RETRACT, State.FAULT):
+        if state in ENDED:
             return None
         if isinstance(fault, ForceError):
             return Breach(Cause.FORCE_SOURCE, str(fault))
-        if back_ns > CLOCK_BACK_NS:
-            text = f"this machine's clock was set back by {back_ns * 1e-9:.3g} s"
-            return Breach(Cause.TIME, text)
         breach = taken or self._envelope.judge_motion(arm, place)
         if breach is None and state in TOUCHING and place.height_m < self._lowest_m:
             text = (
@@ -90,15 +89,7 @@ class Judgement:
         return breach or self._judge_time(state, since_s)
 
     def _judge_time(self, state: State, since_s: float) -> Breach | None:
-        limits, tare = self._envelope.limits, 2 * self._parameters.tare_s + 2.0
-        most = {
-            State.TRAVEL: limits.travel_s,
-            State.TARE: tare,
-            State.APPROACH: limits.approach_s,
-            State.CONTACT: limits.press_s,
-            State.SETTLE: limits.press_s,
-            State.HOLD: limits.hold_s,
-        }[state]
+        most = self._longest_s[state]
         if since_s <= most:
             return None
         if state is State.HOLD:

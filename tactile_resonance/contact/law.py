@@ -63,10 +63,14 @@ def force_speed(
     holding : bool
         Whether the force has been reached: then slower, and without caution.
     """
-    target, slope, std = model.height_for(aim_n)
-    if not holding:
+    depth = model.depth_for(aim_n)
+    target = model.surface_m - depth
+    if holding:
+        time = parameters.hold_time_constant_s
+    else:
+        time = parameters.time_constant_s
+        slope, std = model.slope_at(depth)
         target += parameters.caution * max(0.0, std - SURE_SHARE * aim_n) / slope
-    time = parameters.hold_time_constant_s if holding else parameters.time_constant_s
     # relaxation takes the force away: at constant force u goes as C^(-2/3)
     creep = 2 / 3 * model.c_rate_per_s * hertz.depth(aim_n, model.c)
     # what is under way will be gone by then, and the target will have moved on

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S
@@ -16,6 +14,7 @@ from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, ForceE
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.vectors import Vector
 
 STOP_AGAIN_NS = 50_000_000
 """A stop that holds is told again after so long, at least once, and until the arm is seen to rest."""
@@ -34,7 +33,7 @@ class Cycle:
     wrenches: list[WrenchSample]
     state: State
     late_s: float
-    bias_n: NDArray[np.float64]  # (3,) of the last tare, not taken off the wrenches
+    bias_n: Vector  # of the last tare, not taken off the wrenches
     fault: ArmError | ForceError | None  # what a device raised in this cycle
 
 
@@ -173,4 +172,4 @@ class ContactLoop:
 
 def _rests(arm: ArmSample | None) -> bool:
     """Whether an arm is seen to stand still; what is no number is not."""
-    return arm is not None and bool(np.linalg.norm(arm.tip_velocity[:3]) < STILL_M_S)
+    return arm is not None and math.hypot(*arm.velocity[:3]) < STILL_M_S

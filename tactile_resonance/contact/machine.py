@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.envelope import Envelope, Place, is_finite
 from tactile_resonance.contact.estimator import ContactEstimate
@@ -28,8 +25,10 @@ from tactile_resonance.contact.pressing import Pressing
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tip_path import TipPath
+from tactile_resonance.contact.vectors import Vector, dot
 
-FloatArray = NDArray[np.float64]
+RELIEVING = (*TOUCHING, State.RETRACT)
+"""States in which force is taken off as fast as it may be."""
 
 RETRACT_AFTER_S = 0.1
 """A fault's stop lasts so long before the tip is drawn back [s]; where too much force is why, none."""
@@ -47,6 +46,8 @@ WISH_NS = 1_000_000_000
 
 class ContactController:
     """State machine, law and envelope of one tip.
+
+    All times are of one monotonic clock, that of the samples, or of a simulation's.
 
     Parameters
     ----------
@@ -72,10 +73,10 @@ class ContactController:
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
         self._envelope = Envelope(limits)
-        self._observer = Observer(parameters, limits.stuck_samples)
+        self._observer = Observer(parameters, limits)
         self._outcome = Outcome(self._observer, 0)
         self._height_m = 0.0
-        self._state_ns = self._now_ns = 0
+        self._state_ns = 0
         self._wish_retract = False
         self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 
@@ -97,8 +98,8 @@ class ContactController:
         return stays or self.state is State.IDLE
 
     @property
-    def bias_n(self) -> FloatArray:
-        """Force (3,) of the last tare [N], of the frame `tip`; zeros before it."""
+    def bias_n(self) -> Vector:
+        """Force of the last tare [N], of the frame `tip`; zeros before it."""
         return self._observer.watch.bias_n
 
     # requests
@@ -132,7 +133,7 @@ class ContactController:
         check_goal(goal, self.parameters, self.limits, self._tip, start)
         p, limits = self.parameters, self.limits
         self.goal = goal
-        self._observer = Observer(p, limits.stuck_samples)
+        self._observer = Observer(p, limits)
         self._outcome = Outcome(self._observer, now_ns)
         self._path = TipPath(goal, self._tip)
         self._free = FreeMotion(self._path, self._observer, p, limits)
@@ -180,29 +181,27 @@ class ContactController:
         """
         if self.state is State.IDLE or self.goal is None:
             return None
-        # how long a state has lasted does not change where the clock is set back
-        back_ns = max(0, self._now_ns - now_ns)
-        self._now_ns, self._state_ns = now_ns, self._state_ns - back_ns
-        # of an arm whose place is no number nothing can be told but that
+        # of an arm whose place is not finite nothing can be told but that
         place = None if arm is None or not is_finite(arm) else self._place(arm)
         breach = self._judgement.breach(
-            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault, back_ns
+            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
         )
         if breach is not None and self.state is State.FAULT:
             self._arm_was_bad = True  # nothing else counts in this state
         elif breach is not None:
             self._fail(breach, now_ns)
-        self._heed_wish(now_ns, breach)
+        if self._wish_retract:
+            self._heed_wish(now_ns, breach)
         if arm is None or place is None:
             return self._stop()
         move = self._act(now_ns, arm, place)
         self._follow(move, now_ns)
         if move.twist is None:
             return self._stop()
-        twist = self._envelope.bound(move.twist, arm.tip.position_m, place)
-        speed, arm_model = float(self._path.normal @ twist[:3]), self._observer.arm_model
+        twist = self._envelope.bound(move.twist, arm.position_m, place)
+        speed, arm_model = dot(place.normal, twist[:3]), self._observer.arm_model
         limit = self.parameters.acceleration_m_s2
-        if self.state in (*TOUCHING, State.RETRACT) and speed > arm_model.set_speed_m_s:
+        if self.state in RELIEVING and speed > arm_model.set_speed_m_s:
             limit = max(limit, self.parameters.relief_acceleration_m_s2)
         arm_model.step(speed, limit)
         return Command(twist, limit)
@@ -214,22 +213,18 @@ class ContactController:
 
     def _heed_wish(self, now_ns: int, breach: Breach | None) -> None:
         """Draw back as asked for; a wish that the arm cannot follow soon is forgotten."""
-        if not self._wish_retract or self.state is State.RETRACT:
+        if self.state is State.RETRACT:
             return
         if breach is None:
             self._end(Breach(Cause.CANCELLED, "drawn back as asked for"), now_ns)
             self._enter(State.RETRACT, now_ns)
         elif self._wish_ns is None:
             self._wish_ns = now_ns
-        elif abs(now_ns - self._wish_ns) > WISH_NS:
+        elif now_ns - self._wish_ns > WISH_NS:
             self._wish_retract, self._wish_ns = False, None
 
     def _act(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
         """What the present state wishes."""
-        if self.state is State.TRAVEL:
-            return self._free.travel(now_ns, arm, place)
-        if self.state is State.TARE:
-            return self._free.tare(now_ns, arm)
         if self.state is State.APPROACH:
             move = self._free.approach(arm, place)
             if move.to is not State.CONTACT:
@@ -239,6 +234,10 @@ class ContactController:
             place = self._place(arm)
         if self.state in TOUCHING:
             return self._pressing.step(now_ns, self.state, arm, place)
+        if self.state is State.TRAVEL:
+            return self._free.travel(now_ns, arm, place)
+        if self.state is State.TARE:
+            return self._free.tare(now_ns, arm)
         since_s = self._since_s(now_ns)
         if self.state is State.RETRACT:
             return self._free.draw_back(since_s, arm, place)
@@ -265,21 +264,16 @@ class ContactController:
         return (now_ns - self._state_ns) * 1e-9
 
     def _place(self, arm: ArmSample) -> Place:
-        path, depth = self._path, None
+        path, model, depth = self._path, self._observer.model, None
         self._height_m = above = path.height_m(arm)
-        if self._observer.model is not None and self.state in TOUCHING:
-            depth = self._observer.model.estimate(above).depth_m
+        if model is not None and self.state in TOUCHING:
+            depth = model.surface_m - above
             above = -depth
-        return Place(
-            path.normal,
-            self._height_m,
-            depth,
-            float(np.linalg.norm(path.turn(arm))),
-            path.housing_m(arm, above),
-        )
+        housing_m = path.housing_m(arm, above)
+        return Place(path.normal, self._height_m, depth, path.off_rad(arm), housing_m)
 
     def _enter(self, state: State, now_ns: int) -> None:
-        self.state, self._state_ns, self._now_ns = state, now_ns, now_ns
+        self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None
 

@@ -3,51 +3,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.samples import CellSample, Pose, WrenchSample
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    cross,
+    difference,
+    rotated,
+    rotated_back,
+    transposed,
+    turn_from_vector,
+    turn_product,
+    vector,
+)
 
-FloatArray = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """Where the tip is and how it accelerates, in the base.
 
     Attributes
     ----------
-    position_m : (3,) array
-    rotation : (3, 3) array
-        From the frame `tip` into the base.
-    acceleration_m_s2, angular_velocity_rad_s, angular_acceleration_rad_s2 : (3,) arrays
+    position_m : tuple of 3 floats
+    turn : Turn
+        Rotation from the frame `tip` into the base.
+    acceleration_m_s2, angular_velocity_rad_s, angular_acceleration_rad_s2 : tuples of 3 floats
     """
 
-    position_m: FloatArray
-    rotation: FloatArray
-    acceleration_m_s2: FloatArray
-    angular_velocity_rad_s: FloatArray
-    angular_acceleration_rad_s2: FloatArray
+    position_m: Vector
+    turn: Turn
+    acceleration_m_s2: Vector = ZERO
+    angular_velocity_rad_s: Vector = ZERO
+    angular_acceleration_rad_s2: Vector = ZERO
 
-    @classmethod
-    def at_rest(cls, pose: Pose) -> Motion:
-        """Return the motion of a tip that stands still."""
-        zero = np.zeros(3)
-        return cls(pose.position_m, pose.rotation.as_matrix(), zero, zero, zero)
-
-    def acceleration_of(self, arm_m: FloatArray) -> FloatArray:
-        """Acceleration (3,) of a point of the tool, `arm_m` (3,) from the tip in the base."""
+    def acceleration_of(self, arm_m: Vector) -> Vector:
+        """Acceleration of a point of the tool, `arm_m` from the tip in the base [m/s2]."""
         spin = self.angular_velocity_rad_s
-        return (
-            self.acceleration_m_s2
-            + np.cross(self.angular_acceleration_rad_s2, arm_m)
-            + np.cross(spin, np.cross(spin, arm_m))
-        )
+        x, y, z = self.acceleration_m_s2
+        ax, ay, az = cross(self.angular_acceleration_rad_s2, arm_m)
+        cx, cy, cz = cross(spin, cross(spin, arm_m))
+        return x + ax + cx, y + ay + cy, z + az + cz
 
 
 @dataclass(frozen=True)
@@ -79,40 +82,52 @@ class Mounting:
             )
 
     @cached_property
-    def _own(self) -> FloatArray:
-        """Rotation (3, 3) of the cell in what it sits on."""
-        return self.frame.rotation.as_matrix()
+    def _place_m(self) -> Vector:
+        """Of the cell in what it sits on."""
+        return vector(self.frame.position_m)
 
-    def to_tip(self, wrench: FloatArray, motion: Motion) -> FloatArray:
-        """Wrench of the tissue on the tip.
+    @cached_property
+    def _turn(self) -> Turn:
+        """Rotation of the cell in what it sits on."""
+        return turn_from_vector(vector(self.frame.rotation_rad))
+
+    @cached_property
+    def _centre_m(self) -> Vector:
+        """Of the payload's mass, in the frame `tip`."""
+        assert self.payload is not None
+        x, y, z = self._place_m
+        dx, dy, dz = rotated(self._turn, self.payload.centre_m)
+        return x + dx, y + dy, z + dz
+
+    def to_tip(self, samples: Iterable[CellSample], motion: Motion) -> list[WrenchSample]:
+        """Wrenches of the tissue on the tip, from those on the cell.
 
         On the tool the payload's weight and inertia are taken off and the cell passes on what the tip
         feels; under the sample it feels the opposite.
 
         Parameters
         ----------
-        wrench : (..., 6) array
-            On the cell, about its origin, in its frame [N], [N m].
+        samples : iterable of CellSample
         motion : Motion
-
-        Returns
-        -------
-        (..., 6) array
-            On the tip, about its origin, in its frame.
+            While they were measured.
         """
-        wrench = np.asarray(wrench, dtype=float)
-        own = self._own
+        carried: Six = (*ZERO, *ZERO)
         if self.mount is Mount.TOOL:
+            turn, lever = self._turn, self._place_m
             if self.payload is not None:
-                arm = self.frame.position_m + own @ self.payload.centre_m  # in the frame tip
-                wrench = wrench - self.payload.wrench(
-                    motion.rotation @ own, motion.acceleration_of(motion.rotation @ arm)
+                arm_m = rotated(motion.turn, self._centre_m)
+                carried = self.payload.wrench(
+                    turn_product(motion.turn, turn), motion.acceleration_of(arm_m)
                 )
-            turn, lever, sign = own, self.frame.position_m, 1.0
         else:
-            turn = motion.rotation.T @ own
-            lever = motion.rotation.T @ (self.frame.position_m - motion.position_m)
-            sign = -1.0
-        force = sign * wrench[..., :3] @ turn.T
-        torque = sign * wrench[..., 3:] @ turn.T + np.cross(lever, force)
-        return np.concatenate([force, torque], axis=-1)
+            a, b, c, d, e, f, g, h, i = turn_product(transposed(motion.turn), self._turn)
+            turn = -a, -b, -c, -d, -e, -f, -g, -h, -i  # what acts on the sample, turned round
+            lever = rotated_back(motion.turn, difference(self._place_m, motion.position_m))
+        cfx, cfy, cfz, ctx, cty, ctz = carried
+        felt = []
+        for time_ns, (fx, fy, fz, tx, ty, tz), overload in samples:
+            force = rotated(turn, (fx - cfx, fy - cfy, fz - cfz))
+            x, y, z = rotated(turn, (tx - ctx, ty - cty, tz - ctz))
+            dx, dy, dz = cross(lever, force)
+            felt.append(WrenchSample(time_ns, force, (x + dx, y + dy, z + dz), overload))
+        return felt

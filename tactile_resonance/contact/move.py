@@ -3,23 +3,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.result import Breach, Cause
+from tactile_resonance.contact.vectors import Six
 
 
-@dataclass(frozen=True)
-class Move:
+class Move(NamedTuple):
     """The wish of one state for one cycle.
 
     Attributes
     ----------
-    twist : (6,) array or None
+    twist : tuple of 6 floats or None
         In the base [m/s, rad/s]; None: stop.
     to : State or None
         That follows; None: the same.
@@ -29,7 +26,7 @@ class Move:
         With which the force was reached, where `to` is `State.HOLD`.
     """
 
-    twist: NDArray[np.float64] | None
+    twist: Six | None
     to: State | None = None
     breach: Breach | None = None
     estimate: ContactEstimate | None = None

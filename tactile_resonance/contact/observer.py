@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from tactile_resonance.contact.arm_model import ArmModel
 from tactile_resonance.contact.estimator import ContactFilter, TouchDetector
 from tactile_resonance.contact.force_watch import ForceWatch
-from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.tare import TareError, TareLimits, tare
+from tactile_resonance.contact.vectors import vector
 
 WINDOW_SAMPLES = 220
 """Forces kept for the first estimate of the contact: 440 ms at 500 Hz, 1.8 mm at 4 mm/s."""
@@ -43,9 +44,9 @@ class Observer:
         Of one force and of the bias, from the last tare [N].
     """
 
-    def __init__(self, parameters: ContactParameters, stuck_samples: int) -> None:
+    def __init__(self, parameters: ContactParameters, limits: Limits) -> None:
         p = self._parameters = parameters
-        self.watch = ForceWatch(stuck_samples)
+        self.watch = ForceWatch(limits.stuck_samples, limits.lost_s)
         self.arm_model = ArmModel(
             dead_time_s=p.arm_dead_time_s, lag_s=p.arm_lag_s, period_s=p.period_s
         )
@@ -55,6 +56,9 @@ class Observer:
         self.noise_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
         self._accelerations: deque[tuple[int, float]] = deque(maxlen=50)  # middle of period, m/s2
+        self._carried_kg = p.carried_kg
+        self._half_period_ns = round(0.5e9 * p.period_s)
+        self._cell_lag_ns = round(1e9 * p.cell_lag_s)
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW_SAMPLES)
         self._detector: TouchDetector | None = None
         self._model_ns = 0
@@ -79,7 +83,7 @@ class Observer:
         if noise < QUIETEST_SHARE * p.cell_noise_n:
             text = f"tare: noise of {1e3 * noise:.2g} mN rms, the source states"
             return Breach(Cause.TARE, f"{text} {1e3 * p.cell_noise_n:g} mN: does it still measure?")
-        self.watch.set_bias(zero.force_n)
+        self.watch.set_bias(vector(zero.force_n))
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.force_std_n[2])
         # neighbouring forces that are alike make means less certain than white noise would
@@ -106,45 +110,41 @@ class Observer:
 
     def take(self, wrenches: Sequence[WrenchSample], arm_ns: int, height_m: float) -> Breach | None:
         """Take a state of the arm and the forces that came; stop at the first that is bad."""
-        p = self._parameters
         self._heights.append((arm_ns, height_m))
-        middle = arm_ns - round(0.5e9 * p.period_s)
-        self._accelerations.append((middle, self.arm_model.acceleration_m_s2))
+        if self._carried_kg > 0:
+            middle = arm_ns - self._half_period_ns
+            self._accelerations.append((middle, self.arm_model.acceleration_m_s2))
+        watch, model = self.watch, self.model
         for sample in wrenches:
-            inertia = 0.0
-            if (
-                p.carried_kg > 0
-            ):  # a cell on the tool feels the contact less mass times acceleration
-                then = sample.time_ns - round(1e9 * p.cell_lag_s)
-                inertia = -p.carried_kg * _between(self._accelerations, then, 0.0)
-            breach = self.watch.add(sample, inertia)
+            time_ns, inertia = sample.time_ns, 0.0
+            if self._carried_kg > 0:
+                # a cell on the tool feels the contact less mass times acceleration
+                then = time_ns - self._cell_lag_ns
+                inertia = -self._carried_kg * _between(self._accelerations, then, 0.0)
+            breach = watch.add(sample, inertia)
             if breach is not None:
                 return breach
             if self.taring:
                 self._unloaded.append(sample)
-                continue
-            height = _between(self._heights, sample.time_ns, self.arm_model.speed_m_s)
-            force = float(self.watch.force_n[2])
-            if self._detector is not None:
+            elif self._detector is not None:
+                force = watch.force_n[2]
+                height = _between(self._heights, time_ns, self.arm_model.speed_m_s)
                 self._window.append((height, force))
-            if self.model is not None:
-                self._update(self.model, sample.time_ns, height, force)
-            elif self._detector is not None and self._detector.add(force):
-                self._touch(sample.time_ns)
+                if model is not None:
+                    model.predict((time_ns - self._model_ns) * 1e-9)
+                    model.update(height, force)
+                    self._model_ns = time_ns
+                    self._sum_n += force
+                    self._count += 1
+                elif self._detector.add(force):
+                    model = self._touch(time_ns)
         return None
-
-    def _update(self, model: ContactFilter, time_ns: int, height: float, force: float) -> None:
-        model.predict(max(0.0, (time_ns - self._model_ns) * 1e-9))
-        model.update(height, force)
-        self._model_ns = time_ns
-        self._sum_n += force
-        self._count += 1
 
     def look_again(self) -> None:
         """Estimate the contact anew from all that was kept: noise may have told the touch too early."""
         self._touch(self._model_ns)
 
-    def _touch(self, time_ns: int) -> None:
+    def _touch(self, time_ns: int) -> ContactFilter:
         heights, forces = zip(*self._window, strict=True)
         self.model = ContactFilter(
             heights,
@@ -154,6 +154,7 @@ class Observer:
             vibration_m=self._parameters.arm_vibration_m,
         )
         self._model_ns = time_ns
+        return self.model
 
 
 def _between(history: deque[tuple[int, float]], time_ns: int, rate_per_s: float) -> float:

@@ -14,10 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    cross,
+    difference,
+    rotated_back,
+    scaled,
+    vector,
+)
+
 FloatArray = NDArray[np.float64]
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, -9.80665])
 """Standard gravity in a base that stands upright."""
+_GRAVITY_M_S2 = vector(GRAVITY_M_S2)
 LARGEST_CONDITION = 50.0
 """Largest condition number of the scaled equations: orientations that differ too little exceed it."""
 
@@ -29,12 +42,12 @@ class Payload:
     Attributes
     ----------
     mass_kg : float
-    centre_m : (3,) array
+    centre_m : tuple of 3 floats
         Centre of mass in the cell's frame [m].
     """
 
     mass_kg: float
-    centre_m: FloatArray
+    centre_m: Vector
 
     def __post_init__(self) -> None:
         if not 0 <= self.mass_kg < math.inf:
@@ -42,26 +55,24 @@ class Payload:
         if np.shape(self.centre_m) != (3,) or not np.all(np.isfinite(self.centre_m)):
             raise ValueError(f"centre_m: {self.centre_m!r}, expected 3 finite numbers")
 
-    def wrench(
-        self, rotation: FloatArray, acceleration_m_s2: FloatArray | None = None
-    ) -> FloatArray:
+    def wrench(self, turn: Turn, acceleration_m_s2: Vector = ZERO) -> Six:
         """Wrench of the payload on the cell, in the cell's frame.
 
         Parameters
         ----------
-        rotation : (..., 3, 3) array
-            From the cell's frame into the base.
-        acceleration_m_s2 : (..., 3) array or None
+        turn : Turn
+            Rotation from the cell's frame into the base.
+        acceleration_m_s2 : tuple of 3 floats
             Of the centre of mass, in the base [m/s2].
 
         Returns
         -------
-        (..., 6) array
+        tuple of 6 floats
             Force [N] and torque about the cell's origin [N m].
         """
-        field = GRAVITY_M_S2 if acceleration_m_s2 is None else GRAVITY_M_S2 - acceleration_m_s2
-        force = self.mass_kg * np.einsum("...ji,...j->...i", rotation, field)
-        return np.concatenate([force, np.cross(self.centre_m, force)], axis=-1)
+        field = rotated_back(turn, difference(_GRAVITY_M_S2, acceleration_m_s2))
+        force = scaled(self.mass_kg, field)
+        return *force, *cross(self.centre_m, force)
 
 
 @dataclass(frozen=True)
@@ -167,7 +178,7 @@ def identify_payload(
     jacobian[1:4, 1:4] /= mass
     jacobian[1:4, 0] = -theta[1:4] / mass**2
     return PayloadIdentification(
-        payload=Payload(mass, theta[1:4] / mass),
+        payload=Payload(mass, vector(theta[1:4] / mass)),
         bias=theta[4:],
         covariance=jacobian @ covariance @ jacobian.T,
         condition_number=condition,

@@ -48,6 +48,7 @@ class Pressing:
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
+        self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
         self._hold_height_m = 0.0
         self._looked_again = False
@@ -59,28 +60,19 @@ class Pressing:
 
     def step(self, now_ns: int, state: State, arm: ArmSample, place: Place) -> Move:
         """Towards the force, or keep it; judges whether what was touched is the tissue."""
-        p, model = self._parameters, self._observer.model
+        p, model, holding = self._parameters, self._observer.model, state is State.HOLD
         assert model is not None
         gone = self._lost(now_ns, state)
         if gone is not None:
             return gone
-        estimate = model.estimate(place.height_m)
-        sure = now_ns - self.touched_ns > 1e9 * (self._limits.lost_s + LOST_GRACE_S)
-        if state is not State.HOLD and sure and estimate.surface_m > p.early_m:
-            return self._early(now_ns, arm, estimate.surface_m)
-        off = abs(estimate.force_n - self._aim.force_n) / self._aim.force_n
         to: State | None = None
-        if state is State.CONTACT and off < 4 * p.tolerance:
-            to, self._within_ns = State.SETTLE, -1
-        if State.SETTLE in (state, to):
-            if off > p.tolerance:
-                self._within_ns = -1
-            elif self._within_ns < 0:
-                self._within_ns = now_ns
-            elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
-                self._hold_height_m = place.height_m
-                to = State.HOLD
-        holding = State.HOLD in (state, to)
+        if not holding:
+            sure = now_ns - self.touched_ns > self._sure_ns
+            if sure and model.surface_m > p.early_m:
+                return self._early(arm, model.surface_m)
+            to = self._nearer(now_ns, state, model.force_at(place.height_m), sure)
+            if to is State.HOLD:
+                holding, self._hold_height_m = True, place.height_m
         pending = self._observer.arm_model.pending_m
         if holding and self._aim.hold is HoldMode.INDENTATION:
             speed = place_speed(self._hold_height_m, place.height_m, pending, p)
@@ -90,11 +82,29 @@ class Pressing:
             )
         most = p.press_speed_m_s
         twist = self._path.along_normal(arm, min(most, max(-most, speed)))
-        return Move(twist, to, estimate=estimate if to is State.HOLD else None)
+        reached = model.estimate(place.height_m) if to is State.HOLD else None
+        return Move(twist, to, estimate=reached)
 
-    def _early(self, now_ns: int, arm: ArmSample, surface_m: float) -> Move:
+    def _nearer(self, now_ns: int, state: State, force_n: float, sure: bool) -> State | None:
+        """The state that follows while the force comes nearer to what is asked for."""
+        p = self._parameters
+        off = abs(force_n - self._aim.force_n) / self._aim.force_n
+        to: State | None = None
+        if state is State.CONTACT:
+            if off >= 4 * p.tolerance:
+                return None
+            to, self._within_ns = State.SETTLE, -1
+        if off > p.tolerance:
+            self._within_ns = -1
+        elif self._within_ns < 0:
+            self._within_ns = now_ns
+        elif sure and now_ns - self._within_ns >= 1e9 * p.settle_s:
+            to = State.HOLD
+        return to
+
+    def _early(self, arm: ArmSample, surface_m: float) -> Move:
         """The surface seems to lie higher than accepted: noise, a first guess, or so it is."""
-        if self._was_noise(self._limits.lost_force_n, now_ns):
+        if self._was_noise(self._limits.lost_force_n):
             return Move(None, State.APPROACH)
         if not self._looked_again:
             self._looked_again = True
@@ -107,21 +117,22 @@ class Pressing:
     def _lost(self, now_ns: int, state: State) -> Move | None:
         """What follows where the tissue has gone; a touch that was noise is taken back."""
         observer, limits = self._observer, self._limits
-        mean = observer.watch.mean_n(limits.lost_s)
-        if mean is None or now_ns - self.touched_ns < 1e9 * (limits.lost_s + LOST_GRACE_S):
+        mean = observer.watch.mean_n
+        if mean is None or now_ns - self.touched_ns < self._sure_ns:
             return None
-        if state is State.CONTACT and self._was_noise(observer.noise_n / 4, now_ns):
+        if state is State.CONTACT:
+            noise = self._was_noise(observer.noise_n / 4)
+            return Move(None, State.APPROACH) if noise else None
+        if mean >= limits.lost_force_n:
+            return None
+        if state is State.SETTLE and self._was_noise(limits.lost_force_n):
             return Move(None, State.APPROACH)
-        if state is State.SETTLE and self._was_noise(limits.lost_force_n, now_ns):
-            return Move(None, State.APPROACH)
-        if state in (State.SETTLE, State.HOLD) and mean < limits.lost_force_n:
-            text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
-            return failed(Cause.CONTACT_LOST, text)
-        return None
+        text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
+        return failed(Cause.CONTACT_LOST, text)
 
-    def _was_noise(self, least_n: float, now_ns: int) -> bool:
+    def _was_noise(self, least_n: float) -> bool:
         """Whether what told the touch was noise: no such force is there; then it is sought anew."""
-        mean = self._observer.watch.mean_n(self._limits.lost_s)
+        mean = self._observer.watch.mean_n
         if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
             return False
         self._taken_back += 1

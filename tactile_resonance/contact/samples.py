@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What force sensors and robots report: time-stamped wrenches and robot states."""
+"""What force sensors and robots report: time-stamped wrenches and robot states.
+
+Times are of the monotonic clock (``time.monotonic_ns``), or of a simulation's, which counts from 0.
+Numbers are floats in tuples: arithmetic on those of numpy costs a control loop several times as much.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.vectors import Six, Vector
 
 
 @dataclass(frozen=True)
@@ -40,34 +47,32 @@ class Pose:
         return Rotation.from_rotvec(self.rotation_rad)
 
 
-@dataclass(frozen=True)
-class CellSample:
+class CellSample(NamedTuple):
     """One wrench as a force sensor reports it.
 
     Attributes
     ----------
     time_ns : int
-        When it was measured, on the clock of `WrenchSample`.
-    wrench : (6,) array
+        When it was measured.
+    wrench : tuple of 6 floats
         What acts on the sensor, force [N] and torque about its origin [N m], in its own frame.
     overload : bool
         A channel is beyond its range.
     """
 
     time_ns: int
-    wrench: NDArray[np.float64]
+    wrench: Six
     overload: bool = False
 
 
-@dataclass(frozen=True)
-class WrenchSample:
+class WrenchSample(NamedTuple):
     """One wrench.
 
     Attributes
     ----------
     time_ns : int
-        When it was measured, on this machine's clock (``time.time_ns``; virtual time counts from 0).
-    force_n, torque_nm : (3,) arrays
+        When it was measured.
+    force_n, torque_nm : tuples of 3 floats
         What the environment exerts on the tip [N], [N m], in the frame `tip`: pressing on tissue gives
         a positive z force.
     overload : bool
@@ -75,38 +80,43 @@ class WrenchSample:
     """
 
     time_ns: int
-    force_n: NDArray[np.float64]
-    torque_nm: NDArray[np.float64]
+    force_n: Vector
+    torque_nm: Vector
     overload: bool = False
 
 
-@dataclass(frozen=True)
-class ArmSample:
+class ArmSample(NamedTuple):
     """State of the robot.
 
     Attributes
     ----------
     time_ns : int
-        When it held, on the clock of `WrenchSample`.
+        When it held.
     robot_time_s : float
         The controller's own time stamp [s].
-    tip : Pose
-        Frame `tip` in the robot's base.
-    tip_velocity : (6,) array
+    position_m, rotation_rad : tuples of 3 floats
+        Of the frame `tip` in the robot's base: place [m] and rotation vector [rad].
+    velocity : tuple of 6 floats
         Velocity [m/s] and angular velocity [rad/s] of the tip in the base.
     moving_allowed : bool
         Powered, in normal safety mode and its program running.
     message : str
         Why it may not move; empty where it may.
-    tool_wrench : (6,) array or None
+    tool_wrench : tuple of 6 floats or None
         What the robot's own sensor says the environment exerts on the tip, force [N] and torque about
         it [N m], along the axes of the base; None where it has no such sensor.
     """
 
     time_ns: int
     robot_time_s: float
-    tip: Pose
-    tip_velocity: NDArray[np.float64]
+    position_m: Vector
+    rotation_rad: Vector
+    velocity: Six
     moving_allowed: bool = True
     message: str = ""
-    tool_wrench: NDArray[np.float64] | None = None
+    tool_wrench: Six | None = None
+
+    @property
+    def tip(self) -> Pose:
+        """Frame `tip` in the robot's base, for those outside the control loop."""
+        return Pose(np.array(self.position_m), np.array(self.rotation_rad))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,14 +68,6 @@ class Tare:
     drift_std_n_per_s: FloatArray
     time_ns: int
 
-    def apply(self, sample: WrenchSample) -> WrenchSample:
-        """The sample with this zero taken off."""
-        return replace(
-            sample,
-            force_n=sample.force_n - self.force_n,
-            torque_nm=sample.torque_nm - self.torque_nm,
-        )
-
 
 def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
     """Zero from samples without contact.
@@ -95,7 +87,7 @@ def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
     force = np.array([sample.force_n for sample in samples])  # (n, 3)
     torque = np.array([sample.torque_nm for sample in samples])
     if not (np.all(np.isfinite(force)) and np.all(np.isfinite(torque))):
-        raise TareError("tare: a sample is no number")
+        raise TareError("tare: a sample is not finite")
     stamps = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     middle_ns = int(stamps[0]) + int(stamps[-1] - stamps[0]) // 2
     t = (stamps - middle_ns) * 1e-9

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-
-import numpy as np
+from operator import mul
 
 from tactile_resonance.contact.interfaces import Cell, ForceInfo
 from tactile_resonance.contact.mounting import Motion, Mounting
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.vectors import turn_from_vector
 
 
 class TipForce:
@@ -47,7 +47,8 @@ class TipForce:
         if not 0 <= inertia_window_s <= 1:
             raise ValueError(f"inertia_window_s: {inertia_window_s!r}, expected 0 to 1 s")
         self._cell, self._mounting, self._arm_state = cell, mounting, arm_state
-        self._window_ns = inertia_window_s * 1e9
+        # without a payload there is no inertia to take off
+        self._window_ns = 0.0 if mounting.payload is None else inertia_window_s * 1e9
         self._states: deque[ArmSample] = deque()
 
     @property
@@ -63,32 +64,33 @@ class TipForce:
     def read(self) -> list[WrenchSample]:
         """Wrenches since the last call, oldest first, with the newest pose. Raises `ForceError`."""
         samples = self._cell.read()
-        motion = self._motion()
+        state = self._arm_state()
+        if self._window_ns:
+            self._remember(state)
         if not samples:
             return []
-        wrenches = self._mounting.to_tip(np.array([sample.wrench for sample in samples]), motion)
-        return [
-            WrenchSample(sample.time_ns, wrench[:3], wrench[3:], sample.overload)
-            for sample, wrench in zip(samples, wrenches, strict=True)
-        ]
+        return self._mounting.to_tip(samples, self._motion(state))
 
     def close(self) -> None:
         """Close the cell."""
         self._cell.close()
 
-    def _motion(self) -> Motion:
-        state = self._arm_state()
-        at_rest = Motion.at_rest(state.tip)
-        if not self._window_ns:
-            return at_rest
-        if not self._states or state.time_ns > self._states[-1].time_ns:
-            self._states.append(state)
-        while state.time_ns - self._states[0].time_ns > self._window_ns:
-            self._states.popleft()
-        if len(self._states) < 3:
-            return at_rest
-        t = np.array([s.time_ns - state.time_ns for s in self._states]) * 1e-9
-        velocity = np.array([s.tip_velocity for s in self._states])  # (n, 6)
-        t = t - t.mean()
-        slope = t @ velocity / (t @ t)
-        return Motion(at_rest.position_m, at_rest.rotation, slope[:3], velocity[-1, 3:], slope[3:])
+    def _remember(self, state: ArmSample) -> None:
+        states = self._states
+        if not states or state.time_ns > states[-1].time_ns:
+            states.append(state)
+        while state.time_ns - states[0].time_ns > self._window_ns:
+            states.popleft()
+
+    def _motion(self, state: ArmSample) -> Motion:
+        turn, states = turn_from_vector(state.rotation_rad), self._states
+        if len(states) < 3:
+            return Motion(state.position_m, turn)
+        times_s = [(other.time_ns - state.time_ns) * 1e-9 for other in states]
+        middle_s = sum(times_s) / len(times_s)
+        times_s = [time_s - middle_s for time_s in times_s]
+        power = sum(map(mul, times_s, times_s))
+        axes = zip(*(other.velocity for other in states), strict=True)
+        ax, ay, az, bx, by, bz = (sum(map(mul, times_s, axis)) / power for axis in axes)
+        spin = states[-1].velocity[3:]
+        return Motion(state.position_m, turn, (ax, ay, az), spin, (bx, by, bz))

@@ -5,16 +5,24 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import ArmSample
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    difference,
+    dot,
+    scaled,
+    transposed,
+    turn_from_vector,
+    turn_product,
+    vector,
+    vector_from_turn,
+)
 
 RIGHTING_S = 0.1
 """Time constant in which place along the surface and orientation are put right [s]."""
@@ -40,40 +48,59 @@ class TipPath:
 
     Attributes
     ----------
-    normal : (3,) array
+    normal : tuple of 3 floats
         Out of the tissue, in the base.
     """
 
     def __init__(self, goal: ContactGoal, tip: TipGeometry | None = None) -> None:
-        self._touch, self._tip = goal.touch, tip
-        self._rotation = goal.touch.rotation
-        self.normal: FloatArray = self._rotation.as_matrix()[:, 2]
+        self._tip = tip
+        self._touch_m = vector(goal.touch.position_m)
+        self._seen_rad = vector(goal.touch.rotation_rad)
+        self._goal = turn_from_vector(self._seen_rad)
+        self.normal: Vector = self._goal[2], self._goal[5], self._goal[8]
+        # of the orientation seen last; most often the next is the same
+        self._seen: Turn = self._goal
+        self._turn_rad: Vector = ZERO
+        self._off_rad = 0.0
 
     def height_m(self, arm: ArmSample) -> float:
         """Of the tip above the expected first touch, along the normal."""
-        return float(self.normal @ (arm.tip.position_m - self._touch.position_m))
+        return dot(self.normal, difference(arm.position_m, self._touch_m))
 
-    def place_at(self, height_m: float) -> FloatArray:
-        """Place (3,) of the tip straight above the touch."""
-        return self._touch.position_m + height_m * self.normal
+    def place_at(self, height_m: float) -> Vector:
+        """Place of the tip straight above the touch."""
+        x, y, z = self._touch_m
+        nx, ny, nz = self.normal
+        return x + height_m * nx, y + height_m * ny, z + height_m * nz
 
-    def turn(self, arm: ArmSample) -> FloatArray:
-        """Rotation vector (3,) in the base from the tip's orientation to the goal's."""
-        if np.array_equal(arm.tip.rotation_rad, self._touch.rotation_rad):
-            return np.zeros(3)
-        return (self._rotation * Rotation.from_rotvec(arm.tip.rotation_rad).inv()).as_rotvec()
+    def turn_rad(self, arm: ArmSample) -> Vector:
+        """Rotation vector in the base from the tip's orientation to the goal's."""
+        self._see(arm.rotation_rad)
+        return self._turn_rad
+
+    def off_rad(self, arm: ArmSample) -> float:
+        """Angle between the tip's orientation and the goal's."""
+        self._see(arm.rotation_rad)
+        return self._off_rad
 
     def housing_m(self, arm: ArmSample, height_m: float) -> float | None:
         """Height of the housing above the surface, the tip at a height above its first touch."""
         if self._tip is None:
             return None
-        return self._tip.housing_height(arm.tip.rotation.as_matrix(), self.normal, height_m)
+        self._see(arm.rotation_rad)
+        return self._tip.housing_height(self._seen, self.normal, height_m)
+
+    def _see(self, rotation_rad: Vector) -> None:
+        if rotation_rad != self._seen_rad:
+            self._seen_rad = rotation_rad
+            self._seen = turn_from_vector(rotation_rad)
+            self._turn_rad = vector_from_turn(turn_product(self._goal, transposed(self._seen)))
+            self._off_rad = math.hypot(*self._turn_rad)
 
     def arrived(self, arm: ArmSample, height_m: float) -> bool:
         """Whether the tip is above the touch at a height, and turned as it should be."""
-        way = self.place_at(height_m) - arm.tip.position_m
-        near = float(np.linalg.norm(way)) < ARRIVED_M
-        return near and float(np.linalg.norm(self.turn(arm))) < ARRIVED_RAD
+        near = math.dist(self.place_at(height_m), arm.position_m) < ARRIVED_M
+        return near and self.off_rad(arm) < ARRIVED_RAD
 
     def must_lift(self, arm: ArmSample, standoff_m: float) -> bool:
         """Whether the tip is so low that it may press on something, at the touch or beside it."""
@@ -83,30 +110,35 @@ class TipPath:
         """Height of the tip to which it goes while much is to be turned."""
         return max(parameters.standoff_m, limits.near_m + TURNING_M)
 
-    # twists (6,) in the base
+    # twists in the base
 
-    def lift(self, arm: ArmSample, parameters: ContactParameters) -> FloatArray:
+    def lift(self, arm: ArmSample, parameters: ContactParameters) -> Six:
         """Straight up to the standoff, neither along the surface nor turning."""
         left = max(0.0, parameters.standoff_m - self.height_m(arm))
         p = parameters
         speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
-        return np.concatenate([max(speed, 1e-4) * self.normal, np.zeros(3)])
+        return *scaled(max(speed, 1e-4), self.normal), *ZERO
 
-    def travel(self, arm: ArmSample, parameters: ContactParameters, limits: Limits) -> FloatArray:
+    def travel(self, arm: ArmSample, parameters: ContactParameters, limits: Limits) -> Six:
         """To the standoff; turned first, out of reach of the surface, where much is to be turned."""
-        p, turn, height = parameters, self.turn(arm), parameters.standoff_m
-        if float(np.linalg.norm(turn)) > limits.misalignment_rad / 2:
+        p, height = parameters, parameters.standoff_m
+        if self.off_rad(arm) > limits.misalignment_rad / 2:
             height = self.turning_height_m(p, limits)
-        way = self.place_at(height) - arm.tip.position_m
-        distance = float(np.linalg.norm(way))
+        way = difference(self.place_at(height), arm.position_m)
+        distance = math.hypot(*way)
         braking = math.sqrt(p.acceleration_m_s2 * distance)  # half the limit: the arm lags
         speed = min(p.travel_speed_m_s, braking, distance / RIGHTING_S)
-        velocity = way * (speed / max(distance, 1e-9))
-        return np.concatenate([velocity, turn / RIGHTING_S])
+        return *scaled(speed / max(distance, 1e-9), way), *scaled(1 / RIGHTING_S, self.turn_rad(arm))
 
-    def along_normal(self, arm: ArmSample, speed_m_s: float) -> FloatArray:
+    def along_normal(self, arm: ArmSample, speed_m_s: float) -> Six:
         """Along the normal, away from the surface positive; keeps place along it and orientation."""
-        away = self._touch.position_m - arm.tip.position_m
-        away = away - float(self.normal @ away) * self.normal
-        velocity = speed_m_s * self.normal + away / RIGHTING_S
-        return np.concatenate([velocity, self.turn(arm) / RIGHTING_S])
+        away = difference(self._touch_m, arm.position_m)
+        speed = speed_m_s - dot(self.normal, away) / RIGHTING_S
+        x, y, z = away
+        nx, ny, nz = self.normal
+        return (
+            x / RIGHTING_S + speed * nx,
+            y / RIGHTING_S + speed * ny,
+            z / RIGHTING_S + speed * nz,
+            *scaled(1 / RIGHTING_S, self.turn_rad(arm)),
+        )

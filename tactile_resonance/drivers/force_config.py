@@ -16,6 +16,7 @@ from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (
     known_keys,
@@ -229,7 +230,7 @@ def _mounting(content: dict[str, Any], mount: Mount) -> Mounting:
     if content.get("payload") is not None:
         mass = section(content, "payload", "")
         known_keys(mass, {"mass_kg", "centre_m"}, "payload")
-        centre = np.array(numbers(mass.get("centre_m"), "payload.centre_m", 3))
+        centre = vector(numbers(mass.get("centre_m"), "payload.centre_m", 3))
         payload = Payload(number(mass.get("mass_kg"), "payload.mass_kg"), centre)
     return Mounting(mount, pose, payload)
 

@@ -48,7 +48,7 @@ def force_source(
             raise ValueError("kind: can needs python-can: pip install python-can") from error
         cell = CanWrench(config, clock)
     elif config.kind == "rtde":
-        cell = RtdeWrench(config, arm_state, arm_clock_std_s)
+        cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
     elif topic is None:
         raise ValueError("kind: topic is for nodes only")
     else:

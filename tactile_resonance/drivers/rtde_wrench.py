@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import time
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
+from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import ArmSample, CellSample
+from tactile_resonance.contact.vectors import rotated_back, turn_from_vector
 from tactile_resonance.drivers.force_config import ForceConfig
 
 
@@ -27,14 +27,17 @@ class RtdeWrench:
         Of kind rtde.
     arm_state : callable
         Newest state of the arm, without waiting; may raise `ArmError`.
+    clock : Clock or None
+        On which silence is judged; this machine's where it is not given.
     clock_std_s : callable or None
-        Standard deviation of the states' times on this machine's clock at present [s].
+        Standard deviation of the states' times on the clock at present [s].
     """
 
     def __init__(
         self,
         config: ForceConfig,
         arm_state: Callable[[], ArmSample],
+        clock: Clock | None = None,
         clock_std_s: Callable[[], float] | None = None,
     ) -> None:
         if config.kind != "rtde":
@@ -44,7 +47,8 @@ class RtdeWrench:
             raise ValueError("frame, payload: expected zeros and none, the controller knows both")
         self._config, self._arm_state, self._clock_std_s = config, arm_state, clock_std_s
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
-        self._robot_time_s = -np.inf
+        self._clock: Clock = WallClock() if clock is None else clock
+        self._robot_time_s = -math.inf
         self._new_s = 0.0
 
     @property
@@ -60,12 +64,12 @@ class RtdeWrench:
         """Begin anew; the arm is connected by its owner. Raises `ForceError`."""
         self._checks.restart()
         state = self._state()
-        self._robot_time_s, self._new_s = state.robot_time_s, time.monotonic()
+        self._robot_time_s, self._new_s = state.robot_time_s, self._now_s()
 
     def read(self) -> list[CellSample]:
         """The newest wrench where there is a new one. Raises `ForceError`."""
         state = self._state()
-        now_s = time.monotonic()
+        now_s = self._now_s()
         if state.robot_time_s == self._robot_time_s:
             if now_s - self._new_s > self._config.limits.silent_s:
                 text = f"{self.info.name}: no new state for {(now_s - self._new_s) * 1e3:.0f} ms"
@@ -73,16 +77,17 @@ class RtdeWrench:
             return []
         self._robot_time_s, self._new_s = state.robot_time_s, now_s
         assert state.tool_wrench is not None
-        turn = state.tip.rotation
-        wrench = np.concatenate(
-            [turn.inv().apply(state.tool_wrench[:3]), turn.inv().apply(state.tool_wrench[3:])]
-        )
+        turn, (x, y, z, tx, ty, tz) = turn_from_vector(state.rotation_rad), state.tool_wrench
+        wrench = *rotated_back(turn, (x, y, z)), *rotated_back(turn, (tx, ty, tz))
         overload = self._checks.check(wrench)
         stamp_ns = state.time_ns - round(self._config.latency_s * 1e9)
         return [CellSample(stamp_ns, wrench, overload)]
 
     def close(self) -> None:
         """Nothing is to be let go: the arm belongs to someone else."""
+
+    def _now_s(self) -> float:
+        return self._clock.now_ns() * 1e-9
 
     def _state(self) -> ArmSample:
         try:

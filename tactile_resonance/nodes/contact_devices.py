@@ -147,7 +147,7 @@ def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
         arm.state,
         clock=arm.clock,
         arm_clock_std_s=lambda: arm.clock_uncertainty_s,
-        topic=lambda asked: TopicWrench(node, asked),
+        topic=lambda asked: TopicWrench(node, asked, arm.clock),
     )
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -18,8 +18,12 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.contact.samples import WrenchSample
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.vectors import Vector, quaternion_from_vector
 from tactile_resonance.nodes.conversions import time_message
+
+RosTime = Callable[[int], int]
+"""From a time of the loop's clock [ns] to ROS time [ns]."""
 
 _HOLDS = {
     MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
@@ -72,37 +76,51 @@ def feedback_message(state: str, estimate: ContactEstimate | None) -> MakeContac
     return MakeContact.Feedback(state=state, force_n=force_n, depth_m=depth_m)
 
 
-def wrench_message(wrenches: Sequence[WrenchSample], cycle: Cycle, frame_id: str) -> WrenchStamped:
+def wrench_message(
+    wrenches: Sequence[WrenchSample], cycle: Cycle, ros_ns: RosTime, frame_id: str
+) -> WrenchStamped:
     """Mean of these, less the tare, at the middle of their times."""
     wrench = WrenchStamped()
-    wrench.header.stamp = time_message((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
+    wrench.header.stamp = time_message(
+        ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
+    )
     wrench.header.frame_id = frame_id
     count, parts = len(wrenches), wrench.wrench
-    force_n = sum(sample.force_n for sample in wrenches) / count - cycle.bias_n
-    torque_nm = sum(sample.torque_nm for sample in wrenches) / count
-    parts.force.x, parts.force.y, parts.force.z = force_n.tolist()
-    parts.torque.x, parts.torque.y, parts.torque.z = torque_nm.tolist()
+    x, y, z = (sum(values) / count for values in zip(*(w.force_n for w in wrenches), strict=True))
+    bias_x, bias_y, bias_z = cycle.bias_n
+    parts.force.x, parts.force.y, parts.force.z = x - bias_x, y - bias_y, z - bias_z
+    parts.torque.x, parts.torque.y, parts.torque.z = (
+        sum(values) / count for values in zip(*(w.torque_nm for w in wrenches), strict=True)
+    )
     return wrench
 
 
-def pose_message(cycle: Cycle, base_frame: str) -> PoseStamped:
-    """Where the tip is; of a cycle in which the arm was heard."""
-    assert cycle.arm is not None
+def pose_message(arm: ArmSample, ros_ns: RosTime, base_frame: str) -> PoseStamped:
+    """Where the tip is."""
     pose = PoseStamped()
-    pose.header.stamp = time_message(cycle.arm.time_ns)
+    pose.header.stamp = time_message(ros_ns(arm.time_ns))
     pose.header.frame_id = base_frame
-    place, turn = pose.pose.position, pose.pose.orientation
-    place.x, place.y, place.z = cycle.arm.tip.position_m.tolist()
-    turn.x, turn.y, turn.z, turn.w = cycle.arm.tip.rotation.as_quat().tolist()
+    place_tip(pose, arm.position_m, arm.rotation_rad)
     return pose
 
 
+def place_tip(pose: PoseStamped, position_m: Vector, rotation_rad: Vector) -> None:
+    """Write place and rotation vector of the tip into a pose."""
+    place, turn = pose.pose.position, pose.pose.orientation
+    place.x, place.y, place.z = position_m
+    turn.x, turn.y, turn.z, turn.w = quaternion_from_vector(rotation_rad)
+
+
 def state_message(
-    cycle: Cycle, estimate: ContactEstimate | None, result: ContactResult | None, frame_id: str
+    cycle: Cycle,
+    ros_ns: RosTime,
+    estimate: ContactEstimate | None,
+    result: ContactResult | None,
+    frame_id: str,
 ) -> msg.ContactState:
     """What the controller does and knows, without the loop's counts."""
     state = msg.ContactState(state=cycle.state.value)
-    state.header.stamp = time_message(cycle.time_ns)
+    state.header.stamp = time_message(ros_ns(cycle.time_ns))
     state.header.frame_id = frame_id
     state.force_n, state.depth_m, state.stiffness_n_per_m = known(estimate)
     if result is not None:

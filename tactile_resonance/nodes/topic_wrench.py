@@ -6,12 +6,12 @@ from __future__ import annotations
 import time
 from collections import deque
 
-import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
@@ -29,23 +29,26 @@ FIRST_WITHIN_S = 2.0
 class TopicWrench:
     """Wrenches from a topic, in the sensor's frame (a `contact.interfaces.Cell`).
 
-    Takes reliable and best-effort publishers. Needs a node that spins in another thread.
+    Takes reliable and best-effort publishers; read by another thread than the one in which the node spins.
 
     Parameters
     ----------
     node : Node
     config : ForceConfig
         Of kind topic.
+    clock : WallClock
+        On which wrenches are dated; stamps of messages are ROS time.
     """
 
-    def __init__(self, node: Node, config: ForceConfig) -> None:
+    def __init__(self, node: Node, config: ForceConfig, clock: WallClock | None = None) -> None:
         if config.kind != "topic":
             raise ValueError(f"kind: {config.kind!r}, expected topic")
         self._node, self._config = node, config
+        self._clock = WallClock() if clock is None else clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._samples: deque[CellSample] = deque(maxlen=10000)
         self._fault: ForceError | None = None
-        self._last_s = 0.0
+        self._silent_from_s = 0.0
         self._last_stamp_ns = 0
         self._listening = False
         self._subscription = None
@@ -56,17 +59,12 @@ class TopicWrench:
         return self._config.info
 
     def start(self) -> None:
-        """Listen anew and wait for the first wrench.
-
-        Raises
-        ------
-        ForceError
-            `SILENT` where none comes within two seconds, or what is wrong with the first.
-        """
+        """Listen anew; without a wrench in the next two seconds it counts as silent."""
         self._listening = False
         self._samples.clear()
         self._checks.restart()
         self._fault, self._last_stamp_ns = None, 0
+        self._silent_from_s = time.monotonic() + FIRST_WITHIN_S
         self._listening = True
         if self._subscription is None:
             self._subscription = self._node.create_subscription(
@@ -76,15 +74,6 @@ class TopicWrench:
                 SENSOR,
                 callback_group=MutuallyExclusiveCallbackGroup(),
             )
-        deadline_s = time.monotonic() + FIRST_WITHIN_S
-        while not self._samples and self._fault is None:
-            if time.monotonic() > deadline_s:
-                self._listening = False
-                text = f"topic {self._config.topic}: no wrench within {FIRST_WITHIN_S:g} s"
-                raise ForceError(ForceFault.SILENT, text)
-            time.sleep(0.002)
-        if self._fault is not None:
-            raise self._fault
 
     def read(self) -> list[CellSample]:
         """Wrenches since the last call, oldest first, without waiting. Raises `ForceError`."""
@@ -95,8 +84,10 @@ class TopicWrench:
         samples = []
         while self._samples:
             samples.append(self._samples.popleft())
-        since_s = time.monotonic() - self._last_s
-        if not samples and since_s > self._config.limits.silent_s:
+        late_s = time.monotonic() - self._silent_from_s
+        if not samples and late_s > 0:
+            known = self._last_stamp_ns > 0
+            since_s = late_s + (self._config.limits.silent_s if known else FIRST_WITHIN_S)
             text = f"topic {self._config.topic}: silent for {since_s * 1e3:.0f} ms"
             self._fault = ForceError(ForceFault.SILENT, text)
             raise self._fault
@@ -113,7 +104,7 @@ class TopicWrench:
         if not self._listening or self._fault is not None:
             return
         force, torque = message.wrench.force, message.wrench.torque
-        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        wrench = (force.x, force.y, force.z, torque.x, torque.y, torque.z)
         stamp_ns = time_from_message(message.header.stamp)
         try:
             self._check_stamp(stamp_ns)
@@ -121,9 +112,10 @@ class TopicWrench:
         except ForceError as error:
             self._fault = error
             return
-        self._last_stamp_ns, self._last_s = stamp_ns, time.monotonic()
-        latency_ns = round(self._config.latency_s * 1e9)
-        self._samples.append(CellSample(stamp_ns - latency_ns, wrench, overload))
+        self._last_stamp_ns = stamp_ns
+        self._silent_from_s = time.monotonic() + self._config.limits.silent_s
+        taken_ns = self._clock.own_ns(stamp_ns) - round(self._config.latency_s * 1e9)
+        self._samples.append(CellSample(taken_ns, wrench, overload))
 
     def _check_stamp(self, stamp_ns: int) -> None:
         topic = self._config.topic

@@ -12,6 +12,7 @@ from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, Surface, TipOnTissue
@@ -100,7 +101,7 @@ class ContactBench:
         self.clock = VirtualBench(self.plant, start, tracking=tracking, seed=seed)
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
-        payload = Payload(tool_kg, centre) if on_tool else None
+        payload = Payload(tool_kg, vector(centre)) if on_tool else None
         self.force = TipForce(self.cell, Mounting(mount, mounting.frame, payload), self.arm.state)
         self.arm.connect()
         self.force.start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,7 +112,7 @@ class Jitter:
 
 
 class TipMotion:
-    """Six axes of a tip that obeys twists and straight moves, one period at a time.
+    """Six axes of a tip that obeys twists, one period at a time.
 
     Attributes
     ----------
@@ -130,36 +131,19 @@ class TipMotion:
         self.pose = self.reported = start
         self.twist = np.zeros(6)
         self._set_twist = np.zeros(6)  # after the acceleration limit
-        self._set_pose = start
-        self._wanted: FloatArray | Pose = np.zeros(6)
-        self._speed_m_s, self._acceleration_m_s2 = 0.0, 1.0
+        self._wanted: FloatArray = np.zeros(6)
+        self._acceleration_m_s2 = 1.0
         self._lag = Lag(parameters, np.zeros(6), period_s)
         self._jitter = Jitter(parameters, period_s, seed) if parameters.jitter_rms_m > 0 else None
 
-    def speed(self, twist: FloatArray, acceleration_m_s2: float) -> None:
+    def speed(self, twist: Sequence[float] | FloatArray, acceleration_m_s2: float) -> None:
         """Go over to a twist (6,) in the base, under an acceleration limit, and keep it."""
         self._wanted, self._acceleration_m_s2 = np.array(twist, dtype=float), acceleration_m_s2
 
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Go straight to a pose and rest there."""
-        self._wanted, self._speed_m_s = pose, speed_m_s
-        self._acceleration_m_s2 = acceleration_m_s2
-
-    def moving(self) -> bool:
-        """Whether a straight move is under way."""
-        if not isinstance(self._wanted, Pose):
-            return False
-        ahead = self._ahead(self._wanted, self._set_pose)
-        return bool(np.abs(ahead).max() > 1e-7 or np.abs(self.twist).max() > 1e-5)
-
     def step(self) -> None:
         """Advance one period."""
-        dt, before = self.period_s, self._set_twist
-        self._set_twist = self._limited(self._set_point())
-        if isinstance(self._wanted, Pose):  # only moves need to know how far they have come
-            self._set_pose = moved(self._set_pose, (before + self._set_twist) / 2 * dt)
-        else:
-            self._set_pose = self.reported
+        dt = self.period_s
+        self._set_twist = self._limited(self._wanted)
         last = self.twist
         self.twist = self._lag.step(self._set_twist)
         self.reported = moved(self.reported, (last + self.twist) / 2 * dt)
@@ -167,20 +151,6 @@ class TipMotion:
         if self._jitter is not None:
             place = self.reported.position_m + self._jitter.step()
             self.pose = Pose(place, self.reported.rotation_rad)
-
-    def _set_point(self) -> FloatArray:
-        if not isinstance(self._wanted, Pose):
-            return self._wanted
-        ahead = self._ahead(self._wanted, self._set_pose)
-        scaled = ahead * np.repeat([1.0, ROTATION_LEVER_M], 3)
-        distance = float(np.linalg.norm(scaled))
-        if distance < 1e-12:
-            return np.zeros(6)
-        # the speed from which the limit still brakes in time, one period of caution included
-        margin = self._acceleration_m_s2 * self.period_s
-        braking = math.sqrt(margin**2 / 4 + 2 * self._acceleration_m_s2 * distance) - margin / 2
-        speed = min(self._speed_m_s, braking, distance / self.period_s)
-        return ahead * (speed / distance)
 
     def _limited(self, wanted: FloatArray) -> FloatArray:
         change = wanted - self._set_twist
@@ -191,14 +161,6 @@ class TipMotion:
         if largest <= step:
             return wanted
         return self._set_twist + change * (step / largest)
-
-    @staticmethod
-    def _ahead(target: Pose, pose: Pose) -> FloatArray:
-        """Way (3,) [m] and rotation vector (3,) [rad] from a pose to another, in the base."""
-        turn = np.zeros(3)
-        if target.rotation_rad is not pose.rotation_rad:
-            turn = (target.rotation * pose.rotation.inv()).as_rotvec()
-        return np.concatenate([target.position_m - pose.position_m, turn])
 
 
 def moved(pose: Pose, step: FloatArray) -> Pose:

@@ -7,10 +7,9 @@ it takes to compute.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import (
     ArmError,
@@ -20,6 +19,7 @@ from tactile_resonance.contact.interfaces import (
     ForceInfo,
 )
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
+from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.plant import Plant
 from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
 from tactile_resonance.simulation.transducer import (
@@ -28,8 +28,6 @@ from tactile_resonance.simulation.transducer import (
     CellParameters,
     Transducer,
 )
-
-FloatArray = NDArray[np.float64]
 
 PROTECTIVE_DECELERATION_M_S2 = 2.0
 """With which the robot brakes by itself (chosen)."""
@@ -137,19 +135,10 @@ class VirtualArm:
             self._raise_if(ArmFault.STALE)
         return self._sample
 
-    def speed(self, twist: FloatArray, acceleration_m_s2: float) -> None:
+    def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
         """Move with a twist until the next command."""
         if self._may_move():
             self._motion.speed(twist, acceleration_m_s2)
-
-    def move(self, pose: Pose, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Begin a straight move."""
-        if self._may_move():
-            self._motion.move(pose, speed_m_s, acceleration_m_s2)
-
-    def moving(self) -> bool:
-        """Whether the last move is still under way."""
-        return self._motion.moving()
 
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop."""
@@ -213,8 +202,9 @@ class VirtualArm:
         return ArmSample(
             time_ns=bench.time_ns,
             robot_time_s=bench.time_ns * 1e-9,
-            tip=motion.reported,
-            tip_velocity=motion.twist,
+            position_m=vector(motion.reported.position_m),
+            rotation_rad=vector(motion.reported.rotation_rad),
+            velocity=six(motion.twist),
             moving_allowed=self._stopped is None,
             message="" if self._stopped is None else self._stopped.value,
         )
@@ -310,4 +300,4 @@ class VirtualCell:
             return
         wrench = self._scale * counts
         wrench[np.equal(counts, NO_NUMBER)] = np.nan
-        self._waiting.append(CellSample(self._bench.time_ns, wrench, bits != 0))
+        self._waiting.append(CellSample(self._bench.time_ns, six(wrench), bits != 0))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A contact whose clock, arm and force source can be made to lie, and what must hold whatever they say."""
+"""A contact whose arm and force source can be made to lie, and what must hold whatever they say."""
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,25 +17,11 @@ from contacts import contact
 REST_S, AT_REST_M_S = 0.15, 3e-4
 
 
-class SetClock:
-    """The bench's clock as a machine shows it that may set its own."""
-
-    def __init__(self, bench):
-        self._bench = bench
-        self.offset_ns = 0
-
-    def now_ns(self):
-        return self._bench.time_ns + self.offset_ns
-
-    def wait_until(self, time_ns):
-        self._bench.wait_until(time_ns - self.offset_ns)
-
-
 class Lying:
     """A device seen through what changes its samples; all else is passed on."""
 
-    def __init__(self, device, clock):
-        self._device, self._clock = device, clock
+    def __init__(self, device):
+        self._device = device
         self.late_ns = 0
         self.change = lambda sample: sample
         self.deaf = False
@@ -44,8 +30,7 @@ class Lying:
         return getattr(self._device, name)
 
     def _seen(self, sample):
-        time_ns = sample.time_ns + self._clock.offset_ns - self.late_ns
-        return self.change(replace(sample, time_ns=time_ns))
+        return self.change(sample._replace(time_ns=sample.time_ns - self.late_ns))
 
 
 class LyingArm(Lying):
@@ -71,7 +56,6 @@ class Disturbed:
     """A contact, its lying devices, and what truly happened in each period."""
 
     contact: object
-    clock: SetClock
     arm: LyingArm
     force: LyingForce
     states: list
@@ -85,10 +69,9 @@ class Disturbed:
 def disturbed(tissue, **options):
     made = contact(tissue, **options)
     bench = made.bench
-    clock = SetClock(bench.clock)
-    arm, force = LyingArm(bench.arm, clock), LyingForce(bench.force, clock)
-    made.loop = ContactLoop(arm, force, clock, made.controller)
-    rig = Disturbed(made, clock, arm, force, [], [], [])
+    arm, force = LyingArm(bench.arm), LyingForce(bench.force)
+    made.loop = ContactLoop(arm, force, bench.clock, made.controller)
+    rig = Disturbed(made, arm, force, [], [], [])
     touch = made.goal.touch
 
     def record():

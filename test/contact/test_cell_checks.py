@@ -11,6 +11,7 @@ from tactile_resonance.contact.cell_checks import (
     samples_until_stuck,
 )
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo, Mount
+from tactile_resonance.contact.vectors import six
 
 
 def info(noise_n=1e-3, step_n=2e-4):
@@ -22,7 +23,8 @@ def checks(noise_n=1e-3, step_n=2e-4, **limits):
 
 
 def noisy(rng, noise_n=1e-3, step_n=2e-4, n=1):
-    return np.rint(noise_n * rng.standard_normal((n, 6)) / step_n) * step_n
+    counts = np.rint(noise_n * rng.standard_normal((n, 6)) / step_n)
+    return [six(wrench) for wrench in counts * step_n]
 
 
 def fault_of(action):
@@ -50,7 +52,7 @@ def test_a_cell_whose_step_hides_its_noise_cannot_be_called_stuck():
     assert samples_until_stuck(info(1e-4, 0.02)) is None
     quiet = checks(1e-4, 0.02)
     for _ in range(5000):
-        quiet.check(np.zeros(6))
+        quiet.check((0.0,) * 6)
 
 
 def test_noise_alone_is_never_a_fault():
@@ -72,22 +74,22 @@ def test_a_stuck_cell_is_found_at_the_stated_sample():
     watch = checks()
     n = samples_until_stuck(info())
     assert n == 10
-    wrench = np.full(6, 0.01)
+    wrench = (0.01,) * 6
     for _ in range(n - 1):
         watch.check(wrench)
     assert fault_of(lambda: watch.check(wrench)) is ForceFault.STUCK
 
 
-def test_a_value_that_is_no_number():
-    assert fault_of(lambda: checks().check(np.array([0, 0, np.nan, 0, 0, 0]))) is ForceFault.INVALID
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_value_that_is_not_finite(value):
+    assert fault_of(lambda: checks().check((0.0, 0.0, value, 0.0, 0.0, 0.0))) is ForceFault.INVALID
 
 
 @pytest.mark.parametrize("axis", range(6))
 def test_beyond_the_range_is_told_at_once_and_a_fault_on_the_third(axis):
     watch = checks(jump_n=0.015)
-    wrench = np.zeros(6)
-    wrench[axis] = -5.01 if axis < 3 else -0.301
-    assert watch.check(np.zeros(6)) is False
+    wrench = six(np.eye(6)[axis] * (-5.01 if axis < 3 else -0.301))
+    assert watch.check((0.0,) * 6) is False
     assert watch.check(wrench) is True
     assert watch.check(wrench) is True
     assert fault_of(lambda: watch.check(wrench)) is ForceFault.OVERLOAD
@@ -108,8 +110,8 @@ def test_a_change_of_sign_and_a_step_of_bias_are_jumps_a_contact_is_not():
     force_n = 0.0
     for wrench in noisy(rng, n=400):  # 80 N/m at 5 mm/s: 0.4 mN each millisecond
         force_n += 0.0004 if force_n < 0.02 else 0.0
-        watch.check(wrench + [0, 0, force_n, 0, 0, 0])
-    flipped = noisy(rng)[0] - [0, 0, force_n, 0, 0, 0]
+        watch.check(six(np.add(wrench, [0, 0, force_n, 0, 0, 0])))
+    flipped = six(np.subtract(noisy(rng)[0], [0, 0, force_n, 0, 0, 0]))
     assert fault_of(lambda: watch.check(flipped)) is ForceFault.JUMP
 
 

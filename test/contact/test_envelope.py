@@ -19,15 +19,18 @@ from tactile_resonance.contact.parameters import (
     read_contact,
 )
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.contact.samples import ArmSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.vectors import ZERO, six, vector
 
 LIMITS = Limits(workspace=Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5)))
 ENVELOPE = Envelope(LIMITS)
 SLACK = 1 + 1e-9
 
 number = st.floats(-1.0, 1.0)
-vectors = st.tuples(number, number, number).map(np.array)
-normals = vectors.filter(lambda v: np.linalg.norm(v) > 0.1).map(lambda v: v / np.linalg.norm(v))
+vectors = st.tuples(number, number, number)
+normals = vectors.filter(lambda v: np.linalg.norm(v) > 0.1).map(
+    lambda v: vector(v / np.linalg.norm(v))
+)
 places = st.builds(
     Place,
     normal=normals,
@@ -35,24 +38,22 @@ places = st.builds(
     depth_m=st.none() | st.floats(-1e-3, 6e-3),
     misalignment_rad=st.floats(0, 1),
 )
-twists = st.tuples(*[number] * 6).map(np.array)
-positions = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.1, 0.6)).map(
-    np.array
-)
+twists = st.tuples(*[number] * 6)
+positions = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.1, 0.6))
 
 
 @settings(max_examples=400, deadline=None)
 @given(twists, positions, places)
 def test_what_is_let_through_keeps_every_limit(twist, position, place):
-    out = ENVELOPE.bound(twist, position, place)
-    velocity, inwards = out[:3], -float(place.normal @ out[:3])
+    out = np.array(ENVELOPE.bound(twist, position, place))
+    velocity, inwards = out[:3], -float(np.dot(place.normal, out[:3]))
     assert np.isfinite(out).all()
     assert np.linalg.norm(velocity) <= LIMITS.free_speed_m_s * SLACK
     assert np.linalg.norm(out[3:]) <= LIMITS.angular_speed_rad_s * SLACK
     if place.height_m < LIMITS.near_m and inwards > 1e-12:
         assert np.linalg.norm(velocity) <= LIMITS.near_speed_m_s * SLACK
     if place.depth_m is not None:
-        along = velocity + inwards * place.normal
+        along = velocity + inwards * np.array(place.normal)
         assert np.linalg.norm(along) <= LIMITS.lateral_speed_m_s * SLACK
         assert inwards <= LIMITS.contact_speed_m_s * SLACK
         if place.depth_m >= LIMITS.depth_m:
@@ -66,17 +67,17 @@ def test_what_is_let_through_keeps_every_limit(twist, position, place):
 
 # along the wall that it has passed, where rounding leaves 1e-149 m/s towards it
 ALONG_A_WALL = (
-    np.array([-1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
-    np.array([0.375, 0.0, 0.0]),
-    Place(np.array([1.0, -3.9e-147, 0.0]), 0.0, 4e-3, 0.0),
+    (-1.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+    (0.375, 0.0, 0.0),
+    Place((1.0, -3.9e-147, 0.0), 0.0, 4e-3, 0.0),
 )
 
 
 # along floor and surface, where rounding turns 1e-133 m/s away from the surface into 1e-299 m/s towards it
 ALONG_THE_SURFACE = (
-    np.array([1.0, 0.0, -5e-133, 0.0, 0.0, 0.0]),
-    np.zeros(3),
-    Place(np.array([-6e-298, 0.0, -1.0]), 0.0, None, 0.0),
+    (1.0, 0.0, -5e-133, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    Place((-6e-298, 0.0, -1.0), 0.0, None, 0.0),
 )
 
 
@@ -86,21 +87,20 @@ ALONG_THE_SURFACE = (
 @given(twists, positions, places)
 def test_it_never_turns_a_motion_round_and_never_makes_one_faster(twist, position, place):
     out = ENVELOPE.bound(twist, position, place)
-    assert float(out[:3] @ twist[:3]) >= -1e-12
+    assert np.dot(out[:3], twist[:3]) >= -1e-12
     assert np.linalg.norm(out[:3]) <= np.linalg.norm(twist[:3]) * SLACK + 1e-15
-    assert float(out[3:] @ twist[3:]) >= -1e-12
+    assert np.dot(out[3:], twist[3:]) >= -1e-12
     again = ENVELOPE.bound(out, position, place)
     np.testing.assert_allclose(again, out, rtol=1e-9, atol=1e-12)
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from([math.nan, math.inf, -math.inf, 0.1]), min_size=6, max_size=6))
-def test_what_is_no_number_stops_the_tip(values):
-    twist = np.array(values)
-    if np.isfinite(twist).all():
+def test_what_is_not_finite_stops_the_tip(values):
+    if np.isfinite(values).all():
         return
-    place = Place(np.array([0.0, 0, 1]), 0.01, None, 0.0)
-    np.testing.assert_array_equal(ENVELOPE.bound(twist, np.array([0, 0, 0.1]), place), 0)
+    place = Place((0.0, 0.0, 1.0), 0.01, None, 0.0)
+    np.testing.assert_array_equal(ENVELOPE.bound(tuple(values), (0.0, 0.0, 0.1), place), 0)
 
 
 @settings(max_examples=30, deadline=None)
@@ -109,8 +109,8 @@ def test_a_tip_that_comes_down_as_fast_as_allowed_is_slow_when_it_is_near(height
     # followed with dead time 4 ms and lag 10 ms, limited in acceleration to 0.5 m/s2
     speed, delayed, line = 0.0, 0.0, [0.0, 0.0]
     for _ in range(1500):
-        place = Place(np.array([0.0, 0, 1]), height, None, 0.0)
-        out = ENVELOPE.bound(np.array([0, 0, -0.1, 0, 0, 0]), np.array([0, 0, 0.2]), place)
+        place = Place((0.0, 0.0, 1.0), height, None, 0.0)
+        out = ENVELOPE.bound((0.0, 0.0, -0.1, 0.0, 0.0, 0.0), (0.0, 0.0, 0.2), place)
         delayed += min(1e-3, max(-1e-3, out[2] - delayed))
         line.append(delayed)
         speed += (line.pop(0) - speed) * (1 - math.exp(-0.2))
@@ -120,8 +120,8 @@ def test_a_tip_that_comes_down_as_fast_as_allowed_is_slow_when_it_is_near(height
 
 
 def arm(**changes):
-    pose = Pose(np.array([0.1, 0.0, 0.2]), np.zeros(3))
-    return replace(ArmSample(1_000_000_000, 1.0, pose, np.zeros(6)), **changes)
+    still = ArmSample(1_000_000_000, 1.0, (0.1, 0.0, 0.2), (0.0, 0.0, 0.0), (0.0,) * 6)
+    return still._replace(**changes)
 
 
 @pytest.mark.parametrize(
@@ -130,10 +130,11 @@ def arm(**changes):
         (None, Cause.ARM_STALE),
         (arm(time_ns=979_000_000), Cause.ARM_STALE),
         (arm(moving_allowed=False, message="protective stop"), Cause.ARM_STOPPED),
-        (arm(tip=Pose(np.array([np.nan, 0, 0.2]), np.zeros(3))), Cause.ARM_INVALID),
-        (arm(tip=Pose(np.array([0.1, 0.31, 0.2]), np.zeros(3))), Cause.WORKSPACE),
-        (arm(tip=Pose(np.array([0.1, 0, 0.2]), np.array([0.0, 0.81, 0]))), Cause.TILT),
-        (arm(tip=Pose(np.array([0.1, 0, 0.2]), np.array([np.pi, 0, 0]))), Cause.TILT),
+        (arm(position_m=(math.nan, 0.0, 0.2)), Cause.ARM_INVALID),
+        (arm(position_m=(0.1, 0.31, 0.2)), Cause.WORKSPACE),
+        (arm(position_m=(0.1, 0.0, -0.01)), Cause.WORKSPACE),
+        (arm(rotation_rad=(0.0, 0.81, 0.0)), Cause.TILT),
+        (arm(rotation_rad=(math.pi, 0.0, 0.0)), Cause.TILT),
     ],
 )
 def test_state_of_the_arm_is_judged(sample, cause):
@@ -144,9 +145,9 @@ def test_state_of_the_arm_is_judged(sample, cause):
     "rotation", [[0, 0, 0], [0, 0, 3.0], [0.5, 0.5, 0], [0, 0.79, 0], [0.2, 0.1, 2.0]]
 )
 def test_upright_arm_passes(rotation):
-    pose = Pose(np.array([0.1, 0, 0.2]), np.array(rotation, dtype=float))
-    tilt = math.acos(min(1.0, pose.rotation.as_matrix()[2, 2]))
-    breach = ENVELOPE.judge_arm(1_000_000_000, arm(tip=pose))
+    sample = arm(rotation_rad=vector(rotation))
+    tilt = math.acos(min(1.0, sample.tip.rotation.as_matrix()[2, 2]))
+    breach = ENVELOPE.judge_arm(1_000_000_000, sample)
     assert (breach is None) == (tilt <= LIMITS.tilt_rad)
 
 
@@ -161,18 +162,18 @@ def test_upright_arm_passes(rotation):
     ],
 )
 def test_motion_near_the_surface_is_judged(velocity, place, cause):
-    sample = arm(tip_velocity=np.array([*velocity, 0, 0, 0], dtype=float))
+    sample = arm(velocity=six([*velocity, 0, 0, 0]))
     limits = Envelope(replace(LIMITS, depth_m=4e-3))
-    breach = limits.judge_motion(sample, Place(np.array([0.0, 0, 1]), *place))
+    breach = limits.judge_motion(sample, Place((0.0, 0.0, 1.0), *place))
     assert (None if breach is None else breach.cause) is cause
 
 
-def watched(forces, period_ns=2_000_000):
-    watch = ForceWatch(10)
-    watch.set_bias(np.zeros(3))
-    for n, force in enumerate(forces):
-        force = np.array(force, dtype=float) + [0, 0, 1e-9 * n]
-        assert watch.add(WrenchSample(n * period_ns, force, np.zeros(3))) is None
+def watched(forces, period_ns=2_000_000, mean_s=0.02):
+    watch = ForceWatch(10, mean_s)
+    watch.set_bias((0.0, 0.0, 0.0))
+    for n, (x, y, z) in enumerate(forces):
+        sample = WrenchSample(n * period_ns, (x, y, z + 1e-9 * n), (0.0, 0.0, 0.0))
+        assert watch.add(sample) is None
     return watch, (len(forces) - 1) * period_ns
 
 
@@ -199,15 +200,16 @@ def test_old_force_is_judged():
     watch, now = watched([[0, 0, 0.01]] * 5)
     assert ENVELOPE.judge_force(now + 10_000_000, watch) is None
     assert ENVELOPE.judge_force(now + 10_100_000, watch).cause is Cause.FORCE_STALE
-    assert ENVELOPE.judge_force_age(0, ForceWatch(10)).cause is Cause.FORCE_STALE
+    assert ENVELOPE.judge_force_age(0, ForceWatch(10, 0.05)).cause is Cause.FORCE_STALE
 
 
 @pytest.mark.parametrize(
     ("sample", "cause"),
     [
-        (WrenchSample(10, np.array([0, np.nan, 0]), np.zeros(3)), Cause.FORCE_INVALID),
-        (WrenchSample(10, np.zeros(3), np.zeros(3), overload=True), Cause.FORCE_OVERLOAD),
-        (WrenchSample(0, np.ones(3), np.zeros(3)), Cause.FORCE_INVALID),
+        (WrenchSample(10, (0.0, math.nan, 0.0), ZERO), Cause.FORCE_INVALID),
+        (WrenchSample(10, (math.inf, 0.0, -math.inf), ZERO), Cause.FORCE_INVALID),
+        (WrenchSample(10, ZERO, ZERO, overload=True), Cause.FORCE_OVERLOAD),
+        (WrenchSample(0, (1.0, 1.0, 1.0), ZERO), Cause.FORCE_INVALID),
     ],
 )
 def test_bad_force_is_not_used(sample, cause):
@@ -221,8 +223,8 @@ def test_rate_of_a_ramp_is_its_slope():
     ramp = [[0, 0, 0.5 * 0.002 * n + 1e-4 * rng.standard_normal()] for n in range(50)]
     watch, _ = watched(ramp)
     assert watch.rate_n_per_s() == pytest.approx(0.5, abs=0.05)
-    assert watch.mean_n(0.02) == pytest.approx(0.5 * (0.098 - 0.009), abs=2e-4)
-    assert watch.mean_n(0.2) is None
+    assert watch.mean_n == pytest.approx(0.5 * (0.098 - 0.009), abs=2e-4)
+    assert watched(ramp, mean_s=0.2)[0].mean_n is None
 
 
 def test_configuration_is_read_and_checked(tmp_path):

@@ -24,8 +24,8 @@ def test_force_and_depth_are_each_other_and_obey_hertz_in_series(c, beam):
     for pressed in (1e-5, 1e-3, 1e-2, 5e-2):
         depth = hertz.depth(pressed, c, beam)
         force, slope, per_ln_c = hertz.force(depth, c, beam)
-        assert force == pytest.approx(pressed, rel=1e-6)
-        assert c * (depth - force / beam) ** 1.5 == pytest.approx(force, rel=1e-5)
+        assert force == pytest.approx(pressed, rel=1e-12)
+        assert c * (depth - force / beam) ** 1.5 == pytest.approx(force, rel=1e-12)
         step = 1e-4 * depth
         up, down = (hertz.force(depth + sign * step, c, beam)[0] for sign in (1, -1))
         assert slope == pytest.approx((up - down) / (2 * step), rel=1e-4)
@@ -89,11 +89,10 @@ def test_force_is_followed_through_press_and_relaxation(c, beam):
 
 
 def test_time_passes_alike_in_one_step_and_in_many_and_an_hour_is_not_too_long():
-    # a clock that is set ends the contact, but the filter hears of the new time first
     heights, forces = press(np.random.default_rng(4), 800.0)
     ways = [ContactFilter(heights, forces, noise_n=NOISE_N) for _ in range(2)]
     for model in ways:
-        model._x[2] = 0.3
+        model.c_rate_per_s = 0.3
     ways[0].predict(2.0)
     for _ in range(1000):
         ways[1].predict(DT)
@@ -104,6 +103,54 @@ def test_time_passes_alike_in_one_step_and_in_many_and_an_hour_is_not_too_long()
     # ln C goes on by the rate times the second in which it dies out, whatever the time
     assert ways[0].c == pytest.approx(before * math.exp(once[1]), rel=1e-9)
     assert math.isfinite(ways[0].update(heights[-1], forces[-1]))
+
+
+@pytest.mark.parametrize("beam", [hertz.RIGID, 14.8])
+def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
+    rng = np.random.default_rng(6)
+    heights, forces = press(rng, 800.0, beam)
+    model = ContactFilter(heights, forces, noise_n=NOISE_N, beam_n_per_m=beam, vibration_m=5e-6)
+    mean, covariance = touch_posterior(heights, forces, NOISE_N, beam)
+    x, p = np.array([*mean, model.c_rate_per_s]), np.zeros((3, 3))
+    p[:2, :2], p[2, 2] = covariance, 0.25
+    height = heights[-1]
+    for n in range(300):
+        height -= 4e-6 if n < 150 else 0.0
+        measured = hertz.force(-height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
+        gone = 1 - math.exp(-DT)
+        f = np.array([[1, 0, 0], [0, 1, gone], [0, 0, 1 - gone]])
+        x, p = f @ x, f @ p @ f.T + 0.05**2 * DT * np.diag([0, 1, 25])
+        expected, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[1]), beam)
+        h = np.array([slope, per_ln_c, 0])
+        spread = h @ p @ h + NOISE_N**2 + (slope * 5e-6) ** 2
+        step = p @ h / spread * (measured - expected)
+        x, p = x + step / max(1.0, abs(step[1])), p - np.outer(p @ h, p @ h) / spread
+        model.predict(DT)
+        off = model.update(height, measured)
+        assert off == pytest.approx((measured - expected) / math.sqrt(spread), rel=1e-9, abs=1e-12)
+    estimate = model.estimate(height)
+    got = model.surface_m, math.log(model.c), model.c_rate_per_s, estimate.depth_std_m
+    np.testing.assert_allclose(got, [*x, math.sqrt(p[0, 0])], rtol=1e-9)
+    force, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[1]), beam)
+    h = np.array([slope, per_ln_c, 0])
+    assert estimate.force_n == model.force_at(height) == pytest.approx(force, rel=1e-9)
+    assert estimate.force_std_n == pytest.approx(math.sqrt(h @ p @ h), rel=1e-9)
+
+
+def test_touch_is_told_by_the_mean_of_a_window():
+    rng = np.random.default_rng(8)
+    detector, forces = TouchDetector(NOISE_N, 7e-5), []
+    told = 0
+    for n in range(3000):
+        forces.append(rng.normal(3e-3 * math.sin(n / 40), NOISE_N))
+        want = any(
+            len(forces) >= k
+            and np.mean(forces[-k:]) > 5.0 * math.sqrt(NOISE_N**2 / k + 7e-5**2)
+            for k in (4, 12, 36)
+        )
+        assert detector.add(forces[-1]) == want
+        told += want
+    assert 300 < told < 2000
 
 
 def test_touch_is_found_soon_and_noise_is_none():
@@ -144,7 +191,8 @@ def test_law_stands_still_at_the_force_and_goes_towards_it_elsewhere():
     rng = np.random.default_rng(4)
     heights, forces = press(rng, 800.0)
     model = ContactFilter(heights, forces, noise_n=NOISE_N)
-    target, slope, std = model.height_for(0.01)
+    depth = model.depth_for(0.01)
+    target, (slope, std) = model.surface_m - depth, model.slope_at(depth)
     assert model.estimate(target).force_n == pytest.approx(0.01, rel=1e-6)
     p = ContactParameters()
     creep = 2 / 3 * model.c_rate_per_s * hertz.depth(0.01, model.c)

@@ -225,6 +225,19 @@ def test_tissue_that_is_taken_away_is_noticed(state):
     assert max(made.force_n[at:]) < 1.2 * contacts.FORCE_N
 
 
+@pytest.mark.parametrize("lost_s", [0.02, 0.3])
+def test_lost_contact_is_told_by_the_mean_over_the_time_asked_for(lost_s):
+    made = started(limits=Limits(lost_s=lost_s, depth_m=6e-3, force_rate_n_per_s=10.0))
+    assert made.run_until(State.HOLD)
+    made.run(0.5)
+    lower(made.bench, 0.01)
+    at = len(made.force_n)
+    assert made.run_until(State.FAULT, 1.0)
+    assert made.controller.result.cause is Cause.CONTACT_LOST
+    # 10 mN until the tissue was gone: the mean is below 2 mN after four fifths of its time
+    assert (len(made.force_n) - at) * 0.002 == pytest.approx(0.8 * lost_s, rel=0.2, abs=6e-3)
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_tissue_ten_times_stiffer_than_the_stiffest_stays_below_the_hard_limit(seed):
     # 400 kPa under 2.5 mm: 370 N/m at 1 cN

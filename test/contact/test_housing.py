@@ -18,11 +18,12 @@ from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.tip_path import TipPath
+from tactile_resonance.contact.vectors import vector
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, contact
 
-UP = np.array([0.0, 0.0, 1.0])
+UP = (0.0, 0.0, 1.0)
 FLAT = TipGeometry(beam_tilt_rad=0.08)  # the housing 1.6 mm above the surface at the touch
 
 
@@ -35,17 +36,22 @@ def with_tip(tip, limits=None, **options):
     return made
 
 
+def rows(rotation):
+    """A rotation as the core has it: the matrix in a tuple, row by row."""
+    return tuple(rotation.as_matrix().ravel().tolist())
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.03, -0.05])
 def test_height_of_the_housing_is_that_of_its_lowest_point_drawn_in_the_plane(angle):
     tip = TipGeometry()
-    turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+    turn = Rotation.from_rotvec([0.0, angle, 0.0])
     # in the tip's x-z plane: ball at the origin, clamp at -L cos, L sin, housing straight below it
     x, z = -0.064 * np.cos(0.17), 0.064 * np.sin(0.17) - 6e-3
     lowered = np.cos(angle) * z - np.sin(angle) * x
-    assert tip.housing_height(turn, UP, -1e-3) == pytest.approx(2.5e-3 - 1e-3 + lowered, abs=1e-12)
+    assert tip.housing_height(rows(turn), UP, -1e-3) == pytest.approx(2.5e-3 - 1e-3 + lowered, abs=1e-12)
     # tip and plane turned together see the same
     both = Rotation.from_rotvec([0.3, -0.2, 0.5])
-    same = tip.housing_height(both.as_matrix() @ turn, both.apply(UP), -1e-3)
+    same = tip.housing_height(rows(both * turn), vector(both.apply(UP)), -1e-3)
     assert same == pytest.approx(2.5e-3 - 1e-3 + lowered, abs=1e-12)
 
 
@@ -54,7 +60,7 @@ def test_worst_height_is_the_least_over_all_turns_of_that_angle():
     worst = tip.worst_height(4e-3, 0.05)
     axes = rng.standard_normal((2000, 3))
     turns = Rotation.from_rotvec(0.05 * axes / np.linalg.norm(axes, axis=1)[:, None])
-    heights = [tip.housing_height(turn, UP, -4e-3) for turn in turns.as_matrix()]
+    heights = [tip.housing_height(rows(turn), UP, -4e-3) for turn in turns]
     assert worst <= min(heights)
     assert min(heights) - worst < 0.1e-3
     # the default sensor at the default limits: a sixth of a millimetre
@@ -109,8 +115,11 @@ def test_housing_is_nowhere_lower_on_the_way_than_told():
         path, heights = TipPath(made.goal, tip), []
 
         def record(made=made, path=path, heights=heights, start=start):
-            arm = replace(start, tip=made.bench.clock.motion.reported)
-            if np.linalg.norm(path.turn(arm)) > made.controller.limits.misalignment_rad / 2:
+            tip = made.bench.clock.motion.reported
+            arm = start._replace(
+                position_m=vector(tip.position_m), rotation_rad=vector(tip.rotation_rad)
+            )
+            if path.off_rad(arm) > made.controller.limits.misalignment_rad / 2:
                 heights.append(path.housing_m(arm, path.height_m(arm)))
 
         made.bench.clock.on_step.append(record)

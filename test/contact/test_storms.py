@@ -16,7 +16,7 @@ from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.parameters import Limits
-from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant import Plane
 from tactile_resonance.simulation.transducer import CellParameters
 
@@ -90,11 +90,6 @@ def repaired(rig):
     rig.bench.arm.connect()
 
 
-def clock_set(rig, rng):
-    rig.clock.offset_ns += int(rng.choice([-3600, -1, -0.05, -0.005, 0.005, 0.05, 1, 3600]) * 1e9)
-    return lambda: None
-
-
 def unheard(rig, rng):
     rig.arm.deaf = True
     return lambda: setattr(rig.arm, "deaf", False)
@@ -128,15 +123,15 @@ def parameters_changed(rig, rng):
 
 
 def moved_tip(by_m):
-    return lambda s: replace(s, tip=Pose(s.tip.position_m + by_m, s.tip.rotation_rad))
+    return lambda s: s._replace(position_m=vector(np.add(s.position_m, by_m)))
 
 
-def no_number(s):
-    return replace(s, tip=Pose(s.tip.position_m, s.tip.rotation_rad * np.nan))
+def not_finite(s):
+    return s._replace(rotation_rad=(np.nan,) * 3)
 
 
 def forced(change):
-    return lambda s: replace(s, force_n=change(s.force_n))
+    return lambda s: s._replace(force_n=vector(change(np.array(s.force_n))))
 
 
 SHORT_S = (0.0, 0.05)
@@ -161,12 +156,11 @@ FAULTS = {
     "frozen": (frozen, None, True),
     "stopped": (stopped, None, True),
     "link lost": (lost, None, True),
-    "pose no number": (of_samples("arm", no_number), None, True),
+    "pose no number": (of_samples("arm", not_finite), None, True),
     "pose too low": (of_samples("arm", moved_tip([0, 0, -2e-3])), SHORT_S, True),
     "pose aside": (of_samples("arm", moved_tip([0.02, 0, 0])), SHORT_S, True),
     "arm ahead": (late("arm", -1.0, -0.03), None, True),
     "arm late": (late("arm", 0.0, 0.05), None, True),
-    "clock set": (clock_set, None, True),
     "unheard": (unheard, SHORT_S, False),
     "tissue gone": (tissue_moved(-5e-3), None, False),
     "tissue up": (tissue_moved(3e-4), None, False),

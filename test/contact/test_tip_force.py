@@ -11,6 +11,7 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.requirements import require_fit, unfit
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.vectors import six, vector
 
 FINE = ForceInfo("fine", 1000.0, 1e-3, 2e-4, 5.0, Mount.TOOL)
 
@@ -36,7 +37,7 @@ class Recorded:
 
 def test_weight_and_inertia_of_a_shaken_tool_leave_the_contact():
     """The tool swings at 2 Hz with 0.5 m/s2 and turns; 10 mN press on it all the while."""
-    payload = Payload(0.03, np.array([0.0, 0.0, 0.02]))
+    payload = Payload(0.03, (0.0, 0.0, 0.02))
     frame = Pose(np.array([-0.05, 0.0, 0.02]), np.array([0.0, 0.3, 0.0]))
     own = frame.rotation.as_matrix()
     w = 2 * np.pi * 2
@@ -45,7 +46,9 @@ def test_weight_and_inertia_of_a_shaken_tool_leave_the_contact():
         tilt = Rotation.from_rotvec([0.3 * np.sin(w * t), 0, 0])
         velocity = np.array([0, 0, -0.5 / w * np.cos(w * t), 0.3 * w * np.cos(w * t), 0, 0])
         position = np.array([0.4, 0, 0.1 - 0.5 / w**2 * np.sin(w * t)])
-        return ArmSample(round(t * 1e9), t, Pose(position, tilt.as_rotvec()), velocity)
+        return ArmSample(
+            round(t * 1e9), t, vector(position), vector(tilt.as_rotvec()), six(velocity)
+        )
 
     def cell_at(t):
         state = state_at(t)
@@ -63,7 +66,7 @@ def test_weight_and_inertia_of_a_shaken_tool_leave_the_contact():
         force = own.T @ (contact + turn.T @ load)
         torque = own.T @ np.cross(-frame.position_m, contact)
         torque = torque + np.cross(payload.centre_m, own.T @ turn.T @ load)
-        return CellSample(state.time_ns, np.concatenate([force, torque]))
+        return CellSample(state.time_ns, six([*force, *torque]))
 
     def worst_error_n(window_s):
         now = [0.0]
@@ -77,7 +80,7 @@ def test_weight_and_inertia_of_a_shaken_tool_leave_the_contact():
             cell.waiting.append(cell_at(now[0]))
             (sample,) = source.read()
             if i > 10:
-                worst = max(worst, float(np.abs(sample.force_n - [0, 0, 0.01]).max()))
+                worst = max(worst, float(np.abs(np.subtract(sample.force_n, [0, 0, 0.01])).max()))
         return worst
 
     uncompensated_n = worst_error_n(0.0)

@@ -211,7 +211,7 @@ def test_two_readers_share_the_bus(cell):
                 heard.add(tuple(struct.unpack(">3h", message.data[1:7])))
             if len(heard) > 400:
                 break
-        own_counts = {tuple(np.rint(s.wrench[:3] * 5000).astype(int)) for s in own}
+        own_counts = {tuple(np.rint(np.array(s.wrench[:3]) * 5000).astype(int)) for s in own}
         assert own_counts & heard
     finally:
         first.close()

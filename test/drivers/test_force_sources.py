@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.samples import ArmSample, Pose
+from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.simulation.cell_loop import CellLoop
@@ -24,8 +24,8 @@ def test_the_tip_feels_what_presses_on_the_cell_under_the_sample():
     bus = SocketcandServer("127.0.6.4", 0)
     cell = LoadCell(CellParameters("quiet", 5000.0, 1e5, 1e-3, 5e-5, 5.0, 0.3))
     # the surface's normal is tilted by 0.1 rad about y; the force on the cell is against it
-    tilt = Pose(np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.1, 0.0]))
-    normal = tilt.rotation.apply([0, 0, 1])
+    state = ArmSample(0, 0.0, (0.3, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0,) * 6)
+    normal = state.tip.rotation.apply([0, 0, 1])
     wrench = np.concatenate([-0.01 * normal, np.zeros(3)])
     ended = threading.Event()
     loop = threading.Thread(target=CellLoop(cell, bus, lambda _: wrench).run, args=(ended.is_set,))
@@ -37,7 +37,7 @@ def test_the_tip_feels_what_presses_on_the_cell_under_the_sample():
         can=replace(config.can, bus=settings),
         limits=replace(config.limits, silent_s=1.0),
     )
-    source = force_source(config, lambda: ArmSample(0, 0.0, tilt, np.zeros(6)))
+    source = force_source(config, lambda: state)
     samples = []
     try:
         source.start()

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault, ForceError, ForceFault
-from tactile_resonance.contact.samples import ArmSample, Pose
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.vectors import six
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.rtde_wrench import RtdeWrench
 
 CONFIG = read_force_config(Path("rtde_ur.yaml"))
-DOWN = Pose(np.array([0.4, 0.0, 0.3]), np.array([np.pi / 2, 0.0, 0.0]))
+PLACE_M, TURNED_RAD, STILL = (0.4, 0.0, 0.3), (np.pi / 2, 0.0, 0.0), (0.0,) * 6
 
 
 class States:
@@ -25,8 +26,8 @@ class States:
         self.now = self.at(1.0, [0.0] * 6)
 
     def at(self, time_s, wrench):
-        wrench = None if wrench is None else np.array(wrench, float)
-        return ArmSample(round(time_s * 1e9), time_s, DOWN, np.zeros(6), tool_wrench=wrench)
+        time_ns, wrench = round(time_s * 1e9), None if wrench is None else six(wrench)
+        return ArmSample(time_ns, time_s, PLACE_M, TURNED_RAD, STILL, tool_wrench=wrench)
 
     def __call__(self):
         if self.now is None:

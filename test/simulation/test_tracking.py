@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.tracking import Jitter, Lag, TipMotion, TrackingParameters
@@ -47,27 +46,6 @@ def test_speed_is_reached_under_the_acceleration_limit_and_the_way_is_its_integr
     np.testing.assert_allclose(places[-1], want, atol=1e-9)
     angle = np.linalg.norm(tip.pose.rotation_rad)
     assert angle == pytest.approx(0.2 * (0.6 - late), rel=1e-6)
-
-
-def test_straight_move_ends_at_its_pose_without_passing_it():
-    goal = Pose(
-        START.position_m + [0.0, 0.05, -0.02], Rotation.from_rotvec([0.2, 0.1, 0]).as_rotvec()
-    )
-    tip = TipMotion(STILL, START)
-    tip.move(goal, 0.1, 0.5)
-    speeds = []
-    distance = np.linalg.norm(goal.position_m - START.position_m)
-    direction = (goal.position_m - START.position_m) / distance
-    while tip.moving() and len(speeds) < 2000:
-        tip.step()
-        speeds.append(np.linalg.norm(tip.twist[:3]))
-        assert direction @ (tip.reported.position_m - START.position_m) <= distance + 1e-6
-    assert not tip.moving()
-    assert max(speeds) <= 0.1 * (1 + 1e-9)
-    np.testing.assert_allclose(tip.reported.position_m, goal.position_m, atol=1e-6)
-    np.testing.assert_allclose(tip.reported.rotation_rad, goal.rotation_rad, atol=1e-5)
-    # trapezoid of the scaled way, dead time and a few lags
-    assert len(speeds) * 0.002 < distance / 0.1 + 0.1 / 0.5 + 0.004 + 0.2
 
 
 def test_vibration_has_its_rms_and_its_correlation():

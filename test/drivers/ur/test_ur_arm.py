@@ -41,7 +41,7 @@ def test_moves_in_a_straight_line_to_the_pose(high):
         done = sample.tip.position_m - start.position_m
         aside = done - way * (done @ way) / length**2
         assert np.linalg.norm(aside) < 2e-5
-        assert np.linalg.norm(sample.tip_velocity[:3]) < 0.052
+        assert np.linalg.norm(sample.velocity[:3]) < 0.052
     took = samples[-1].robot_time_s - samples[0].robot_time_s
     # trapezoid: length / speed + speed / acceleration
     assert took == pytest.approx(length / 0.05 + 0.05 / ACCELERATION_M_S2, abs=0.15)
@@ -56,17 +56,17 @@ def test_speed_changes_and_stop(high):
     assert np.polyfit(t - t[0], z, 1)[0] == pytest.approx(DOWN[2], rel=5e-3)
     high.speed(-DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
-    assert high.state().tip_velocity[2] == pytest.approx(-DOWN[2], rel=0.02)
+    assert high.state().velocity[2] == pytest.approx(-DOWN[2], rel=0.02)
     high.stop(ACCELERATION_M_S2)
     keep_for(high, 0.1)
-    assert np.linalg.norm(high.state().tip_velocity) < 1e-4
+    assert np.linalg.norm(high.state().velocity) < 1e-4
     # a move overtaken by a speed, and a speed by a move
     goal = Pose(high.state().tip.position_m - [0, 0, 0.05], high.state().tip.rotation_rad)
     high.move(goal, 0.05, 1.0)
     keep_for(high, 0.2)
     high.speed(-DOWN, 1.0)
     keep_for(high, 0.5)
-    assert high.state().tip_velocity[2] == pytest.approx(-DOWN[2], rel=0.02)
+    assert high.state().velocity[2] == pytest.approx(-DOWN[2], rel=0.02)
     assert not high.moving()
     high.move(goal, 0.1, 1.0)
     keep(high, high.moving)
@@ -81,7 +81,7 @@ def test_stop_of_a_move(high):
     high.stop(2.0)
     keep(high, high.moving)
     keep_for(high, LAG_S)
-    assert np.linalg.norm(high.state().tip_velocity[:3]) < 1e-3
+    assert np.linalg.norm(high.state().velocity[:3]) < 1e-3
     assert start.position_m[2] - 0.09 < high.state().tip.position_m[2] < start.position_m[2] - 0.005
     assert high.state().moving_allowed
 
@@ -150,7 +150,7 @@ def test_short_freeze_is_survived(robot, module_arm, start_arm):
     robot.order("freeze", seconds=0.02)
     assert all(s.moving_allowed for s in keep_for(arm, 0.3))
     arm.speed(DOWN, ACCELERATION_M_S2)
-    assert keep_for(arm, 0.1)[-1].tip_velocity[2] < 0
+    assert keep_for(arm, 0.1)[-1].velocity[2] < 0
 
 
 def test_no_velocity_is_lost_where_packets_come_together(robot, high):
@@ -159,11 +159,11 @@ def test_no_velocity_is_lost_where_packets_come_together(robot, high):
         robot.order("freeze", seconds=0.025)
         high.speed(DOWN, ACCELERATION_M_S2)
         keep_for(high, 0.025 + LAG_S)
-        assert high.state().tip_velocity[2] == pytest.approx(DOWN[2], rel=0.1)
+        assert high.state().velocity[2] == pytest.approx(DOWN[2], rel=0.1)
         robot.order("freeze", seconds=0.025)
         high.stop(ACCELERATION_M_S2)
         keep_for(high, 0.025 + LAG_S)
-        assert np.abs(high.state().tip_velocity).max() < 5e-4
+        assert np.abs(high.state().velocity).max() < 5e-4
 
 
 def test_connection_is_dropped(robot, high):
@@ -192,7 +192,7 @@ def test_protective_stop(robot, high):
     robot.unlock()
     connect_again(high)
     high.speed(-DOWN, ACCELERATION_M_S2)
-    assert keep_for(high, 0.2)[-1].tip_velocity[2] > 0
+    assert keep_for(high, 0.2)[-1].velocity[2] > 0
 
 
 def test_emergency_stop(robot, high):

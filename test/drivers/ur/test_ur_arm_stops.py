@@ -21,7 +21,7 @@ def below(arm, by_m=0.1):
 
 
 def speed_m_s(arm):
-    return float(np.linalg.norm(arm.state().tip_velocity[:3]))
+    return float(np.linalg.norm(arm.state().velocity[:3]))
 
 
 def followed(arm, seconds):

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arithmetic on vectors and rotations as tuples of floats.
+
+The control loop does this in every period. On three numbers a numpy call costs ten to a hundred times
+as much as the arithmetic that it does, so that it is written out here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+Vector = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+"""Force and torque, or velocity and angular velocity."""
+Turn = tuple[float, float, float, float, float, float, float, float, float]
+"""A rotation matrix, row by row."""
+
+ZERO: Vector = (0.0, 0.0, 0.0)
+NO_TURN: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_NAN = math.nan
+_UNKNOWN: Turn = (_NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
+
+
+def vector(values: Iterable[float]) -> Vector:
+    """Return three numbers, of an array or whatever, as floats in a tuple."""
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def six(values: Iterable[float]) -> Six:
+    """Return six numbers, of an array or whatever, as floats in a tuple."""
+    a, b, c, d, e, f = map(float, values)
+    return a, b, c, d, e, f
+
+
+def dot(a: Vector, b: Vector) -> float:
+    """Return the scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product of two vectors."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def difference(a: Vector, b: Vector) -> Vector:
+    """Return `a` less `b`."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def scaled(factor: float, a: Vector) -> Vector:
+    """Return a vector times a number."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+def rotated(turn: Turn, a: Vector) -> Vector:
+    """Return a vector turned by a rotation."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+    x, y, z = a
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+def rotated_back(turn: Turn, a: Vector) -> Vector:
+    """Return a vector turned by the inverse of a rotation."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+    x, y, z = a
+    return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+
+
+def transposed(turn: Turn) -> Turn:
+    """Return the inverse of a rotation."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+    return xx, yx, zx, xy, yy, zy, xz, yz, zz
+
+
+def turn_product(a: Turn, b: Turn) -> Turn:
+    """Return the rotation that first does `b`, then `a`."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = b
+    return (
+        a0 * b0 + a1 * b3 + a2 * b6,
+        a0 * b1 + a1 * b4 + a2 * b7,
+        a0 * b2 + a1 * b5 + a2 * b8,
+        a3 * b0 + a4 * b3 + a5 * b6,
+        a3 * b1 + a4 * b4 + a5 * b7,
+        a3 * b2 + a4 * b5 + a5 * b8,
+        a6 * b0 + a7 * b3 + a8 * b6,
+        a6 * b1 + a7 * b4 + a8 * b7,
+        a6 * b2 + a7 * b5 + a8 * b8,
+    )
+
+
+def turn_from_vector(rotation_rad: Vector) -> Turn:
+    """Return the rotation of a rotation vector [rad] (Rodrigues' formula); NaN where that is not finite."""
+    x, y, z = rotation_rad
+    angle = math.hypot(x, y, z)
+    if angle == 0.0:
+        return NO_TURN
+    if not angle < math.inf:
+        return _UNKNOWN
+    # 1 - cos(angle) by half the angle: the difference has no digits left where the angle is small
+    half = math.sin(angle / 2) / angle
+    sine, versine = 2 * half * math.cos(angle / 2), 2 * half * half
+    sx, sy, sz = sine * x, sine * y, sine * z
+    vx, vy, vz = versine * x, versine * y, versine * z
+    return (
+        1.0 - vy * y - vz * z,
+        vx * y - sz,
+        vx * z + sy,
+        vx * y + sz,
+        1.0 - vx * x - vz * z,
+        vy * z - sx,
+        vx * z - sy,
+        vy * z + sx,
+        1.0 - vx * x - vy * y,
+    )
+
+
+def vector_from_turn(turn: Turn) -> Vector:
+    """Return the rotation vector [rad] of a rotation, of up to half a turn.
+
+    By the quaternion, whose largest element comes first (Shepperd, J. Guidance and Control 1, 1978),
+    so that no digits are lost at any angle. Of half a turn either direction of the axis is right.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+    trace = xx + yy + zz
+    largest = max(trace, xx, yy, zz)
+    # four times the product of the quaternion with its largest element
+    if largest == trace:
+        x, y, z, w = zy - yz, xz - zx, yx - xy, 1.0 + trace
+    elif largest == xx:
+        x, y, z, w = 1.0 - trace + 2 * xx, xy + yx, xz + zx, zy - yz
+    elif largest == yy:
+        x, y, z, w = xy + yx, 1.0 - trace + 2 * yy, yz + zy, xz - zx
+    else:
+        x, y, z, w = xz + zx, yz + zy, 1.0 - trace + 2 * zz, yx - xy
+    sine = math.hypot(x, y, z)
+    if sine == 0.0:
+        return ZERO
+    scale = 2 * math.atan2(sine, w) / sine if w >= 0.0 else -2 * math.atan2(sine, -w) / sine
+    return scale * x, scale * y, scale * z
+
+
+def quaternion_from_vector(rotation_rad: Vector) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w) of a rotation vector [rad]."""
+    x, y, z = rotation_rad
+    angle = math.hypot(x, y, z)
+    half = 0.5 if angle == 0.0 else math.sin(angle / 2) / angle
+    return half * x, half * y, half * z, math.cos(angle / 2)
