@@ -53,13 +53,17 @@ class ToBench(IntEnum):
     GO = 3
     SEED = 4  # up to three integers: noise is theirs from now on
     WAKE = 6  # time at which it is told, and which nobody waits for [ns]
-    PORTS = 5  # local ports of the connections to the robot's RTDE server and to the bus of the cell
+    PORTS = (
+        5  # local ports of the connections to the robot's RTDE server and to the bus of the cell
+    )
 
 
 class FromBench(IntEnum):
     """Kinds of messages from the bench, with their integers."""
 
-    TOLD = 1  # time now [ns]; what was sent: stamp of the newest robot state [ns], frames of the bus
+    TOLD = (
+        1  # time now [ns]; what was sent: stamp of the newest robot state [ns], frames of the bus
+    )
     TIME = 2  # time now [ns]
 
 
@@ -87,9 +91,13 @@ class Clock(Protocol):
         """A time of this clock as ROS time: since 1970, or of the simulation [ns]."""
         ...
 
+    def own_ns(self, ros_ns: int) -> int:
+        """A ROS time as one of this clock [ns]."""
+        ...
+
 
 class WallClock:
-    """This machine's monotonic clock, related to ROS time once, when it is made."""
+    """The machine's monotonic clock, related to ROS time once, when it is made."""
 
     simulated = False
 
@@ -217,9 +225,7 @@ class SimulatedClock:
         while self._now_ns < time_ns:
             self.wait_told(while_waiting)
 
-    def sleep_until(
-        self, time_ns: int, while_waiting: Callable[[], None] | None = None
-    ) -> None:
+    def sleep_until(self, time_ns: int, while_waiting: Callable[[], None] | None = None) -> None:
         """Wait until it is a time [ns], without a part in whether and when that comes."""
         if time_ns <= self._now_ns:
             return

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from tactile_resonance.simulation.cell_loop import CellLoop
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.simulation.cell_loop import CellLoop
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.socketcand import SocketcandServer
 from tactile_resonance.simulation.transducer import CellParameters

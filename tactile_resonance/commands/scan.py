@@ -41,6 +41,4 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def _resume(options: argparse.Namespace) -> int:
     run = options.output.resolve()
     scene = run / "scene.yaml"
-    return run_job(
-        Job(scene, run, options.robot_host, resume=True, real_time=options.real_time)
-    )
+    return run_job(Job(scene, run, options.robot_host, resume=True, real_time=options.real_time))

@@ -146,9 +146,7 @@ class CellChecks:
         self._equal = self._equal + 1 if wrench == last else 0
         if self._stuck_at is not None and self._equal + 1 >= self._stuck_at:
             raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
-        largest = max(
-            abs(wrench[0] - last[0]), abs(wrench[1] - last[1]), abs(wrench[2] - last[2])
-        )
+        largest = max(abs(wrench[0] - last[0]), abs(wrench[1] - last[1]), abs(wrench[2] - last[2]))
         if largest > self._limits.jump_n and not over:
             raise ForceError(
                 ForceFault.JUMP,

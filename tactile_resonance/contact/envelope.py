@@ -205,9 +205,7 @@ def _age(age_s: float) -> str:
 def _inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
     """Whether a place is in a box, its walls included."""
     x, y, z = place_m
-    return (
-        low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]
-    )
+    return low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]
 
 
 def is_finite(arm: ArmSample) -> bool:

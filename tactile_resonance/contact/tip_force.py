@@ -27,6 +27,10 @@ class TipForce:
         it is half of that late, and its noise is that of the velocity times ``sqrt(12 / n) / window`` for n
         states. 0: inertia is left in the force.
 
+    Attributes
+    ----------
+    cell : Cell
+
     Raises
     ------
     ValueError
@@ -46,7 +50,7 @@ class TipForce:
             )
         if not 0 <= inertia_window_s <= 1:
             raise ValueError(f"inertia_window_s: {inertia_window_s!r}, expected 0 to 1 s")
-        self._cell, self._mounting, self._arm_state = cell, mounting, arm_state
+        self.cell, self._mounting, self._arm_state = cell, mounting, arm_state
         # without a payload there is no inertia to take off
         self._window_ns = 0.0 if mounting.payload is None else inertia_window_s * 1e9
         self._states: deque[ArmSample] = deque()
@@ -54,16 +58,16 @@ class TipForce:
     @property
     def info(self) -> ForceInfo:
         """What the cell can do."""
-        return self._cell.info
+        return self.cell.info
 
     def start(self) -> None:
         """Start the cell. Raises `ForceError`."""
         self._states.clear()
-        self._cell.start()
+        self.cell.start()
 
     def read(self) -> list[WrenchSample]:
         """Wrenches since the last call, oldest first, with the newest pose. Raises `ForceError`."""
-        samples = self._cell.read()
+        samples = self.cell.read()
         state = self._arm_state()
         if self._window_ns:
             self._remember(state)
@@ -73,7 +77,7 @@ class TipForce:
 
     def close(self) -> None:
         """Close the cell."""
-        self._cell.close()
+        self.cell.close()
 
     def _remember(self, state: ArmSample) -> None:
         states = self._states

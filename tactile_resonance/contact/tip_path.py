@@ -128,7 +128,9 @@ class TipPath:
         distance = math.hypot(*way)
         braking = math.sqrt(p.acceleration_m_s2 * distance)  # half the limit: the arm lags
         speed = min(p.travel_speed_m_s, braking, distance / RIGHTING_S)
-        return *scaled(speed / max(distance, 1e-9), way), *scaled(1 / RIGHTING_S, self.turn_rad(arm))
+        return *scaled(speed / max(distance, 1e-9), way), *scaled(
+            1 / RIGHTING_S, self.turn_rad(arm)
+        )
 
     def along_normal(self, arm: ArmSample, speed_m_s: float) -> Six:
         """Along the normal, away from the surface positive; keeps place along it and orientation."""

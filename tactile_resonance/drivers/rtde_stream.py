@@ -134,9 +134,7 @@ class RtdeStream:
                 continue
             at += size
             v = values
-            states.append(
-                RobotState(v[0], tuple(v[1:7]), tuple(v[7:13]), tuple(v[13:19]), *v[19:])
-            )
+            states.append(RobotState(v[0], tuple(v[1:7]), tuple(v[7:13]), tuple(v[13:19]), *v[19:]))
         self._buffer = buffer[at:] if at >= 0 else buffer
         return states
 

@@ -62,7 +62,9 @@ class UrArm:
         self._stream: RtdeStream | None = None
         self._states: StateReader | None = None
         self._number = 0
-        self._sent: dict[int, tuple[bytes, float]] = {}  # kind and time [s] of what has no answer yet
+        self._sent: dict[
+            int, tuple[bytes, float]
+        ] = {}  # kind and time [s] of what has no answer yet
         self._refused = 0
         self._reading, self._speaking = threading.Lock(), threading.Lock()
 
@@ -489,13 +491,11 @@ class _Asked:
 
     def __init__(self, clock: SimulatedClock) -> None:
         self._clock = clock
+        self.ros_ns = self.own_ns = clock.ros_ns
 
     def now_ns(self) -> int:
         return self._clock.ask_ns()
 
-    def wait_until(self, time_ns: int) -> None:
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
         while self.now_ns() < time_ns:
-            time.sleep(0.002)
-
-    def ros_ns(self, time_ns: int) -> int:
-        return time_ns
+            time.sleep(AWAY_S)

@@ -82,7 +82,7 @@ class Client:
     # what the owner says
 
     def _wait(self) -> list[bytes]:
-        """Messages of the owner, without velocities that a later command has overtaken; waits a while for one."""
+        """Wait a while for messages of the owner; without velocities that a later command has overtaken."""
         session, channels = self._session, [self._commands]
         pause_s = None if session is None else 1.0 / (3 * session.config.watchdog_hz)
         if self._clock is not None and session is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `UrArm` and its client process tell each other: commands over a socket, signs of life on a page of memory.
+"""What `UrArm` and its client process tell each other: commands over a socket, signs of life on a page.
 
 Each value on the page has one writer and eight bytes of its own; neither side waits for the other.
 """

@@ -60,7 +60,9 @@ class MeasurementFrf:
         self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._first: Record | None = None
         self._last: Record | None = None
-        self._forces: list[tuple[float, float, float]] = []  # mean, deviation [N], length [s] of each block
+        self._forces: list[
+            tuple[float, float, float]
+        ] = []  # mean, deviation [N], length [s] of each block
         self.saturated = False
 
     def add(self, record: Record, excitation: Excitation) -> FRF:

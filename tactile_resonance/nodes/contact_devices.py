@@ -141,7 +141,9 @@ def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
             raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")
         config = replace(config, can=replace(config.can, bus={**config.can.bus, "host": host}))
     if config.kind == "topic" and node.time_server:
-        raise ValueError(f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN")
+        raise ValueError(
+            f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN"
+        )
     return force_source(
         config,
         arm.state,
@@ -151,7 +153,7 @@ def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
     )
 
 
-def tip_geometry(node: Node) -> TipGeometry:
+def tip_geometry(node: ManagedNode) -> TipGeometry:
     """Ball, beam and housing; ValueError where a figure is wrong."""
     name, tilt, below = values(node, "sensor_config", "beam_tilt_rad", "housing_below_m")
     sensor = read_sensor(_path(name))

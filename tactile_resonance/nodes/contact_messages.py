@@ -81,9 +81,7 @@ def wrench_message(
 ) -> WrenchStamped:
     """Mean of these, less the tare, at the middle of their times."""
     wrench = WrenchStamped()
-    wrench.header.stamp = time_message(
-        ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2)
-    )
+    wrench.header.stamp = time_message(ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2))
     wrench.header.frame_id = frame_id
     count, parts = len(wrenches), wrench.wrench
     x, y, z = (sum(values) / count for values in zip(*(w.force_n for w in wrenches), strict=True))

@@ -38,8 +38,8 @@ PARAMETERS = (
     Parameter(
         "publish_rate_hz",
         50.0,
-        "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench is "
-        "the mean since the last one.",
+        "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench "
+        "is the mean since the last one.",
         1.0,
         500.0,
         read_only=True,
@@ -90,7 +90,6 @@ class ContactNode(ManagedNode):
         names = ("frame_id", "base_frame", "publish_rate_hz")
         frame_id, self._base_frame, rate_hz = values(self, *names)
         self._topics = ContactTopics(self, frame_id, self._base_frame, rate_hz)
-        self._forces = ForceService(self, self._base_frame)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings, self._limits = self._read_parameters()
@@ -100,6 +99,13 @@ class ContactNode(ManagedNode):
         self._tip = contact_devices.tip_geometry(self)
         self._arm.connect()
         self._force.start()
+        self._forces = ForceService(
+            self,
+            self._force.info.rate_hz,
+            self._settings.period_s,
+            lambda: None if self._thread is None else self._thread.clock,
+            self._base_frame,
+        )
         self._goal: ServerGoalHandle | None = None
         self._finished: Future | None = None
         self._fault: ArmError | ForceError | None = None
@@ -252,7 +258,7 @@ class ContactNode(ManagedNode):
         if thread is None:
             return
         self._topics.say_again()
-        self._forces.answer(thread.clock)
+        self._forces.look()
         if thread.error is not None:
             self._finish(None)
             self.fail(f"control loop ended: {thread.error!r}")
@@ -304,7 +310,7 @@ class ContactNode(ManagedNode):
             return
         if self._touch is not None:
             self._touch.moved(cycle.state, thread.clock.ros_ns(cycle.time_ns))
-        self._forces.take(cycle, thread.controller)
+        self._forces.take(cycle)
         self._topics.take(cycle, thread)
 
 

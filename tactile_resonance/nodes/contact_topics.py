@@ -33,9 +33,7 @@ class ContactTopics:
         By the loop's clock.
     """
 
-    def __init__(
-        self, node: ManagedNode, frame_id: str, base_frame: str, rate_hz: float
-    ) -> None:
+    def __init__(self, node: ManagedNode, frame_id: str, base_frame: str, rate_hz: float) -> None:
         self._node, self._period_ns = node, round(1e9 / rate_hz)
         self._frame_id, self._base_frame = frame_id, base_frame
         self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
@@ -69,18 +67,14 @@ class ContactTopics:
         if self._newest is not None and time.monotonic() - self._said_s > SAID_AGAIN_S:
             self._say(self._newest)
 
-    def _publish(
-        self, wrenches: list[WrenchSample], cycle: Cycle, thread: ContactThread
-    ) -> None:
+    def _publish(self, wrenches: list[WrenchSample], cycle: Cycle, thread: ContactThread) -> None:
         ros_ns = thread.clock.ros_ns
         if cycle.arm is not None and self._pose.get_subscription_count():
             self._pose.publish(pose_message(cycle.arm, ros_ns, self._base_frame))
         if wrenches and self._wrench.get_subscription_count():
             self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
-        state = state_message(
-            cycle, ros_ns, controller.estimate, controller.result, self._frame_id
-        )
+        state = state_message(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
         state.cycles, state.overruns = loop.cycles, loop.overruns
         self._say(state)
 

@@ -193,7 +193,9 @@ class ExcitationNode(ManagedNode):
         (timeout_s,) = values(self, "block_timeout_s")
         if store is not None:
             store.add_excitation(excitation)
-        self._excitations.publish(excitation_to_message(excitation, self.ros_now_ns(), self._frame_id))
+        self._excitations.publish(
+            excitation_to_message(excitation, self.ros_now_ns(), self._frame_id)
+        )
         try:
             self._device.arm(excitation)
             self._device.play()

@@ -13,11 +13,12 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.multisine import Excitation
+from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
 from tactile_resonance.nodes.conversions import (
     contact_from_message,
     excitation_from_message,
@@ -28,7 +29,6 @@ from tactile_resonance.nodes.conversions import (
     time_message,
     truth_to_response,
 )
-from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
 from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -63,8 +63,8 @@ PARAMETERS = (
     Parameter(
         "serve_contact",
         False,
-        "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the tip "
-        "is wherever tcp_pose says.",
+        "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the "
+        "tip is wherever tcp_pose says.",
         read_only=True,
     ),
     Parameter(

@@ -69,9 +69,7 @@ class Stays:
         """The tip is somewhere else from now on."""
         self._stays.append(stay)
 
-    def serve(
-        self, request: ForceOver.Request, response: ForceOver.Response
-    ) -> ForceOver.Response:
+    def serve(self, request: ForceOver.Request, response: ForceOver.Response) -> ForceOver.Response:
         """The force over an interval, as the service `force_over` answers."""
         start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
         response.force_n = response.force_std_n = math.nan

@@ -87,9 +87,7 @@ class ScanNode(ManagedNode):
         self._recorder = ScanRecorder(self)
         self._time = ScanTime(self.time_server)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
-        self._hands = NodeHands(
-            self, self._recorder, table_in_base, base_frame, robot, self._time
-        )
+        self._hands = NodeHands(self, self._recorder, table_in_base, base_frame, robot, self._time)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
         self._waited_for = ""

@@ -65,9 +65,7 @@ class TipContact:
         self._retract = node.create_client(Trigger, "retract")
         node.resources.callback(node.destroy_client, self._retract)
 
-    def hold(
-        self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll
-    ) -> None:
+    def hold(self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll) -> None:
         """Press there until the force is held."""
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION

@@ -181,7 +181,7 @@ class BenchTime:
             self._participants.remove(participant)
 
     def expect(self, packets: int) -> None:
-        """No step before so many packets have come that were sent to the robot since the last 0; below 0: none said."""
+        """No step before so many packets for the robot have come since the last 0; below 0 nothing is said."""
         if packets < 0:
             return
         if packets == 0:
@@ -272,7 +272,7 @@ class BenchTime:
             repeat_ns = time.perf_counter_ns() + round(REPEAT_S * 1e9)
 
     def _all_packets(self) -> bool:
-        """Whether what was sent to the robot is there; where it does not come, nothing is waited for any more."""
+        """Whether what was sent to the robot is there; what does not come is waited for once."""
         arrived = self.packets_arrived()
         if arrived is None or self._packets_due <= arrived:
             return True

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tactile_resonance.simulation.cell_loop import CellLoop
 
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
-from tactile_resonance.simulation.cell_loop import CellLoop
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.socketcand import SocketcandServer
 from tactile_resonance.simulation.transducer import CellParameters

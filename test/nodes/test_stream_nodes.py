@@ -13,10 +13,10 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
+from tactile_resonance.nodes.stream_nodes import StreamNodes
 
 from tactile_resonance.nodes import stream_nodes
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.stream_nodes import StreamNodes
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.hands import NodeAway
 

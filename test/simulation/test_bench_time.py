@@ -231,7 +231,8 @@ def test_nonsense_costs_its_sender_the_connection_and_nobody_the_time(bench, con
     import socket
 
     clock = bench.join("loop")
-    for text in (b"[]\n", b"{}\n", b"x" * 5000, b"[" * 4000 + b"\n", b'{"name": "odd"}\n' + bytes([99]) + bytes(31)):
+    unknown_kind = b'{"name": "odd"}\n' + bytes([99]) + bytes(31)
+    for text in (b"[]\n", b"{}\n", b"x" * 5000, b"[" * 4000 + b"\n", unknown_kind):
         with socket.create_connection((HOST, bench.port), 5) as odd:
             odd.sendall(text)
             assert odd.recv(10) == b""
