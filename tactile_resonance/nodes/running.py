@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import (
@@ -18,6 +20,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
 
@@ -68,6 +71,17 @@ SERIES = QoSProfile(
 )
 
 
+@contextmanager
+def initialised(**options: Any) -> Iterator[None]:
+    """`with rclpy.init(**options)` of Kilted; in Jazzy `rclpy.init` returns nothing to enter."""
+    rclpy.init(**options)
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+        uninstall_signal_handlers()  # try_shutdown of Jazzy leaves them
+
+
 def run_node(make: Callable[[], Node]) -> None:
     """Spin one node until it is interrupted or ROS shuts down.
 
@@ -82,7 +96,7 @@ def run_node(make: Callable[[], Node]) -> None:
 
     signal.signal(signal.SIGINT, interrupt)
     try:
-        with rclpy.init():
+        with initialised():
             node = make()
             try:
                 rclpy.spin(node)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from rclpy.action import ActionClient
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
@@ -17,6 +16,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
+from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, follow_goal, send_goal
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.publisher_watch import PublisherWatch
@@ -82,7 +82,7 @@ class NodeHands:
         self._base_frame = base_frame
         self.free_air = with_robot
         self._nodes = StreamNodes(node, (*STREAM_TOPICS, *([STATE_TOPIC] if with_robot else [])))
-        self._measure = ActionClient(node, Measure, "measure")
+        self._measure = GoalClient(node, Measure, "measure")
         node.resources.callback(self._measure.destroy)
         self._tip: TipContact | None = None
         if with_robot:

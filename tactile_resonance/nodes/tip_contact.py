@@ -6,12 +6,12 @@ from __future__ import annotations
 import time
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.result import Cause
+from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, follow_goal, send_goal
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.publisher_watch import PublisherWatch
@@ -61,7 +61,7 @@ class TipContact:
         self._state_s = float("-inf")
         # the newest only: the recorder's may have to wait behind what else is recorded
         node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
-        self._contact = ActionClient(node, MakeContact, "make_contact")
+        self._contact = GoalClient(node, MakeContact, "make_contact")
         node.resources.callback(self._contact.destroy)
         self._retract = node.create_client(Trigger, "retract")
         node.resources.callback(node.destroy_client, self._retract)

@@ -9,13 +9,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from tactile_resonance.nodes import stream_nodes
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.stream_nodes import StreamNodes
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.hands import NodeAway
@@ -43,7 +43,7 @@ class Source(ManagedNode):
 def nodes(monkeypatch):
     """The listener, and something that spins until a condition holds, or for so long."""
     monkeypatch.setattr(stream_nodes, "FRESH_S", 2.5)
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         executor = SingleThreadedExecutor()
         listener = Listener()
         listener.trigger_configure()
