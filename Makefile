@@ -3,7 +3,7 @@
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint setup lock clean
+.PHONY: help demo test jazzy lint setup lock clean
 
 help: ## Show this list
 	@echo "make TARGET [ARGS='...'] [PYTHON=python3.x]"
@@ -15,6 +15,12 @@ demo: setup ## Run the demonstration on the simulated bench; ARGS go to `tactile
 test: setup ## Run all tests with coverage; ARGS go to pytest
 	@tools/run.sh python -m pytest --cov --cov-report=term:skip-covered $(ARGS)
 
+jazzy: export TACTILE_ROS = jazzy
+jazzy: ## Set up ROS 2 Jazzy beside it; run the nodes' tests and a scan of two points on it
+	@$(MAKE) --no-print-directory setup
+	@tools/run.sh python -m pytest test/nodes $(addprefix test/integration/test_,stream.py lifecycle.py pole_map.py records.py)
+	@tools/run.sh tactile_resonance demo --scene .ci/two_points.yaml
+
 lint: setup ## Check style (ruff) and types of the core (mypy)
 	@env -u PYTHONPATH .venv/bin/python -m ruff check
 	@env -u PYTHONPATH .venv/bin/python -m mypy
@@ -22,10 +28,10 @@ lint: setup ## Check style (ruff) and types of the core (mypy)
 setup: ## Make .venv and build the messages, where not done yet
 	@python=$$(tools/find_python.sh) && "$$python" -E -s -S tools/bootstrap.py
 
-lock: ## Renew requirements.lock from requirements.in and requirements-ros.in
+lock: ## Renew the locks from requirements.in and requirements-ros.in
 	@tools/lock.sh
 
 clean: ## Remove everything that the other targets made, the environment included
-	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-* build install install-* log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	rm -rf tactile_resonance.egg-info
 	find tactile_resonance test benchmarks tools launch -name __pycache__ -prune -exec rm -rf {} +

@@ -4,7 +4,7 @@
 Run by the interpreter that tools/find_python.sh names, with the standard library alone. A stamp is
 written into .venv and into install/ once that part is complete and names all it was made from;
 without its stamp a part is made anew. So an interrupted set-up is resumed, and a moved or updated
-repository is noticed.
+repository is noticed. TACTILE_ROS=jazzy makes .venv-jazzy and install-jazzy instead.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ def set_up() -> None:
     """Make what is missing or out of date: packages first, then the build."""
     if not re.fullmatch(r"[A-Za-z0-9_./+@~-]+", str(ROOT)):
         raise SetupError(f"ROS 2 builds only where the path has no spaces or accents: {ROOT}")
+    if not packages.ROS_LOCK.exists():
+        raise SetupError(f"TACTILE_ROS: {packages.NAMED}, expected kilted or jazzy")
     ros = packages.sourced_ros()
     packages_key = wanted_packages(ros)
     last = read(PACKAGES_STAMP)
@@ -83,7 +85,7 @@ def wanted_packages(ros: str | None) -> Stamp:
         "root": str(ROOT),
         "python": THIS_PYTHON,
         "ros": ros,
-        "lock": contents([packages.LOCK, packages.ROS_FREE] if ros else [packages.LOCK]),
+        "lock": contents([packages.LOCK, packages.ROS_FREE if ros else packages.ROS_LOCK]),
         "recipe": contents([TOOLS / "packages.py", TOOLS / "missing.py"]),
     }
 

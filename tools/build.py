@@ -11,11 +11,11 @@ import sys
 import sysconfig
 
 from console import LOGS, ROOT, SetupError, run, step
-from packages import PYTHON
+from packages import BESIDE, NAMED, PYTHON
 
 BUILD = ROOT / "build"
-COLCON_BUILD = BUILD / "tactile_resonance"
-INSTALL = ROOT / "install"
+COLCON_BUILD = BUILD / NAMED / "tactile_resonance"
+INSTALL = ROOT / f"install{BESIDE}"
 INTERFACES = ("msg", "srv", "action")
 INSTALLED = ("tactile_resonance", "config", "launch")
 
@@ -68,6 +68,7 @@ def build(anew: bool) -> None:
         # By its module: of a sourced ROS 2 there may be a colcon that is not in .venv/bin.
         colcon = [PYTHON, "-c", "from colcon_core.command import main; raise SystemExit(main())"]
         colcon += ["--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
+        colcon += ["--build-base", COLCON_BUILD.parent, "--install-base", INSTALL]
         # Python files are linked, so that what is edited in the source tree is what runs.
         layout = ["--merge-install", "--symlink-install"]
         cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"]

@@ -1,7 +1,8 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Renews requirements.lock: newest versions that requirements.in and requirements-ros.in allow, for every
-# supported Python, with hashes. Uses uv in an environment that is thrown away.
+# Renews the locks: newest versions that requirements.in and requirements-ros.in allow, for every supported
+# Python, with hashes. requirements-DISTRO.lock adds to requirements.lock the wheels of one distribution of ROS 2.
+# Uses uv in an environment that is thrown away.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
@@ -14,8 +15,19 @@ trap 'exit 130' INT TERM
 
 "$python" -m venv "$scratch/venv"
 "$scratch/venv/bin/pip" install --quiet --disable-pip-version-check uv
-UV_CUSTOM_COMPILE_COMMAND='make lock' "$scratch/venv/bin/uv" pip compile --quiet --no-config --upgrade \
-    --universal --python-version 3.10 --generate-hashes --annotation-style line \
-    requirements.in requirements-ros.in --output-file "$scratch/requirements.lock"
-mv "$scratch/requirements.lock" requirements.lock
-echo "requirements.lock: $(grep -c '^[a-z]' requirements.lock) entries"
+
+compile() {
+    UV_CUSTOM_COMPILE_COMMAND='make lock' "$scratch/venv/bin/uv" pip compile --quiet --no-config --upgrade \
+        --universal --python-version 3.10 --generate-hashes --annotation-style line "$@"
+}
+
+shared="$scratch/requirements.lock"
+compile requirements.in --output-file "$shared"
+in_shared=$(sed -n 's/^\([a-z][^=]*\)==.*/--no-emit-package \1/p' "$shared")
+for distro in kilted jazzy; do
+    # shellcheck disable=SC2086 # one argument per word
+    sed "s/DISTRO/$distro/" requirements-ros.in |
+        compile - --constraint "$shared" $in_shared --output-file "$scratch/requirements-$distro.lock"
+done
+mv "$scratch"/requirements*.lock .
+grep -c '^[a-z]' requirements*.lock

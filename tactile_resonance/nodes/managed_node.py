@@ -8,8 +8,10 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
@@ -21,7 +23,7 @@ from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Parameter, declare, values
-from tactile_resonance.nodes.running import BEATS, STEADY
+from tactile_resonance.nodes.running import BEATS, STEADY, RCLError
 
 # What a configuration may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
@@ -55,6 +57,9 @@ class ManagedNode(LifecycleNode):
         self.resources = ExitStack()
         self.active = False
         self._failing = False
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = partial(self._change_state, service.callback)
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
         self._instance = int.from_bytes(os.urandom(7), "big")
@@ -210,6 +215,20 @@ class ManagedNode(LifecycleNode):
         """Stop what is under way first, in whatever state."""
         self._undo()
         super().destroy_node()
+
+    def _change_state(
+        self,
+        change: Callable[[ChangeState.Request, ChangeState.Response], ChangeState.Response],
+        request: ChangeState.Request,
+        response: ChangeState.Response,
+    ) -> ChangeState.Response:
+        """Refuse a transition that the present state does not have; in Jazzy it would end the node."""
+        try:
+            return change(request, response)
+        except RCLError as error:
+            self.get_logger().error(f"transition refused: {error}")
+            response.success = False
+            return response
 
     def _undo(self) -> None:
         if self.active:

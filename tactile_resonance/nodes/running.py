@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -21,6 +23,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
 
@@ -86,6 +89,17 @@ END_WITHIN_S = 20.0
 """From being asked to end: a tip is drawn back meanwhile."""
 
 
+@contextmanager
+def initialised(**options: Any) -> Iterator[None]:
+    """`with rclpy.init(**options)` of Kilted; in Jazzy `rclpy.init` returns nothing to enter."""
+    rclpy.init(**options)
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+        uninstall_signal_handlers()  # try_shutdown of Jazzy leaves them
+
+
 def run_node(make: Callable[[], Node]) -> None:
     """Spin one node until it is interrupted or ROS shuts down.
 
@@ -108,7 +122,7 @@ def run_node(make: Callable[[], Node]) -> None:
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, end_in_time)
     try:
-        with rclpy.init():
+        with initialised():
             node = make()
             try:
                 rclpy.spin(node)

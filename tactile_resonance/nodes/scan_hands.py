@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from rclpy.action import ActionClient
 from rclpy.duration import Duration
 
 from tactile_resonance import msg
@@ -18,6 +17,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
+from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.node_watch import Instances, NodeWatch
@@ -89,7 +89,7 @@ class NodeHands:
         topics = (*STREAM_TOPICS, *([STATE_TOPIC] if with_robot else []))
         self._nodes = NodeWatch(node, topics, scan_time.silent_s)
         self._waited_for = ""
-        client = ActionClient(node, Measure, "measure")
+        client = GoalClient(node, Measure, "measure")
         node.resources.callback(client.destroy)
         self._measure = Goals(client, "measure")
         self._tip: TipContact | None = None

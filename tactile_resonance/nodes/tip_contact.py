@@ -6,12 +6,12 @@ from __future__ import annotations
 import time
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.result import Cause
+from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import NEWEST
@@ -59,7 +59,7 @@ class TipContact:
         self._state: msg.ContactState | None = None
         # the newest only: the recorder's may have to wait behind what else is recorded
         node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
-        client = ActionClient(node, MakeContact, "make_contact")
+        client = GoalClient(node, MakeContact, "make_contact")
         self._goals = Goals(client, "make_contact")
         node.resources.callback(client.destroy)
         self._retract = node.create_client(Trigger, "retract")

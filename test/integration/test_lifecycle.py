@@ -87,6 +87,13 @@ def test_all_come_up_go_down_in_order_and_come_up_again(running):
     watcher.wait(lambda: watcher.all_are("active"))
 
 
+def test_a_transition_that_the_state_does_not_have_is_refused(running):
+    _, watcher = running
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+    assert not watcher.call(ChangeState, "frf_node/change_state", request).success
+    assert watcher.state("frf_node") == "active"
+
+
 def test_a_node_that_was_deactivated_or_cleaned_up_comes_back(running):
     _, watcher = running
     for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):

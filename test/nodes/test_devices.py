@@ -18,6 +18,7 @@ from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes import devices
 from tactile_resonance.nodes.excitation_node import ExcitationNode
 from tactile_resonance.nodes.parameters import declare
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
 
@@ -34,7 +35,7 @@ def make():
         finally:
             node.destroy_node()
 
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         yield make_with
 
 
@@ -58,7 +59,7 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
             closed.append(True)
 
     monkeypatch.setattr(devices, "make_device", lambda _: Device())
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         node = ExcitationNode()
         node.trigger_configure()
         node.destroy_node()

@@ -10,12 +10,13 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 import rclpy
 
 from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, Health
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
 
 def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatch):
     told = []
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("health")
         health = Health(node, lambda: "active", dict)
         monkeypatch.setattr(health._publisher, "publish", told.append)

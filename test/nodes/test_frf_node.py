@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy
 
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.conversions import (
@@ -18,6 +17,7 @@ from tactile_resonance.nodes.conversions import (
     record_to_message,
 )
 from tactile_resonance.nodes.frf_node import FrfNode
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 
@@ -26,7 +26,7 @@ N, RATE_HZ, PERIODS = 200, 1000.0, 3
 
 @pytest.fixture
 def node(monkeypatch):
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         node = FrfNode()
         node.trigger_configure()
         node.trigger_activate()

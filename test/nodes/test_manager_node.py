@@ -8,13 +8,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
-import rclpy
 from lifecycle_msgs.msg import State
 from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance.nodes import manager_node
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.manager_node import ManagerNode
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
 WITHIN_S = 10.0
@@ -38,7 +38,7 @@ def test_one_tick_brings_all_up_in_order(monkeypatch):
     monkeypatch.setattr(manager_node, "TICK_S", 3600.0)
     log, names = [], ["first", "second", "third"]
     arguments = ["--ros-args", "-p", f"manager_node:nodes:=[{','.join(names)}]"]
-    with rclpy.init(args=arguments, domain_id=free_domain_id(os.environ)):
+    with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
         manager, nodes = ManagerNode(), [Managed(name, log) for name in names]
         executor = SingleThreadedExecutor()
         for node in (manager, *nodes):

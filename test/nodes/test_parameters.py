@@ -9,7 +9,6 @@ import yaml
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy
 from rclpy.parameter import Parameter as RosParameter
 
 from tactile_resonance.configuration import share_path
@@ -23,6 +22,7 @@ from tactile_resonance.nodes import (
     poles_node,
     scan_node,
 )
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
 NODES = {
@@ -52,7 +52,7 @@ DECLARED = {
 
 @pytest.fixture
 def ros():
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         yield
 
 

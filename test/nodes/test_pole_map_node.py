@@ -21,7 +21,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.pole_map_node import PoleMapNode
-from tactile_resonance.nodes.running import LATCHED, POLES
+from tactile_resonance.nodes.running import LATCHED, POLES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
@@ -95,7 +95,7 @@ class Bench:
 
 @pytest.fixture
 def bench():
-    with rclpy.init(domain_id=free_domain_id(os.environ)), Bench() as made:
+    with initialised(domain_id=free_domain_id(os.environ)), Bench() as made:
         yield made
 
 
@@ -242,7 +242,7 @@ def test_clear_empties_every_output(bench):
 def test_tissue_is_called_from_a_scene():
     scene = share_path("config/scenes/inclusion_scan.yaml")
     arguments = ["--ros-args", "-p", f"classes_file:={scene}"]
-    with rclpy.init(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
         bench.send(
             poles(1, 0.0, 253.8, 0.0336), poles(2, 0.004, 258.0, 0.0379), poles(3, 0.008, 240.0)
         )
@@ -257,7 +257,7 @@ def test_tissue_is_called_from_a_scene():
 def test_a_classes_file_that_is_wrong_is_refused(tmp_path):
     path = tmp_path / "classes.yaml"
     path.write_text("tissue_classes: {a: {f0_hz: 250.0}}\n")
-    with rclpy.init(
+    with initialised(
         domain_id=free_domain_id(os.environ), args=["--ros-args", "-p", f"classes_file:={path}"]
     ):
         node = PoleMapNode()

@@ -23,6 +23,7 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.frf_node import FrfNode
 from tactile_resonance.nodes.poles_node import PolesNode
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 
@@ -32,7 +33,7 @@ SPECTRA = ("sensor_real", "sensor_imag", "actuator_real", "actuator_imag")
 
 @pytest.fixture
 def node(monkeypatch):
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         node = PolesNode()
         node.trigger_configure()
         node.trigger_activate()

@@ -21,6 +21,7 @@ from tactile_resonance.multisine import Grid, design_multisine
 from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
 from tactile_resonance.nodes.devices import PARAMETERS, make_device
 from tactile_resonance.nodes.parameters import declare
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording import from_messages
@@ -126,7 +127,7 @@ def test_excitation_and_records_come_back_bit_by_bit(run):
 def test_a_replay_plays_the_run_again_bit_by_bit(run):
     given = {"device": "replay", "device_config": run, "replay_speed": 0.0}
     arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
-    with rclpy.init(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
+    with initialised(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("replay_test")
         declare(node, PARAMETERS)
         device = make_device(node)

@@ -3,6 +3,7 @@
 
 import os
 import signal
+import time
 
 import pytest
 
@@ -10,7 +11,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 import rclpy
 
-from tactile_resonance.nodes.running import run_node
+from tactile_resonance.nodes.running import initialised, run_node
 
 
 @pytest.fixture
@@ -43,3 +44,15 @@ def test_what_goes_wrong_without_an_interrupt_is_told(node, monkeypatch):
     monkeypatch.setattr(rclpy, "spin", spin)
     with pytest.raises(RuntimeError, match="a defect"):
         run_node(node)
+
+
+def test_an_interrupt_shuts_ros_down_each_time_it_is_initialised(node):
+    for _ in range(2):
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # run_node sets its own
+        with initialised():
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            deadline = time.monotonic() + 10.0
+            while rclpy.ok() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert not rclpy.ok()

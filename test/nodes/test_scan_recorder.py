@@ -9,13 +9,13 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.from_messages import poles_from_message
@@ -42,7 +42,7 @@ class Listener(ManagedNode):
 @pytest.fixture
 def nodes():
     """Makes nodes and activates them, one executor for all."""
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         executor = SingleThreadedExecutor()
 
         def start(kind):

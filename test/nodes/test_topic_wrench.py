@@ -14,7 +14,6 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-import rclpy
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -22,6 +21,7 @@ from rclpy.node import Node
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.processes import free_domain_id
 
@@ -62,7 +62,7 @@ class Driver:
 
 @pytest.fixture
 def driver_and_source():
-    with rclpy.init(domain_id=free_domain_id(os.environ)):
+    with initialised(domain_id=free_domain_id(os.environ)):
         node = Node("topic_wrench_test")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
