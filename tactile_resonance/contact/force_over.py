@@ -29,6 +29,9 @@ IntArray = NDArray[np.int64]
 GAP_PERIODS = 3
 """Wrenches further apart than so many of their nominal periods say nothing of the time between them."""
 
+POSE_GAP_NS = 100_000_000
+"""The same of poses [ns]: a loop that has nothing to do looks seldom, and the tip moves slowly."""
+
 LEAST_COVERAGE = 0.8
 """Of an interval that forces must cover for their mean to be its force."""
 
@@ -96,7 +99,6 @@ class ForceRecord:
         self._forces = _Ring(1, math.ceil(SPARE * rate_hz * length_s) + 1)
         self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
         self._poses = _Ring(6, math.ceil(SPARE * length_s / period_s) + 1)
-        self._pose_gap_ns = GAP_PERIODS * 1e9 * period_s
         self._now_ns = 0
         self._lock = threading.Lock()
 
@@ -157,7 +159,7 @@ class ForceRecord:
             times, rows = self._forces.around(t0_ns, t1_ns)
             pose_times, poses = self._poses.around(t0_ns, t1_ns)
         spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
-        places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, self._pose_gap_ns)
+        places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
         position_m = rotation_rad = (math.nan, math.nan, math.nan)
         if places.coverage >= LEAST_COVERAGE:
             position_m = vector(places.mean())
@@ -185,7 +187,7 @@ class ForceRecord:
             return f"the block begins {ago_s:.1f} s ago, forces are kept for {length_s:g} s"
         if coverage < LEAST_COVERAGE:
             accepted = f"at least {100 * LEAST_COVERAGE:g} % are accepted"
-            return f"forces cover {100 * coverage:.0f} % of the block, {accepted}"
+            return f"forces cover {100 * coverage:.3g} % of the block, {accepted}"
         return ""
 
 
@@ -221,7 +223,7 @@ class _Spans:
             values[0] += first
             values[-1] += last
         known = np.isfinite(values[:, 0])
-        self._reference = values[known.argmax()] if known.any() else np.zeros(values.shape[1])
+        self._reference = values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
         values -= self._reference
         lengths, middles = np.diff(corners), (values[:-1] + values[1:]) / 2  # (n - 1,), (n - 1, k)
         unknown = ~(known[:-1] & known[1:] & (steps <= longest_ns))

@@ -39,7 +39,11 @@ places = st.builds(
     misalignment_rad=st.floats(0, 1),
 )
 twists = st.tuples(*[number] * 6)
-positions = st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.1, 0.6))
+# far from the walls at 0.3 m to the sides, 0 and 0.5 m in height, beyond them, and where they begin to count
+near_a_side = st.floats(0.285, 0.301)
+sideways = st.floats(-0.4, 0.4) | near_a_side | near_a_side.map(lambda x: -x)
+upwards = st.floats(-0.1, 0.6) | st.floats(-0.001, 0.015) | st.floats(0.485, 0.501)
+positions = st.tuples(sideways, sideways, upwards)
 
 
 @settings(max_examples=400, deadline=None)

@@ -117,6 +117,7 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
     for n in range(300):
         height -= 4e-6 if n < 150 else 0.0
         measured = hertz.force(-height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
+        measured += 2.0 if n == 5 else 0.0  # by which ln C would change by more than 1
         gone = 1 - math.exp(-DT)
         f = np.array([[1, 0, 0], [0, 1, gone], [0, 0, 1 - gone]])
         x, p = f @ x, f @ p @ f.T + 0.05**2 * DT * np.diag([0, 1, 25])
@@ -124,6 +125,7 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
         h = np.array([slope, per_ln_c, 0])
         spread = h @ p @ h + NOISE_N**2 + (slope * 5e-6) ** 2
         step = p @ h / spread * (measured - expected)
+        assert (abs(step[1]) > 1.0) == (n == 5)
         x, p = x + step / max(1.0, abs(step[1])), p - np.outer(p @ h, p @ h) / spread
         model.predict(DT)
         off = model.update(height, measured)

@@ -40,6 +40,7 @@ def close(got, want, atol=1e-14):
     np.testing.assert_allclose(got, want, rtol=0, atol=atol * max(1.0, np.abs(want).max()))
 
 
+@settings(deadline=None)
 @given(vectors, vectors, number)
 def test_sums_and_products_of_vectors_are_those_of_numpy(a, b, factor):
     close(dot(a, b), np.dot(a, b))
@@ -56,7 +57,7 @@ def test_arrays_become_tuples_of_floats():
         vector([1.0, 2.0])
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(vectors, vectors, vectors)
 def test_rotations_are_those_of_scipy(rotation, other, a):
     turn, first = turn_from_vector(rotation), turn_from_vector(other)
@@ -111,7 +112,7 @@ def test_half_turns_about_the_axes_are_exact(diagonal):
     close(vector_from_turn(turn), math.pi * (np.array(diagonal) > 0))
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(vectors, vectors)
 def test_turn_from_one_orientation_to_another_is_that_of_scipy(start, end):
     between = turn_product(turn_from_vector(end), transposed(turn_from_vector(start)))
