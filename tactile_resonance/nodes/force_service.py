@@ -95,6 +95,7 @@ class ForceService:
             future: Future = Future()
             self._waiting.append((end_ns, time.monotonic() + WAIT_S, future))
             self._awaited_ns = min(self._awaited_ns, end_ns)
+            self.look()  # the loop may have come there meanwhile
             await future
         over = self._record.over(start_ns, end_ns)
         response.force_n, response.force_std_n = over.force_n, over.force_std_n

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
@@ -120,8 +121,10 @@ class ManagedNode(LifecycleNode):
         self.resources.callback(self.destroy_subscription, subscription)
 
     def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """Service until the node is cleaned up; the callback sees to `active` itself."""
-        service = self.create_service(kind, name, callback)
+        """Service until the node is cleaned up; the callback sees to `active` itself, and may wait."""
+        # in the node's own group, whose callbacks exclude each other, one that waits would keep all waiting
+        group = ReentrantCallbackGroup()
+        service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
