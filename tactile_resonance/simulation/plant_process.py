@@ -160,8 +160,8 @@ class Tabletop:
         plant = self.plant
         return {
             "time_s": plant.time_s,
-            "tip_m": plant.tip_m.tolist(),
-            "force_n": plant.force_n.tolist(),
+            "tip_m": plant.tip_m,
+            "force_n": plant.force_n,
             "normal_force_n": plant.normal_force_n,
             "contact_s": plant.contact_s,
             "depth_m": plant.depth_m,
@@ -189,8 +189,7 @@ class CellOnBus:
         for can_id, data in self._bus.poll():
             self._bus.send(self._cell.receive(can_id, data))
         force_n, torque_nm = self._plant.wrench_at_cell()
-        wrench = np.concatenate([force_n, torque_nm])
-        self._bus.send(self._cell.step(wrench, self._plant.time_s))
+        self._bus.send(self._cell.step((*force_n, *torque_nm), self._plant.time_s))
 
     def _keep_epoch(self, now_s: float) -> None:
         """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall."""
