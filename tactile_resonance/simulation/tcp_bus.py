@@ -113,13 +113,15 @@ class TcpBus(ABC):
 
     def send(self, frames: Iterable[CanFrame]) -> None:
         """Hand frames of the bus to every client that listens."""
-        text = b"".join(self.text_of(frame) for frame in frames)
+        now_s = time.monotonic()
+        since_s = [(client, client.listens_from_s) for client in self._clients]
+        listening = [
+            client for client, begun_s in since_s if begun_s is not None and begun_s <= now_s
+        ]
+        text = b"".join(map(self.text_of, frames)) if listening else b""
         if not text:
             return
-        now_s = time.monotonic()
-        for client in list(self._clients):
-            if client.listens_from_s is None or now_s < client.listens_from_s:
-                continue
+        for client in listening:
             client.queue += text
             try:
                 self._flush(client)
