@@ -116,13 +116,20 @@ class Jitter:
 
     def step(self) -> tuple[float, float, float]:
         """Advance one period; return the displacement [m]."""
-        noise = self._rows.take()
-        state = list(zip(self._place, self._speed, noise[:3], noise[3:], strict=True))
+        (x, y, z), (vx, vy, vz) = self._place, self._speed
+        x1, y1, z1, x2, y2, z2 = self._rows.take()
         a, b, c, d = self._place_by
-        x, y, z = (a * place + b * speed + c * n + d * m for place, speed, n, m in state)
+        self._place = (
+            a * x + b * vx + c * x1 + d * x2,
+            a * y + b * vy + c * y1 + d * y2,
+            a * z + b * vz + c * z1 + d * z2,
+        )
         a, b, c, d = self._speed_by
-        self._speed = [a * place + b * speed + c * n + d * m for place, speed, n, m in state]
-        self._place = x, y, z
+        self._speed = (
+            a * x + b * vx + c * x1 + d * x2,
+            a * y + b * vy + c * y1 + d * y2,
+            a * z + b * vz + c * z1 + d * z2,
+        )
         return self._place
 
 

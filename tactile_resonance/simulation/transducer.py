@@ -146,7 +146,9 @@ class Transducer:
         self._drift = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
         self._offset = [*p.force_bias_n, *p.torque_bias_nm]
         self._zero = [0.0] * 6  # what the bias command subtracts
-        self._signal: list[float] | None = None  # the newest reading without noise, filtered
+        # of the newest reading, filtered
+        self._signal: list[float] | None = None
+        self._noise = [0.0] * 6
         self._overloaded = 0
         self._counts = [0] * 6
         self._keep = 0.0
@@ -166,12 +168,12 @@ class Transducer:
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""
         self._rows = NormalRows(seed, 6)
-        self._noise: list[float] | None = None  # in the newest reading, filtered
+        self._noise_begins = True
 
     def set_zero(self, on: bool) -> None:
         """Take the present reading as zero, or end that."""
         self._zero = [0.0] * 6
-        if on and self._signal is not None and self._noise is not None:
+        if on and self._signal is not None:
             self._zero = list(map(add, self._signal, self._noise))
 
     def convert(self, wrench: Sequence[float]) -> tuple[list[int], int]:
@@ -188,7 +190,7 @@ class Transducer:
         noise = list(map(mul, self._noise_rms, self._rows.take()))
         if self._keep:
             signal, noise = self._through_filter(signal, noise)
-        self._signal, self._noise = signal, noise
+        self._signal, self._noise, self._noise_begins = signal, noise, False
         if not faults.stuck:
             parts = zip(signal, noise, self._zero, self._divisor, strict=True)
             counts = [(value + n - zero) * divisor for value, n, zero, divisor in parts]
@@ -207,7 +209,7 @@ class Transducer:
     ) -> tuple[list[float], list[float]]:
         """Return signal and noise behind the low-pass; noise begins anywhere in its stationary state."""
         keep = self._keep
-        if self._noise is None:
+        if self._noise_begins:
             noise = [math.sqrt((1 - keep) / (1 + keep)) * n for n in noise]
         else:
             noise = [keep * old + (1 - keep) * n for old, n in zip(self._noise, noise, strict=True)]

@@ -113,6 +113,19 @@ def test_what_the_filter_remembers_of_the_noise_is_stationary_from_the_first_rea
     assert_variance(later, variance)
 
 
+def test_the_present_reading_can_be_taken_as_zero_just_after_a_reseed():
+    cell = LoadCell(CellParameters("quiet", 1e3, 1e4, 0.0, 0.0, 5.0, 0.3))
+    for command in (b"\x0f\x08", b"\x0b"):
+        cell.receive(0x64, command)
+    load = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    cell.step(load, 0.0)
+    cell.step(load, 0.002)
+    cell.reseed(1)
+    cell.receive(0x64, b"\x11\x01")
+    frames = cell.step(load, 0.004)
+    assert frames[0].data[5:7] == b"\x00\x00"
+
+
 def test_a_cell_is_reseeded_with_its_transducer():
     found = []
     for construction in (1, 2):

@@ -17,8 +17,8 @@ class Joints:
     ----------
     posture : Posture
         At the angles that the encoders say [rad]; the same object while they do not change.
-    qd, qdd : 6 floats
-        Speeds [rad/s] and accelerations [rad/s^2].
+    qd : 6 floats
+        Speeds [rad/s].
     tremble_m : Vector
         Vibration of the tool in the base, which the encoders do not see.
     """
@@ -35,6 +35,11 @@ class Joints:
         """Angles [rad]."""
         return self.posture.q
 
+    @property
+    def qdd(self) -> Six:
+        """Accelerations [rad/s^2]."""
+        return rate(self._slower, self.qd)
+
     def reseed(self, seed: Seed) -> None:
         """Tremble from the next step on as a seed says."""
         if self._jitter is not None:
@@ -43,19 +48,18 @@ class Joints:
     def step(self, target_q: Six, powered: bool) -> None:
         """Follow for one cycle; without power the brakes hold the joints where they are."""
         if not powered:
-            self.qd = self.qdd = ZERO
+            self._slower = self.qd = ZERO
             return
-        before, slower = self.posture.q, self.qd
+        before, self._slower = self.posture.q, self.qd
         q = self._lag.step(target_q)
         if q != before:
             self.posture = Posture(q)
         self.qd = ZERO if q == before else rate(before, q)
-        self.qdd = ZERO if self.qd == slower else rate(slower, self.qd)
         if self._jitter is not None:
             self.tremble_m = self._jitter.step()
 
     def hold(self) -> Six:
         """Forget what is pending and return the angles at which the brakes caught the joints."""
         self._lag = Lag(self._tracking, self.q, CYCLE_S)
-        self.qd = self.qdd = ZERO
+        self._slower = self.qd = ZERO
         return self.q

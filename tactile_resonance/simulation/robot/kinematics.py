@@ -75,7 +75,7 @@ class Posture:
 
     def tool(self, tcp: Transform) -> Transform:
         """Return a frame that the flange carries, in the base; computed anew for another frame only."""
-        if tcp is not self._carried:
+        if tcp != self._carried:
             self._carried, self._tool = tcp, product(self.flange, tcp)
         return self._tool
 

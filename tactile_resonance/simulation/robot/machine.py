@@ -31,7 +31,6 @@ from tactile_resonance.simulation.robot.poses import (
     dot,
     largest,
     moved_wrench,
-    product,
     rotated_back,
     rounded,
     total,
@@ -279,7 +278,7 @@ class Machine:
 
     def _touch(self, environment: Environment) -> Six:
         """Move the tip; return the wrench of what it touches on the flange, in the flange's frame."""
-        turn, (x, y, z) = product(self.posture.flange, self._tip)
+        turn, (x, y, z) = self.posture.tool(self._tip)
         dx, dy, dz = self.joints.tremble_m
         environment.step((turn, (x + dx, y + dy, z + dz)), CYCLE_S)
         flange = self.posture.flange[0]

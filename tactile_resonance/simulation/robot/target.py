@@ -99,8 +99,8 @@ class Target:
     ----------
     posture : Posture
         At the target angles [rad].
-    qd, qdd : 6 floats
-        Target speeds [rad/s] and accelerations [rad/s^2].
+    qd : 6 floats
+        Target speeds [rad/s].
     pace : float
         Speed slider: share of the programmed speed, above 0 to 1.
     commanded : bool
@@ -120,8 +120,8 @@ class Target:
         self.pace = 1.0
         self.posture = Posture(q)
         self.qd = ZERO
-        self.qdd = ZERO
         self._cycle_qd = ZERO
+        self._accelerated: tuple[Six, Six] = (ZERO, ZERO)  # from and to, in the last whole cycle
         self.commanded = False
         self.yielded_q = ZERO
         self.yielded_m: Vector = ORIGIN
@@ -141,6 +141,11 @@ class Target:
     def q(self) -> Six:
         """Target angles [rad]."""
         return self.posture.q
+
+    @property
+    def qdd(self) -> Six:
+        """Target accelerations [rad/s^2]."""
+        return rate(*self._accelerated)
 
     @property
     def aside_q(self) -> Six:
@@ -173,7 +178,7 @@ class Target:
         """Brake where nothing moved the arm, and note the acceleration of the cycle."""
         if not self.commanded:
             self.brake(self.limits.brake_rad_s2)
-        self.qdd = ZERO if self.qd is self._cycle_qd else rate(self._cycle_qd, self.qd)
+        self._accelerated = self._cycle_qd, self.qd
 
     def command(self, q: Six, qd: Six) -> None:
         """Set target angles and speeds for this cycle.
