@@ -110,6 +110,7 @@ def run(options: argparse.Namespace) -> int:
         simulated_time=options.simulated_time,
         control_port=options.control_port,
     )
+    robot.time.seeds.append(lambda seed: controller.reseed((options.seed, *seed)))
     ready = f"{READY} {options.host}, control port {options.control_port}"
     if bench is not None:
         bench.attach(robot)
@@ -169,6 +170,7 @@ class _Bench:
         except ValueError as error:
             raise ValueError(f"can-port: {error}") from error
         robot.time.frames_sent = bus.frames_sent
+        robot.time.seeds.append(lambda seed: cell.reseed((options.seed + 1, *seed)))
         plant, simulated = self.tabletop.plant, robot.time.simulated
         attach(robot, self.tabletop, CellOnBus(plant, cell, bus, simulated))
 

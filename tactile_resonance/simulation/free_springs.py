@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 from math import exp
+from operator import mul
 
 import numpy as np
 
 from tactile_resonance.simulation.tissue import FloatArray
 
-Values = list[float]  # one per Prony term
-Node = tuple[float, float, Values]
+Values = list[float]  # one per Prony term: its share E_j v_j of the line load
+Node = tuple[float, float, FloatArray]  # x, time when it was let go, modal state then
 
 
 class FreeSprings:
     """Springs of a Prony series without load: ``E0 u = sum E_j z_j``, ``tau_j z_j' = u - z_j``.
 
-    A free spring is a node (x, time it was let go, modal state then).
+    While it touches, a spring bears ``Einf u + sum E_j v_j`` with ``v_j = u - z_j``.
 
     Parameters
     ----------
@@ -35,26 +36,20 @@ class FreeSprings:
         root = np.sqrt(moduli_pa / times_s)
         rates, vectors = np.linalg.eigh(np.diag(1 / times_s) - np.outer(root, root) / glassy_pa)
         weights = np.sqrt(moduli_pa * times_s)
-        self._rates = rates.tolist()
-        self._into = (vectors.T * weights).tolist()  # (modes, terms)
-        self._out = (vectors / weights[:, None]).tolist()  # (terms, modes)
-        self._displacement = (vectors.T @ root / glassy_pa).tolist()
+        self._moduli, self._decay_rates = moduli_pa, (-rates).tolist()
+        self._into = vectors.T * weights  # (modes, terms): modal state of z
+        displacement = vectors.T @ root / glassy_pa  # (modes,)
+        loads = moduli_pa[:, None] * (displacement - vectors / weights[:, None])  # (terms, modes)
+        self._out = np.vstack([displacement, loads]).tolist()
 
-    def state(self, z: Values) -> Values:
-        """Return the modal state of a spring that has just been let go."""
-        return [sum(w * value for w, value in zip(row, z, strict=True)) for row in self._into]
+    def let_go(self, u: float, values: Values) -> FloatArray:
+        """Return the modal state of a spring at displacement u [m] that has just been let go."""
+        return (self._into @ (u - np.array(values) / self._moduli)).tolist()
 
-    def displacement(self, node: Node, time: float) -> float:
-        """Return u of a free spring [m]."""
-        elapsed, state = node[1] - time, node[2]
-        u = 0.0
-        for weight, rate, value in zip(self._displacement, self._rates, state, strict=True):
-            u += weight * value * exp(elapsed * rate)
-        return u
-
-    def deformation(self, node: Node, time: float) -> Values:
-        """Return ``v_j = u - z_j`` of a free spring [m]."""
-        elapsed = node[1] - time
-        now = [y * exp(elapsed * rate) for y, rate in zip(node[2], self._rates, strict=True)]
-        u = sum(w * y for w, y in zip(self._displacement, now, strict=True))
-        return [u - sum(w * y for w, y in zip(row, now, strict=True)) for row in self._out]
+    def at(self, node: Node, time: float) -> tuple[float, Values]:
+        """Return u of a free spring [m], and what its terms would bear if it were held there."""
+        _, since, state = node
+        elapsed = time - since
+        now = [y * exp(elapsed * rate) for y, rate in zip(state, self._decay_rates, strict=True)]
+        values = [sum(map(mul, row, now)) for row in self._out]
+        return values.pop(0), values

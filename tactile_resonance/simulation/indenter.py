@@ -11,12 +11,13 @@ contact grows and that of Ting (1966) while it shrinks. Spring x has the displac
 from there it recovers free of load. The force is ``2 integral_0^a q dx``.
 
 All springs that touch see the same motion, so sums over them take a few operations per step; only
-the profile of v_j, which tells where the edge goes, is kept, at nodes.
+the profile of E_j v_j, which tells where the edge goes, is kept, at nodes.
 """
 
 from __future__ import annotations
 
 from math import exp, expm1, pi, sqrt
+from operator import mul
 
 import numpy as np
 
@@ -81,7 +82,8 @@ class Indenter:
         self._spacing = NODE_SPACING * tip_radius_m
         self._interval = 0.0
         self._decay: Values = []
-        self._mean_decay: Values = []
+        self._gain: Values = []
+        self._stiffness = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -92,11 +94,12 @@ class Indenter:
         self._time = 0.0
         self._touching = False
         zero = [0.0] * len(self._times)
-        self._sum = zero  # integral_0^a v_j dx
+        # of E_j v_j, one for each j
+        self._sum = zero  # integral_0^a dx
         self._common = zero  # what every touching spring has gone through alike
-        self._edge = zero  # v_j at x = a
-        self._inside: list[Node] = []  # x, time, v_j - common, x ascending
-        self._outside: list[Node] = []  # x, time, free state, x descending
+        self._edge = zero  # at x = a
+        self._inside: list[tuple[float, float, Values]] = []  # x, time, less common; x ascending
+        self._outside: list[Node] = []  # x descending
 
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the tip to a depth at constant speed within `dt_s` and return the force [N]."""
@@ -106,12 +109,15 @@ class Indenter:
         self.depth_m = depth_m
         self._time += dt_s
         if self._touching:
-            self._set_interval(dt_s)
-            shift = [moved * m for m in self._mean_decay]
-            decay, a = self._decay, self.contact_radius_m
-            self._sum = [d * s + a * v for d, s, v in zip(decay, self._sum, shift, strict=True)]
-            self._common = [d * c + v for d, c, v in zip(decay, self._common, shift, strict=True)]
-            self._edge = [d * e + v for d, e, v in zip(decay, self._edge, shift, strict=True)]
+            if dt_s != self._interval:
+                self._set_interval(dt_s)
+            decay, gain, a = self._decay, self._gain, self.contact_radius_m
+            before = zip(decay, gain, self._sum, self._common, self._edge, strict=True)
+            self._sum, self._common, self._edge = [], [], []
+            for d, g, total, common, edge in before:
+                self._sum.append(d * total + g * moved * a)
+                self._common.append(d * common + g * moved)
+                self._edge.append(d * edge + g * moved)
             excess = self._load(a, self._edge)
             if excess < 0:
                 self._recede(excess)
@@ -128,43 +134,40 @@ class Indenter:
         """
         if not self._touching:
             return 0.0, 0.0
-        self._set_interval(dt_s)
-        a, stress, stiffness = self.contact_radius_m, 0.0, self._einf
-        terms = zip(self._moduli, self._decay, self._mean_decay, self._sum, strict=True)
-        for modulus, decay, mean, total in terms:
-            stress += modulus * decay * total
-            stiffness += modulus * mean
-        stress += self._einf * a * (self.depth_m - a * a / (3 * self._radius))
-        return self._scale * stress, self._scale * a * stiffness
+        if dt_s != self._interval:
+            self._set_interval(dt_s)
+        a = self.contact_radius_m
+        stress = self._einf * a * (self.depth_m - a * a / (3 * self._radius))
+        stress += sum(map(mul, self._decay, self._sum))
+        return self._scale * stress, self._scale * a * self._stiffness
 
     def _set_interval(self, dt_s: float) -> None:
-        """Keep ``exp(-dt / tau)`` and its mean over the step, which steady motion sees."""
-        if dt_s != self._interval:
-            self._interval = dt_s
-            self._decay = [exp(-dt_s / tau) for tau in self._times]
-            self._mean_decay = [-tau / dt_s * expm1(-dt_s / tau) for tau in self._times]
+        """Keep ``exp(-dt / tau)``, and E_j times its mean over the step, which steady motion sees."""
+        self._interval = dt_s
+        terms = zip(self._moduli, self._times, strict=True)
+        self._decay = [exp(-dt_s / tau) for tau in self._times]
+        self._gain = [-modulus * tau / dt_s * expm1(-dt_s / tau) for modulus, tau in terms]
+        self._stiffness = self._einf + sum(self._gain)
 
-    def _load(self, x: float, v: Values) -> float:
+    def _load(self, x: float, values: Values) -> float:
         """Return ``q (1 - nu^2)`` at x, above that at which the edge lets go."""
-        load = self._einf * (self.depth_m - x * x / self._radius) + self._pull * sqrt(x)
-        for modulus, value in zip(self._moduli, v, strict=True):
-            load += modulus * value
-        return load
+        return (
+            self._einf * (self.depth_m - x * x / self._radius) + self._pull * sqrt(x) + sum(values)
+        )
 
     def _touch(self, moved: float, dt_s: float) -> bool:
         """Begin a contact if the tip has met the surface, which may still be dented."""
-        surface = 0.0
+        surface, start = 0.0, [0.0] * len(self._times)
         if self._outside:
-            surface = self._free.displacement(self._outside[-1], self._time)
+            surface, start = self._free.at(self._outside[-1], self._time)
         gone_in = self.depth_m - surface
         if gone_in <= 0:
             return False
         # the part of the step in contact; the first step ever starts at the surface
         self._set_interval(dt_s * min(1.0, gone_in / moved) if 0 < moved < np.inf else dt_s)
-        start = [0.0] * len(self._times)
         if self._outside:
-            start = self._free.deformation(self._outside.pop(), self._time)
-        self._edge = [v + gone_in * m for v, m in zip(start, self._mean_decay, strict=True)]
+            self._outside.pop()
+        self._edge = [v + gone_in * g for v, g in zip(start, self._gain, strict=True)]
         self._touching = True
         self._sum = self._common = [0.0] * len(self._times)
         self._inside = [(0.0, self._time, self._edge)]
@@ -177,19 +180,20 @@ class Indenter:
         while self._outside:
             node = self._outside[-1]
             x, a = node[0], self.contact_radius_m
-            surface = self._free.displacement(node, self._time)
-            start = [v - pull * sqrt(x) for v in self._free.deformation(node, self._time)]
-            gone_in = self.depth_m - x * x / radius - surface + pull * sqrt(x)
+            surface, start = self._free.at(node, self._time)
+            jump = pull * sqrt(x)
+            if jump:
+                start = [v - jump * modulus for v, modulus in zip(start, self._moduli, strict=True)]
+            gone_in = self.depth_m - x * x / radius - surface + jump
             if gone_in >= 0:
                 self._outside.pop()
-                ends = zip(start, self._mean_decay, strict=True)
-                self._extend(x, [v + gone_in * m for v, m in ends])
+                self._extend(x, [v + gone_in * g for v, g in zip(start, self._gain, strict=True)])
                 excess = self._load(x, self._edge)
                 continue
             at_edge = excess / self._e0
             share = at_edge / (at_edge - gone_in)
-            pairs = zip(self._edge, start, strict=True)
-            edge = [(1 - share) * (v - at_edge) + share * w for v, w in pairs]
+            terms = zip(self._edge, start, self._moduli, strict=True)
+            edge = [(1 - share) * (v - at_edge * modulus) + share * w for v, w, modulus in terms]
             self._extend(sqrt(a * a + share * (x * x - a * a)), edge)
             return
         x, a = self._undisturbed_edge(), self.contact_radius_m
@@ -201,8 +205,8 @@ class Indenter:
         radius, pull = self._radius, self._pull / self._e0
         pressed = self.depth_m * (x - a) - (x * x * x - a * a * a) / (3 * radius)
         pulled = 2 / 3 * pull * (x * sqrt(x) - a * sqrt(a))
-        added = [m * (pressed + pulled) - pulled for m in self._mean_decay]
-        self._sum = [s + v for s, v in zip(self._sum, added, strict=True)]
+        terms = zip(self._sum, self._gain, self._moduli, strict=True)
+        self._sum = [v + gain * (pressed + pulled) - modulus * pulled for v, gain, modulus in terms]
         self._keep_edge()
         # nodes on the way, where the edge has leapt
         count = min(MAX_NODES_PER_STEP, int((x - a) / self._spacing))
@@ -210,10 +214,12 @@ class Indenter:
             at = a + (x - a) * n / (count + 1)
             jump = -pull * sqrt(at)
             gone_in = self.depth_m - at * at / radius - jump
-            self._edge = [jump + m * gone_in for m in self._mean_decay]
+            pairs = zip(self._gain, self._moduli, strict=True)
+            self._edge = [jump * modulus + gain * gone_in for gain, modulus in pairs]
             self.contact_radius_m = at
             self._keep_edge()
-        self.contact_radius_m, self._edge = x, [-pull * sqrt(x)] * len(self._times)
+        self.contact_radius_m = x
+        self._edge = [-pull * sqrt(x) * modulus for modulus in self._moduli]
 
     def _undisturbed_edge(self) -> float:
         """Return the radius at which undisturbed springs just touch."""
@@ -237,8 +243,7 @@ class Indenter:
 
     def _extend(self, x: float, edge: Values) -> None:
         """Move the edge outwards to x, v_j linear in x^2 on the way."""
-        parts = _segment(self.contact_radius_m, x, self._edge, edge)
-        self._sum = [s + part for s, part in zip(self._sum, parts, strict=True)]
+        self._add_segment(self.contact_radius_m, x, self._edge, edge)
         self._keep_edge()
         self.contact_radius_m, self._edge = x, edge
 
@@ -263,12 +268,10 @@ class Indenter:
                 new = sqrt(x * x + share * (a * a - x * x))
                 pairs = zip(v, self._edge, strict=True)
                 edge = [(1 - share) * inner + share * outer for inner, outer in pairs]
-                parts = _segment(new, a, edge, self._edge)
-                self._sum = [s - part for s, part in zip(self._sum, parts, strict=True)]
+                self._add_segment(a, new, self._edge, edge)
                 self.contact_radius_m, self._edge = new, edge
                 return
-            parts = _segment(x, a, v, self._edge)
-            self._sum = [s - part for s, part in zip(self._sum, parts, strict=True)]
+            self._add_segment(a, x, self._edge, v)
             self.contact_radius_m, self._edge, excess = x, v, load
             self._inside.pop()
         self._let_go(force=True)
@@ -279,23 +282,20 @@ class Indenter:
         x = self.contact_radius_m
         if force or self._outside[-1][0] - x >= self._spacing:
             u = self.depth_m - x * x / self._radius
-            self._outside.append((x, self._time, self._free.state([u - v for v in self._edge])))
+            self._outside.append((x, self._time, self._free.let_go(u, self._edge)))
+
+    def _add_segment(self, x0: float, x1: float, v0: Values, v1: Values) -> None:
+        """Add ``integral v dx`` from x0 to x1 to the sums, every v linear in x^2 between its ends."""
+        # mean of (x^2 - x0^2) / (x1^2 - x0^2) over the way
+        share = (x1 + 2 * x0) / (3 * (x1 + x0)) if x1 + x0 > 0 else 0.0
+        at0, at1 = (x1 - x0) * (1 - share), (x1 - x0) * share
+        self._sum = [v + at0 * a + at1 * b for v, a, b in zip(self._sum, v0, v1, strict=True)]
 
     def _update_force(self) -> float:
         stress, a = 0.0, self.contact_radius_m
         if self._touching:
-            stress = self._einf * a * (self.depth_m - a * a / (3 * self._radius))
-            for modulus, total in zip(self._moduli, self._sum, strict=True):
-                stress += modulus * total
+            stress = self._einf * a * (self.depth_m - a * a / (3 * self._radius)) + sum(self._sum)
             if stress < 0 and self._pull == 0:
                 stress = 0.0  # rounding of the profile when hardly anything touches
         self.force_n = self._scale * stress
         return self.force_n
-
-
-def _segment(x0: float, x1: float, v0: Values, v1: Values) -> Values:
-    """Return ``integral v dx`` from x0 to x1 for every v linear in x^2 between its ends."""
-    width = x1 - x0
-    # mean of (x^2 - x0^2) / (x1^2 - x0^2) over the way
-    share = (x1 + 2 * x0) / (3 * (x1 + x0)) if x1 > 0 else 0.0
-    return [width * (a + share * (b - a)) for a, b in zip(v0, v1, strict=True)]

@@ -9,19 +9,17 @@ byte repeats the command. A wrench is such a response.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterable
+from operator import sub
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.transducer import (
     SAMPLE_PERIOD_S,
     CellFaults,
     CellParameters,
     Transducer,
 )
-
-FloatArray = NDArray[np.float64]
 
 READ_MODEL, READ_SERIAL, READ_FIRMWARE = 0x01, 0x02, 0x03
 SET_IDS, READ_IDS = 0x04, 0x05
@@ -36,8 +34,7 @@ UNSUPPORTED, OUT_OF_RANGE = 1, 2
 WHILE_STREAMING = (STOP, SET_BIAS)
 
 
-@dataclass(frozen=True)
-class CanFrame:
+class CanFrame(NamedTuple):
     """One frame on the bus: when it was sent (plant's clock) [s], identifier, up to 8 bytes."""
 
     time_s: float
@@ -70,7 +67,7 @@ class LoadCell:
     def __init__(
         self,
         parameters: CellParameters,
-        seed: int = 1,
+        seed: Seed = 1,
         command_id: int = 0x64,
         response_ids: tuple[int, int] = (0x001, 0x002),
     ) -> None:
@@ -80,9 +77,10 @@ class LoadCell:
         self._next_ids = (command_id, *response_ids)
         self.streaming = False
         self._rate_code = self._filter_code = 0
+        self._decimation = _decimation(0)
         self._time_s: float | None = None
         self._ticks = self._sent = 0
-        self._wrench = np.zeros(6)
+        self._wrench = [0.0] * 6
         self._counts, self._bits = [0] * 6, 0
 
     @property
@@ -95,12 +93,12 @@ class LoadCell:
         """Wrenches a second while it streams."""
         return 1 / (self._decimation * SAMPLE_PERIOD_S)
 
-    @property
-    def _decimation(self) -> int:
-        return round(1 / (RATES_HZ[self._rate_code] * SAMPLE_PERIOD_S))
+    def reseed(self, seed: Seed) -> None:
+        """Take all noise from the next conversion on from a seed, whatever was drawn before."""
+        self._transducer.reseed(seed)
 
-    def step(self, wrench: FloatArray, time_s: float) -> list[CanFrame]:
-        """Advance to a time of the plant, at which `wrench` (6,) [N, N m] acts on the cell.
+    def step(self, wrench: Iterable[float], time_s: float) -> list[CanFrame]:
+        """Advance to a time of the plant, at which `wrench`, 6 [N, N m], acts on the cell.
 
         Between two calls the wrench runs linearly.
 
@@ -109,24 +107,25 @@ class LoadCell:
         list of CanFrame
             Sent meanwhile, oldest first.
         """
+        load = list(map(float, wrench))
         if self._time_s is None:
-            self._time_s = time_s
-            self._wrench = np.array(wrench, dtype=float)
+            self._time_s, self._wrench = time_s, load
         span = time_s - self._time_s
+        change = list(map(sub, load, self._wrench))
         frames: list[CanFrame] = []
         period = SAMPLE_PERIOD_S
         start_s = self._time_s
         while self._time_s + period <= time_s + 1e-9:
             self._time_s += period
             part = (self._time_s - start_s) / span
-            now = self._wrench + part * (wrench - self._wrench)
+            now = [old + part * way for old, way in zip(self._wrench, change, strict=True)]
             self._counts, self._bits = self._transducer.convert(now)
             self._ticks += 1
             if self.streaming and self._ticks % self._decimation == 0:
                 frames += self._wrench_frames(START, self._time_s)
         # what is left of the span counts for the next call
         left = (time_s - self._time_s) / span if span > 0 else 0.0
-        self._wrench = np.asarray(wrench) - left * (wrench - self._wrench)
+        self._wrench = [new - left * way for new, way in zip(load, change, strict=True)]
         return frames
 
     def receive(self, can_id: int, data: bytes) -> list[CanFrame]:
@@ -175,6 +174,7 @@ class LoadCell:
             good = parameters[0] < len(RATES_HZ)
             if good:
                 self._rate_code = parameters[0]
+                self._decimation = _decimation(self._rate_code)
             return _result(good)
         if command == READ_RATE:
             return bytes([self._rate_code])
@@ -195,6 +195,11 @@ class LoadCell:
         at = self._time_s or 0.0 if time_s is None else time_s
         first, second = self.response_ids
         return [CanFrame(at, first, whole[:8]), CanFrame(at, second, whole[8:])]
+
+
+def _decimation(rate_code: int) -> int:
+    """Conversions from one wrench that is sent to the next."""
+    return round(1 / (RATES_HZ[rate_code] * SAMPLE_PERIOD_S))
 
 
 def _result(good: bool) -> bytes:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +23,18 @@ from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.robot.poses import (
+    IDENTITY,
+    ORIGIN,
+    Transform,
+    Vector,
+    cross,
+    dot,
+    rotated,
+    rotated_back,
+    turn_from_vector,
+    turn_product,
+)
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
@@ -33,8 +46,8 @@ NEAR_M = 0.005
 class Surface(Protocol):
     """The undisturbed surface of what lies on the table."""
 
-    def height_of(self, position_m: FloatArray) -> tuple[float, FloatArray]:
-        """Height of a position above the surface [m], along the outward normal (3,) there."""
+    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
+        """Height of a position above the surface [m], along the outward normal there."""
         ...
 
 
@@ -52,9 +65,14 @@ class Plane:
         normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
         return cls(np.array([0.0, 0.0, height_m]), np.array(normal))
 
-    def height_of(self, position_m: FloatArray) -> tuple[float, FloatArray]:
-        """Height of a position above the plane [m], and the normal (3,)."""
-        return float(self.normal @ (position_m - self.point_m)), self.normal
+    @cached_property
+    def _floats(self) -> tuple[Vector, Vector]:
+        return _vector(self.point_m), _vector(self.normal)
+
+    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
+        """Height of a position above the plane [m], and the normal."""
+        (x, y, z), normal = self._floats
+        return dot(normal, (position_m[0] - x, position_m[1] - y, position_m[2] - z)), normal
 
 
 class TipOnTissue(Protocol):
@@ -147,7 +165,7 @@ class Plant:
     ----------
     time_s : float
         Since the start [s].
-    force_n, torque_nm : (3,) arrays
+    force_n, torque_nm : Vector
         True wrench of the tissue on the ball, about its centre, in the base [N], [N m].
     depth_m : float
         Depth of the ball's lowest point below the undisturbed surface [m], 0 above it.
@@ -157,7 +175,7 @@ class Plant:
         How often contact has begun.
     contact_s : float
         How long this contact has lasted [s]; 0 out of contact.
-    tip_m : (3,) array
+    tip_m : Vector
         Place of the frame `tip` in the base [m].
     normal_force_n : float
         True force along the normal [N], compression positive.
@@ -180,31 +198,36 @@ class Plant:
         self.mounting = CellMounting() if mounting is None else mounting
         self.friction = Friction() if friction is None else friction
         self.time_s = 0.0
-        self.force_n, self.torque_nm = np.zeros(3), np.zeros(3)
+        self.force_n = self.torque_nm = ORIGIN
         self.depth_m = 0.0
         self.in_contact = False
         self.touches = 0
         self.contact_s = 0.0
-        self.tip_m = np.zeros(3)
+        self.tip_m = ORIGIN
         self.normal_force_n = 0.0
         self._tip = tip
         self._on: TipOnTissue | None = None
-        self._site: FloatArray | None = None  # where the tissue was last asked for
-        self._slip = np.zeros(3)  # elastic displacement of the contact along the surface
-        self._held_n = np.zeros(3)  # force on what holds the tip: the beam's, where there is one
-        self._pose: Pose | None = None
-        self._turned: tuple[FloatArray, FloatArray] = (np.zeros(3), np.eye(3))
-        self._places: list[FloatArray] = []  # of the carried mass, newest last
+        self._site: Vector | None = None  # where the tissue was last asked for
+        self._slip = ORIGIN  # elastic displacement of the contact along the surface
+        self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
+        self._turn = IDENTITY[0]  # of the tip
+        self._stepped = False
+        cell = self.mounting
+        self._cell_m, self._carried_m = _vector(cell.frame.position_m), _vector(cell.centre_m)
+        self._cell_turn = turn_from_vector(_vector(cell.frame.rotation_rad))
+        self._gravity_m_s2 = _vector(GRAVITY_M_S2)
+        self._places: list[Vector] = []  # of the carried mass, newest last
         self._period_s = 0.0
 
-    def step(self, tip_pose: Pose, dt_s: float) -> None:
-        """Advance by `dt_s` [s], at whose end the frame `tip` is at `tip_pose` in the base.
+    def step(self, tip: Transform, dt_s: float) -> None:
+        """Advance by `dt_s` [s], at whose end the frame `tip` is at `tip` in the base.
 
-        For a beam the pose is where the undeflected tip would be.
+        For a beam that is where the undeflected tip would be.
         """
-        before, self._pose, self._period_s = self._pose, tip_pose, dt_s
+        self._turn, place = tip
+        way = _from(self.tip_m, place) if self._stepped else ORIGIN
+        self._stepped, self._period_s = True, dt_s
         self.time_s += dt_s
-        place = tip_pose.position_m
         height, normal = self.surface.height_of(place)
         depth = self.tip_radius_m - height
         pushed = held = 0.0
@@ -220,90 +243,98 @@ class Plant:
         self.in_contact = touching
         self.contact_s = self.contact_s + dt_s if touching else 0.0
         self.tip_m, self.normal_force_n = place, pushed
-        way = np.zeros(3) if before is None else place - before.position_m
-        along = self._friction(way, normal, pushed)
-        self.force_n = pushed * normal + along
-        self._held_n = held * normal + along
+        x, y, z = self._friction(way, normal, pushed)
+        nx, ny, nz = normal
+        self.force_n = (pushed * nx + x, pushed * ny + y, pushed * nz + z)
+        self._held_n = (held * nx + x, held * ny + y, held * nz + z)
         # the ball is touched at its lowest point
-        self.torque_nm = cross(-self.tip_radius_m * normal, along)
+        radius = -self.tip_radius_m
+        self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
         if self.mounting.mount is Mount.TOOL:
-            self._places = [*self._places[-2:], self._mass_place(tip_pose)]
+            self._places = [*self._places[-2:], self._on_tip(self._carried_m)]
 
-    def wrench_at_cell(self) -> tuple[FloatArray, FloatArray]:
+    def wrench_at_cell(self) -> tuple[Vector, Vector]:
         """Force [N] and torque [N m] on the cell about its origin, in its frame, without noise.
 
         On the tool the cell feels the contact (through the beam), the weight of the tool beyond it
         and its inertia; under the sample the reaction of the contact and the sample's weight.
         """
-        mounting, pose = self.mounting, self._pose
-        if pose is None:
+        if not self._stepped:
             raise RuntimeError("wrench_at_cell: the plant has not been stepped yet")
-        turn = self._matrix(mounting.frame.rotation_rad, pose)
-        mass = mounting.carried_kg
-        if mounting.mount is Mount.TABLE:
-            origin, centre = mounting.frame.position_m, mounting.centre_m
-            contact, couple = -self.force_n, -self.torque_nm
-            load = mass * GRAVITY_M_S2
+        mass = self.mounting.carried_kg
+        gx, gy, gz = self._gravity_m_s2
+        cx, cy, cz = self.torque_nm
+        if self.mounting.mount is Mount.TABLE:
+            turn, origin, centre = self._cell_turn, self._cell_m, self._carried_m
+            fx, fy, fz = self.force_n
+            fx, fy, fz, cx, cy, cz = -fx, -fy, -fz, -cx, -cy, -cz
         else:
-            origin = pose.position_m + self._tip_matrix(pose) @ mounting.frame.position_m
-            centre = self._places[-1]
-            contact, couple = self._held_n, self.torque_nm
-            load = mass * (GRAVITY_M_S2 - self._mass_acceleration())
-        force = contact + load
-        torque = couple + cross(pose.position_m - origin, contact)
-        torque += cross(centre - origin, load)
-        return turn.T @ force, turn.T @ torque
+            turn = turn_product(self._turn, self._cell_turn)
+            origin, centre = self._on_tip(self._cell_m), self._places[-1]
+            fx, fy, fz = self._held_n
+            ax, ay, az = self._mass_acceleration()
+            gx, gy, gz = gx - ax, gy - ay, gz - az
+        load = (mass * gx, mass * gy, mass * gz)
+        tx, ty, tz = cross(_from(origin, self.tip_m), (fx, fy, fz))
+        lx, ly, lz = cross(_from(origin, centre), load)
+        return (
+            rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
+            rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
+        )
 
-    def _find_tissue(self, place: FloatArray, height: float, normal: FloatArray) -> None:
+    def _find_tissue(self, place: Vector, height: float, normal: Vector) -> None:
         """Tissue remembers the last touch within a ball's radius; further away it is fresh."""
         if self.in_contact or height > self.tip_radius_m + NEAR_M:
             return
         if self._site is not None:
-            way = place - self._site
-            if math.dist(way, (normal @ way) * normal) < self.tip_radius_m:
+            way = _from(self._site, place)
+            if math.hypot(*_along(way, normal)) < self.tip_radius_m:
                 return
-        tissue = self.tissue_at(place)
+        tissue = self.tissue_at(np.array(place))
         self._on = None if tissue is None else self._tip(tissue)
         self._site = place
 
-    def _friction(self, way: FloatArray, normal: FloatArray, pushed: float) -> FloatArray:
-        """Force along the surface on the ball (3,) [N]."""
+    def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:
+        """Force along the surface on the ball [N]."""
         if pushed <= 0 or self.depth_m <= 0:
-            self._slip = np.zeros(3)
-            return self._slip
-        slip = self._slip + way
-        slip = slip - (normal @ slip) * normal
+            self._slip = ORIGIN
+            return ORIGIN
+        (x, y, z), (dx, dy, dz) = self._slip, way
+        x, y, z = _along((x + dx, y + dy, z + dz), normal)
         stiffness = self.friction.stiffness_ratio * 1.5 * pushed / self.depth_m
-        length, most = math.sqrt(slip @ slip), self.friction.coefficient * pushed / stiffness
-        self._slip = slip * (most / length) if length > most else slip
-        return -stiffness * self._slip
+        length, most = math.hypot(x, y, z), self.friction.coefficient * pushed / stiffness
+        if length > most:
+            share = most / length
+            x, y, z = x * share, y * share, z * share
+        self._slip = (x, y, z)
+        return -stiffness * x, -stiffness * y, -stiffness * z
 
-    def _mass_place(self, pose: Pose) -> FloatArray:
-        return pose.position_m + self._tip_matrix(pose) @ self.mounting.centre_m
-
-    def _mass_acceleration(self) -> FloatArray:
-        """Of the carried mass (3,) [m/s2], by differences over the last two periods."""
+    def _mass_acceleration(self) -> Vector:
+        """Of the carried mass [m/s2], by differences over the last two periods."""
         if len(self._places) < 3:
-            return np.zeros(3)
+            return ORIGIN
         first, second, third = self._places
-        return (third - 2 * second + first) / self._period_s**2
+        (x, y, z), (lx, ly, lz) = _from(second, third), _from(first, second)
+        square = self._period_s**2
+        return (x - lx) / square, (y - ly) / square, (z - lz) / square
 
-    def _tip_matrix(self, pose: Pose) -> FloatArray:
-        """Rotation of the tip (3, 3); kept while the rotation vector stays the same object."""
-        if pose.rotation_rad is not self._turned[0]:
-            self._turned = (pose.rotation_rad, pose.rotation.as_matrix())
-        return self._turned[1]
-
-    def _matrix(self, frame_rad: FloatArray, pose: Pose) -> FloatArray:
-        """Rotation of the cell in the base (3, 3)."""
-        own = np.eye(3)
-        if frame_rad.any():
-            own = self.mounting.frame.rotation.as_matrix()
-        return self._tip_matrix(pose) @ own if self.mounting.mount is Mount.TOOL else own
+    def _on_tip(self, place_m: Vector) -> Vector:
+        """What has a place in the frame `tip`, in the base."""
+        (x, y, z), (dx, dy, dz) = self.tip_m, rotated(self._turn, place_m)
+        return x + dx, y + dy, z + dz
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Vector product of two (3,) arrays, without the overhead of the general one."""
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
+def _vector(values: FloatArray) -> Vector:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _from(start: Vector, end: Vector) -> Vector:
+    """Way from a place to another."""
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
+
+
+def _along(way: Vector, normal: Vector) -> Vector:
+    """What of a way is along the surface."""
+    height = dot(normal, way)
+    return way[0] - height * normal[0], way[1] - height * normal[1], way[2] - height * normal[2]

@@ -10,6 +10,7 @@ from collections import deque
 
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant import Plant
+from tactile_resonance.simulation.robot.poses import Vector
 
 KEEP_STEPS = 30_000
 """A minute at 500 Hz."""
@@ -28,12 +29,12 @@ class PlantHistory:
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
-        self._steps: deque[tuple[float, list[float], float]] = deque(maxlen=KEEP_STEPS)
+        self._steps: deque[tuple[float, Vector, float]] = deque(maxlen=KEEP_STEPS)
 
     def step(self) -> None:
         """Note what is true now; to be called after each step of the plant."""
         plant = self._plant
-        self._steps.append((plant.time_s, plant.tip_m.tolist(), plant.normal_force_n))
+        self._steps.append((plant.time_s, plant.tip_m, plant.normal_force_n))
 
     def since(self, fields: dict) -> dict:
         """Control port: the first steps after field ``after_s``, 250 at most, oldest first.
@@ -41,7 +42,7 @@ class PlantHistory:
         Answers ``time_s`` (n,), ``tip_m`` (n, 3) in the base and ``normal_force_n`` (n,).
         """
         after_s = number(fields.get("after_s", 0.0), "after_s")
-        found: list[tuple[float, list[float], float]] = []
+        found: list[tuple[float, Vector, float]] = []
         for step in reversed(self._steps):
             if step[0] <= after_s:
                 break

@@ -160,8 +160,8 @@ class Tabletop:
         plant = self.plant
         return {
             "time_s": plant.time_s,
-            "tip_m": plant.tip_m.tolist(),
-            "force_n": plant.force_n.tolist(),
+            "tip_m": plant.tip_m,
+            "force_n": plant.force_n,
             "normal_force_n": plant.normal_force_n,
             "contact_s": plant.contact_s,
             "depth_m": plant.depth_m,

@@ -78,31 +78,27 @@ class SprungIndenter:
         """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""
         if not dt_s > 0:
             require(False, "dt_s", dt_s, "a number above 0")
-        base = self._base
-        if base is None:
-            base = self.tip_depth_m = base_depth_m
+        if self._base is None:
+            self._base = self.tip_depth_m = base_depth_m
+        k, c, m, ball = self._stiffness, self._damping, self._mass, self.indenter
+        depth, speed = self.tip_depth_m, self._speed
         count = ceil(dt_s / SUBSTEP_S - 1e-9)
-        interval, rate = dt_s / count, (base_depth_m - base) / dt_s
-        for n in range(count):
-            self._substep(base + n * interval * rate, rate, interval)
-        self._base = base_depth_m
-        self.force_n = self._stiffness * (base_depth_m - self.tip_depth_m) + self._damping * (
-            rate - self._speed
-        )
-        return self.force_n
-
-    def _substep(self, base: float, rate: float, h: float) -> None:
-        k, c, m = self._stiffness, self._damping, self._mass
-        held, tangent = self.indenter.tangent(h)
-        whole = k + tangent
-        # motion of equilibrium: offset + drift t
-        drift = k * rate / whole
-        offset = k * base + c * (rate - drift) - held + tangent * self.tip_depth_m
-        offset /= whole
-        y, dy = self.tip_depth_m - offset, self._speed - drift
+        h, rate = dt_s / count, (base_depth_m - self._base) / dt_s
         half = c / (2 * m)
-        omega = sqrt(whole / m - half * half)
-        fall, turn, lift = exp(-half * h), cos(omega * h), sin(omega * h) / omega
-        self.tip_depth_m = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
-        self._speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
-        self.indenter.step(self.tip_depth_m, h)
+        fall = exp(-half * h)
+        for n in range(count):
+            held, tangent = ball.tangent(h)
+            whole = k + tangent
+            # motion of equilibrium: offset + drift t
+            drift = k * rate / whole
+            offset = k * (self._base + n * h * rate) + c * (rate - drift) - held + tangent * depth
+            offset /= whole
+            y, dy = depth - offset, speed - drift
+            omega = sqrt(whole / m - half * half)
+            turn, lift = cos(omega * h), sin(omega * h) / omega
+            depth = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
+            speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
+            ball.step(depth, h)
+        self._base, self.tip_depth_m, self._speed = base_depth_m, depth, speed
+        self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
+        return self.force_n

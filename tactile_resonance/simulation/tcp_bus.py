@@ -107,14 +107,19 @@ class TcpBus(ABC):
 
     def send(self, frames: Iterable[CanFrame]) -> None:
         """Hand frames of the bus to every client that listens."""
-        texts = [self.text_of(frame) for frame in frames]
+        now_s = time.monotonic()
+        listening = [
+            client
+            for client in self.clients
+            if client.listens_from_s is not None and client.listens_from_s <= now_s
+        ]
+        texts = [self.text_of(frame) for frame in frames] if listening else []
         if not texts:
             return
-        text, now_s = b"".join(texts), time.monotonic()
-        for client in list(self.clients):
-            if client.listens_from_s is not None and now_s >= client.listens_from_s:
-                client.frames += len(texts)
-                client.connection.send(text)
+        text = b"".join(texts)
+        for client in listening:
+            client.frames += len(texts)
+            client.connection.send(text)
 
     def keep_epoch(self, machine_s: float, plant_s: float) -> None:
         """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall [s]."""

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
+from tactile_resonance.simulation.noise import NormalRows, Seed
 
 FloatArray = NDArray[np.float64]
 
@@ -58,31 +59,33 @@ class Lag:
 
     Attributes
     ----------
-    value : (n,) array
+    value : tuple of float
         Where the axes are.
     """
 
-    def __init__(self, parameters: TrackingParameters, start: FloatArray, period_s: float) -> None:
-        self.value = np.array(start, dtype=float)
+    def __init__(
+        self, parameters: TrackingParameters, start: Sequence[float], period_s: float
+    ) -> None:
+        self.value = tuple(start)
         periods = parameters.dead_time_s / period_s
         whole = int(periods + 1e-9)
         self._fraction = max(0.0, periods - whole)
-        self._line = deque([self.value.copy()] * (whole + 2), maxlen=whole + 2)
-        self._delayed = self.value.copy()
+        self._line: deque[Sequence[float]] = deque([self.value] * (whole + 2), maxlen=whole + 2)
+        self._delayed: Sequence[float] = self.value
         lag = parameters.lag_s
         self._decay = math.exp(-period_s / lag) if lag > 0 else 0.0
         self._slope = lag / period_s * (1 - self._decay)
 
-    def step(self, target: FloatArray) -> FloatArray:
-        """Advance one period, at whose end the set point is `target`; return `value`, (n,)."""
-        self._line.append(np.array(target, dtype=float))
-        before = self._delayed
-        self._delayed = self._line[1] + self._fraction * (self._line[0] - self._line[1])
-        self.value = (
-            self._delayed
-            + self._decay * (self.value - before)
-            - self._slope * (self._delayed - before)
-        )
+    def step(self, target: Sequence[float]) -> tuple[float, ...]:
+        """Advance one period, at whose end the set points are `target`; return `value`."""
+        line, before, decay, slope = self._line, self._delayed, self._decay, self._slope
+        line.append(target)
+        now = line[1]
+        if self._fraction:
+            now = [b + self._fraction * (a - b) for a, b in zip(line[0], now, strict=True)]
+        self._delayed = now
+        axes = zip(self.value, before, now, strict=True)
+        self.value = tuple([n + decay * (value - b) - slope * (n - b) for value, b, n in axes])
         return self.value
 
 
@@ -92,23 +95,42 @@ class Jitter:
     Its autocorrelation is ``s^2 (1 + w |t|) exp(-w |t|)``; the step is exact for any period.
     """
 
-    def __init__(self, parameters: TrackingParameters, period_s: float, seed: int) -> None:
+    def __init__(self, parameters: TrackingParameters, period_s: float, seed: Seed) -> None:
         rms, w, t = parameters.jitter_rms_m, parameters.jitter_corner_rad_s, period_s
         fall = math.exp(-w * t)
-        self._transition = fall * np.array([[1 + w * t, t], [-(w**2) * t, 1 - w * t]])
+        transition = fall * np.array([[1 + w * t, t], [-(w**2) * t, 1 - w * t]])
         stationary = rms**2 * np.diag([1.0, w**2])
-        driven = stationary - self._transition @ stationary @ self._transition.T
+        driven = stationary - transition @ stationary @ transition.T
         # tiny negative eigenvalues are rounding
         values, vectors = np.linalg.eigh(driven)
-        self._drive = vectors * np.sqrt(np.maximum(values, 0))
-        self._rng = np.random.default_rng(seed)
-        self._state = np.sqrt(stationary) @ self._rng.standard_normal((2, 3))  # [place; speed]
+        drive = vectors * np.sqrt(np.maximum(values, 0))
+        self._rms = np.array([rms, rms * w])  # of place and speed
+        self._place_by, self._speed_by = np.hstack([transition, drive]).tolist()
+        self.reseed(seed)
 
-    def step(self) -> FloatArray:
-        """Advance one period; return the displacement (3,) [m]."""
-        noise = self._rng.standard_normal((2, 3))
-        self._state = self._transition @ self._state + self._drive @ noise
-        return self._state[0]
+    def reseed(self, seed: Seed) -> None:
+        """Vibrate from the next step on as a seed says, from a state drawn anew."""
+        random = np.random.default_rng(seed)
+        self._place, self._speed = (self._rms[:, None] * random.standard_normal((2, 3))).tolist()
+        self._rows = NormalRows(random, 6)
+
+    def step(self) -> tuple[float, float, float]:
+        """Advance one period; return the displacement [m]."""
+        (x, y, z), (vx, vy, vz) = self._place, self._speed
+        x1, y1, z1, x2, y2, z2 = self._rows.take()
+        a, b, c, d = self._place_by
+        self._place = (
+            a * x + b * vx + c * x1 + d * x2,
+            a * y + b * vy + c * y1 + d * y2,
+            a * z + b * vz + c * z1 + d * z2,
+        )
+        a, b, c, d = self._speed_by
+        self._speed = (
+            a * x + b * vx + c * x1 + d * x2,
+            a * y + b * vy + c * y1 + d * y2,
+            a * z + b * vz + c * z1 + d * z2,
+        )
+        return self._place
 
 
 class TipMotion:
@@ -133,7 +155,7 @@ class TipMotion:
         self._set_twist = np.zeros(6)  # after the acceleration limit
         self._wanted: FloatArray = np.zeros(6)
         self._acceleration_m_s2 = 1.0
-        self._lag = Lag(parameters, np.zeros(6), period_s)
+        self._lag = Lag(parameters, [0.0] * 6, period_s)
         self._jitter = Jitter(parameters, period_s, seed) if parameters.jitter_rms_m > 0 else None
 
     def speed(self, twist: Sequence[float] | FloatArray, acceleration_m_s2: float) -> None:
@@ -145,7 +167,7 @@ class TipMotion:
         dt = self.period_s
         self._set_twist = self._limited(self._wanted)
         last = self.twist
-        self.twist = self._lag.step(self._set_twist)
+        self.twist = np.array(self._lag.step(self._set_twist.tolist()))
         self.reported = moved(self.reported, (last + self.twist) / 2 * dt)
         self.pose = self.reported
         if self._jitter is not None:

@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from operator import add, mul
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import known_keys, number, numbers, read_yaml, require
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.simulation.noise import NormalRows, Seed
 
 SAMPLE_PERIOD_S = 0.001
 """The cell converts at 1 kHz, the fastest rate that it can send."""
@@ -137,23 +135,25 @@ class Transducer:
         How often each axis went beyond its range.
     """
 
-    def __init__(self, parameters: CellParameters, seed: int = 1) -> None:
+    def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
         self.parameters = parameters
         self.faults = CellFaults()
         self.overload_counts = [0] * 6
         p = parameters
-        self._random = np.random.default_rng(seed)
-        self._divisor = np.repeat([p.force_divisor, p.torque_divisor], 3)
-        self._noise = np.repeat([p.force_noise_rms_n, p.torque_noise_rms_nm], 3)
-        self._range = np.repeat([p.force_range_n, p.torque_range_nm], 3)
-        self._offset = np.array([*p.force_bias_n, *p.torque_bias_nm], dtype=float)
-        self._drift = np.array([p.force_drift_n_per_s] * 3 + [0.0] * 3) * SAMPLE_PERIOD_S
-        self._zero = np.zeros(6)  # what the bias command subtracts
-        self._filtered: FloatArray | None = None
-        self._overloaded = np.zeros(6, dtype=bool)
-        self._counts = np.zeros(6, dtype=int)
+        self._noise_rms = [p.force_noise_rms_n] * 3 + [p.torque_noise_rms_nm] * 3
+        self._range = [p.force_range_n] * 3 + [p.torque_range_nm] * 3
+        self._divisor = [p.force_divisor] * 3 + [p.torque_divisor] * 3
+        self._drift = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
+        self._offset = [*p.force_bias_n, *p.torque_bias_nm]
+        self._zero = [0.0] * 6  # what the bias command subtracts
+        # of the newest reading, filtered
+        self._signal: list[float] | None = None
+        self._noise = [0.0] * 6
+        self._overloaded = 0
+        self._counts = [0] * 6
         self._keep = 0.0
         self.cutoff_hz = 0.0
+        self.reseed(seed)
 
     @property
     def cutoff_hz(self) -> float:
@@ -165,37 +165,66 @@ class Transducer:
         self._cutoff_hz = value
         self._keep = math.exp(-2 * math.pi * value * SAMPLE_PERIOD_S) if value > 0 else 0.0
 
+    def reseed(self, seed: Seed) -> None:
+        """Take all noise from the next conversion on from a seed, that in the filter's memory too."""
+        self._rows = NormalRows(seed, 6)
+        self._noise_begins = True
+
     def set_zero(self, on: bool) -> None:
         """Take the present reading as zero, or end that."""
-        reading = np.zeros(6) if self._filtered is None else self._filtered
-        self._zero = reading.copy() if on else np.zeros(6)
+        self._zero = [0.0] * 6
+        if on and self._signal is not None:
+            self._zero = list(map(add, self._signal, self._noise))
 
-    def convert(self, wrench: FloatArray) -> tuple[list[int], int]:
-        """Convert once: from the wrench on the cell (6,) [N, N m] to six counts and overload bits.
+    def convert(self, wrench: Sequence[float]) -> tuple[list[int], int]:
+        """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and overload bits.
 
         Bit 5 belongs to Fx, bit 0 to Tz.
         """
         faults = self.faults
-        load = -wrench if faults.flipped else wrench
-        over = np.abs(load) > self._range
-        self._offset = self._offset + self._drift
-        reading = load + self._offset + self._noise * self._random.standard_normal(6)
+        self._offset = list(map(add, self._offset, self._drift))
+        signal = list(map(add, wrench, self._offset))
         if faults.flipped:  # the bias turns with the sign too
-            reading = reading - 2 * self._offset
-        reading[2] += faults.bias_step_n
-        if self._filtered is not None:
-            reading = self._keep * self._filtered + (1 - self._keep) * reading
-        self._filtered = reading
-        for axis in np.flatnonzero(over & ~self._overloaded):
-            self.overload_counts[axis] += 1
-        self._overloaded = over
+            signal = [-value for value in signal]
+        signal[2] += faults.bias_step_n
+        noise = list(map(mul, self._noise_rms, self._rows.take()))
+        if self._keep:
+            signal, noise = self._through_filter(signal, noise)
+        self._signal, self._noise, self._noise_begins = signal, noise, False
         if not faults.stuck:
-            counts = np.rint((reading - self._zero) * self._divisor)
-            self._counts = np.clip(counts, -LARGEST_COUNT, LARGEST_COUNT).astype(int)
-        result = self._counts.tolist()
+            parts = zip(signal, noise, self._zero, self._divisor, strict=True)
+            counts = [(value + n - zero) * divisor for value, n, zero, divisor in parts]
+            if max(counts) > LARGEST_COUNT or min(counts) < -LARGEST_COUNT:
+                counts = [max(-LARGEST_COUNT, min(LARGEST_COUNT, count)) for count in counts]
+            self._counts = [round(count) for count in counts]
+        result = list(self._counts)
         if faults.saturated:
             result[2] = LARGEST_COUNT
         if faults.invalid:
             result[2] = NO_NUMBER
-        bits = sum(1 << (5 - int(axis)) for axis in np.flatnonzero(over))
-        return result, bits
+        return result, self._overload_bits(wrench)
+
+    def _through_filter(
+        self, signal: list[float], noise: list[float]
+    ) -> tuple[list[float], list[float]]:
+        """Return signal and noise behind the low-pass; noise begins anywhere in its stationary state."""
+        keep = self._keep
+        if self._noise_begins:
+            noise = [math.sqrt((1 - keep) / (1 + keep)) * n for n in noise]
+        else:
+            noise = [keep * old + (1 - keep) * n for old, n in zip(self._noise, noise, strict=True)]
+        if self._signal is not None:
+            pairs = zip(self._signal, signal, strict=True)
+            signal = [keep * old + (1 - keep) * value for old, value in pairs]
+        return signal, noise
+
+    def _overload_bits(self, wrench: Sequence[float]) -> int:
+        bits = 0
+        for load, most in zip(wrench, self._range, strict=True):
+            bits = bits << 1 | (abs(load) > most)
+        begun = bits & ~self._overloaded
+        if begun:
+            for axis in range(6):
+                self.overload_counts[axis] += begun >> (5 - axis) & 1
+        self._overloaded = bits
+        return bits

@@ -21,6 +21,7 @@ from tactile_resonance.contact.interfaces import (
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.plant import Plant
+from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
 from tactile_resonance.simulation.transducer import (
     NO_NUMBER,
@@ -70,7 +71,7 @@ class VirtualBench:
         )
         self.on_step: list[Callable[[], None]] = []
         self._period_ns = round(1e9 * period_s)
-        plant.step(start, period_s)
+        plant.step(transform_from_pose(start.vector), period_s)
 
     def now_ns(self) -> int:
         """Virtual time since the start [ns]."""
@@ -80,7 +81,7 @@ class VirtualBench:
         """Let whole periods pass until a time is reached."""
         while self.time_ns < time_ns:
             self.motion.step()
-            self.plant.step(self.motion.pose, self.motion.period_s)
+            self.plant.step(transform_from_pose(self.motion.pose.vector), self.motion.period_s)
             self.time_ns += self._period_ns
             for action in self.on_step:
                 action()
@@ -293,7 +294,8 @@ class VirtualCell:
             raise ForceError(self.error, f"simulated fault: {self.error.value}")
 
     def _measure(self) -> None:
-        counts, bits = self._transducer.convert(np.concatenate(self._bench.plant.wrench_at_cell()))
+        force_n, torque_nm = self._bench.plant.wrench_at_cell()
+        counts, bits = self._transducer.convert((*force_n, *torque_nm))
         self._count += 1
         every = self.faults.lose_second_every
         if self.faults.silent or (every and self._count % every == 0):

@@ -15,6 +15,7 @@ from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
+from tactile_resonance.simulation.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, SOFT, contact, lower, started, stiffer
@@ -147,8 +148,9 @@ def test_tissue_that_rises_while_the_zero_is_taken_is_met_by_a_stop():
 
 def test_noise_of_a_coarse_sensor_is_no_touch_on_the_way_down():
     parameters = replace(contact().controller.parameters, cell_noise_n=0.02, tare_std_n=0.01)
-    made = contact(start_m=4.5e-3, parameters=parameters, limits=Limits(pull_force_n=0.5))
-    made.bench.force._cell._transducer._noise[:3] = 0.02
+    coarse = replace(CellParameters.from_yaml(), force_noise_rms_n=0.02)
+    limits = Limits(pull_force_n=0.5)
+    made = contact(start_m=4.5e-3, parameters=parameters, limits=limits, cell_parameters=coarse)
     made.loop.start(made.goal)
     assert made.run_until(State.APPROACH, 5.0), made.controller.result
 

@@ -9,6 +9,7 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import CellMounting, Friction, Plane, Plant, RigidTip
+from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -27,8 +28,13 @@ def plant(tissue=ELASTIC, *, surface=None, tip=rigid, **options):
     return Plant(surface, lambda _: tissue, tip, tip_radius_m=RADIUS_M, **options)
 
 
-def at(*place, turn=(0.0, 0.0, 0.0)):
+def pose(*place, turn=(0.0, 0.0, 0.0)):
     return Pose(np.array(place, dtype=float), np.array(turn, dtype=float))
+
+
+def at(*place, turn=(0.0, 0.0, 0.0)):
+    """The tip, as the plant takes it."""
+    return transform_from_pose([*place, *turn])
 
 
 def hertz(depth_m):
@@ -103,7 +109,7 @@ def test_nothing_there_is_nothing_felt():
 
 def test_cell_under_the_sample_feels_reaction_and_weight_wherever_the_tip_turns():
     mounting = CellMounting(
-        Mount.TABLE, at(0.1, 0, -0.02), carried_kg=0.2, centre_m=np.array([0.1, 0.01, -0.01])
+        Mount.TABLE, pose(0.1, 0, -0.02), carried_kg=0.2, centre_m=np.array([0.1, 0.01, -0.01])
     )
     p = plant(mounting=mounting)
     p.step(at(0, 0, RADIUS_M), 0.002)
@@ -116,7 +122,7 @@ def test_cell_under_the_sample_feels_reaction_and_weight_wherever_the_tip_turns(
 
 
 def test_cell_on_the_tool_feels_contact_weight_and_inertia_in_its_own_frame():
-    frame = at(-0.05, 0, 0.02, turn=(0, 0, np.pi / 2))
+    frame = pose(-0.05, 0, 0.02, turn=(0, 0, np.pi / 2))
     centre = np.array([-0.03, 0, 0.01])
     p = plant(mounting=CellMounting(Mount.TOOL, frame, carried_kg=0.03, centre_m=centre))
     turn = (0.0, 0.3, 0.0)

@@ -10,11 +10,11 @@ from tactile_resonance.simulation.plant_history import KEEP_STEPS, MOST_STEPS, P
 
 
 def test_pieces_make_up_the_whole_and_the_oldest_go():
-    plant = SimpleNamespace(time_s=0.0, tip_m=np.zeros(3), normal_force_n=0.0)
+    plant = SimpleNamespace(time_s=0.0, tip_m=(0.0, 0.0, 0.0), normal_force_n=0.0)
     history = PlantHistory(plant)
     count = KEEP_STEPS + 700
     for n in range(1, count + 1):
-        plant.time_s, plant.tip_m, plant.normal_force_n = n / 500, np.full(3, n), 2.0 * n
+        plant.time_s, plant.tip_m, plant.normal_force_n = n / 500, (n, n, n), 2.0 * n
         history.step()
     after, times, forces, tips = (count - 600) / 500, [], [], []
     while part := history.since({"after_s": after})["time_s"]:

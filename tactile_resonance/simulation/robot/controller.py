@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.robot.machine import Environment, Machine, MachineConfig
 from tactile_resonance.simulation.robot.outputs import OUTPUT_TYPES, Outputs, OutputValue
 from tactile_resonance.simulation.robot.ports import (
@@ -18,6 +20,7 @@ from tactile_resonance.simulation.robot.ports import (
     Ports,
     write_registers,
 )
+from tactile_resonance.simulation.robot.poses import largest
 from tactile_resonance.simulation.robot.program import Program, register_offset
 from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.safety import RefusedError, RobotMode, Safety, SafetyMode
@@ -86,6 +89,8 @@ class UrController:
         False: an uploaded program is taken and never starts (a fault to be injected).
     popup : str or None
         Open on the pendant.
+    now : Outputs
+        RTDE outputs of this cycle.
     log : deque of str
         Newest lines of the controller's log, time stamped.
     """
@@ -97,11 +102,10 @@ class UrController:
         self,
         config: ControllerConfig | None = None,
         environment: Environment | None = None,
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
         self.config = config or ControllerConfig()
-        rng = np.random.default_rng(seed)
-        self.machine = Machine(self.config.machine, environment, rng)
+        self.machine = Machine(self.config.machine, environment, np.random.default_rng(seed))
         self.safety = Safety(self.config.switching_s)
         self.registers = Registers()
         self.ports = Ports()
@@ -114,7 +118,7 @@ class UrController:
         self.stood_still_s = 0.0
         self._cycles = 0
         self._refreshed_s = 0.0
-        self._outputs = Outputs(self)
+        self.now = Outputs(self)
 
     @property
     def time_s(self) -> float:
@@ -156,6 +160,14 @@ class UrController:
         """RTDE output ``safety_mode``."""
         return self.safety.safety_mode
 
+    def reseed(self, seed: Seed) -> None:
+        """Let all noise from the next step on be that of a seed, whatever was drawn before.
+
+        Vibration and drift begin anew, somewhere in their stationary distribution; the offset of the
+        flange's sensor is no noise and stays.
+        """
+        self.machine.reseed(np.random.default_rng(seed))
+
     def write_inputs(self, values: Mapping[str, InputValue]) -> None:
         """Take one package of RTDE inputs, by name.
 
@@ -172,11 +184,11 @@ class UrController:
         write_registers(self.registers, values)
         self.ports.write(values)
         if "external_force_torque" in values:
-            wrench = np.array(values["external_force_torque"], dtype=float)
-            if np.all(np.abs(wrench) <= LARGEST_FIGURE):
-                self.machine.external_wrench = wrench
+            wrench = np.array(values["external_force_torque"], dtype=float).tolist()
+            if all(abs(value) <= LARGEST_FIGURE for value in wrench):
+                self.machine.external_wrench = tuple(wrench)
             elif self.machine.external is not None:
-                self.protective_stop(f"external_force_torque {wrench.tolist()}")
+                self.protective_stop(f"external_force_torque {wrench}")
 
     def outputs(self, name: str) -> OutputValue:
         """Return an RTDE output: an int or a float, for vectors a list of them.
@@ -186,7 +198,7 @@ class UrController:
         KeyError
             Where the output is not known.
         """
-        return self._outputs.value(name)
+        return self.now.value(name)
 
     def start_program(self, text: str) -> None:
         """Run the client's control program, in place of one that runs.
@@ -278,15 +290,15 @@ class UrController:
             self._run_program()
         was_powered = self.safety.powered
         self.machine.step(was_powered)
-        self._outputs = Outputs(self)
-        force = float(np.linalg.norm(self.machine.tcp_force[:3]))
+        self.now = Outputs(self)
+        force = math.hypot(*self.machine.tcp_force[:3])
         if force > self.machine.config.limits.tool_force_n and self.safety.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")
-        at_rest = not target.qd.any() and np.abs(self.machine.joints.qd).max() < _AT_REST_RAD_S
-        self.safety.step(self.time_s, bool(at_rest))
+        at_rest = not any(target.qd) and largest(self.machine.joints.qd) < _AT_REST_RAD_S
+        self.safety.step(self.time_s, at_rest)
         if was_powered and not self.safety.powered:
             self.machine.catch_with_brakes()
-        if self.runtime_state is RuntimeState.STOPPING and not target.qd.any():
+        if self.runtime_state is RuntimeState.STOPPING and not any(target.qd):
             self.runtime_state = RuntimeState.STOPPED
 
     def _run_program(self) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.simulation.robot.ft_sensor import Payload
+from tactile_resonance.simulation.robot.kinematics import Posture
+from tactile_resonance.simulation.robot.poses import Six, Vector
 
 FloatArray = NDArray[np.float64]
 
@@ -28,33 +30,34 @@ LINK_CENTRE_M = np.array(
 )
 
 
-def gravity_torque(frames: FloatArray, gravity_m_s2: FloatArray, payload: Payload) -> FloatArray:
-    """Return the torques (6,) [N m] that hold links and payload against gravity.
+def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: Payload) -> Six:
+    """Return the torques [N m] that hold links and payload against gravity.
 
     Parameters
     ----------
-    frames : (7, 4, 4) array
-        Base and links.
-    gravity_m_s2 : (3,) array
+    posture : Posture
+    gravity_m_s2 : Vector
         Acceleration of free fall in the base.
     payload : Payload
     """
-    return -_momentum_per_speed(frames, payload) @ gravity_m_s2
+    return tuple((_momentum_per_speed(posture, payload) @ np.negative(gravity_m_s2)).tolist())
 
 
-def momentum(frames: FloatArray, qd: FloatArray, payload: Payload) -> float:
+def momentum(posture: Posture, qd: Six, payload: Payload) -> float:
     """Return the norm of the linear momentum of links and payload [kg m/s]."""
-    return float(np.linalg.norm(qd @ _momentum_per_speed(frames, payload)))
+    return float(np.linalg.norm(np.array(qd) @ _momentum_per_speed(posture, payload)))
 
 
-def _momentum_per_speed(frames: FloatArray, payload: Payload) -> FloatArray:
+def _momentum_per_speed(posture: Posture, payload: Payload) -> FloatArray:
     """Return the linear momentum that a unit speed of each joint carries, shape (6, 3)."""
+    frames = posture.frames()
+    turn = np.array([frame[0] for frame in frames]).reshape(7, 3, 3)
+    origin = np.array([frame[1] for frame in frames])
     mass = np.append(LINK_MASS_KG, payload.mass_kg)
-    links = np.concatenate([frames[1:], frames[-1:]])  # the payload sits on the last link
-    centre = np.concatenate([LINK_CENTRE_M, payload.cog_m[None]])
-    point = links[:, :3, 3] + (links[:, :3, :3] @ centre[..., None])[..., 0]  # (7, 3)
+    centre = np.concatenate([LINK_CENTRE_M, [payload.cog_m]])
+    carrier = [1, 2, 3, 4, 5, 6, 6]  # the payload sits on the last link
+    point = origin[carrier] + (turn[carrier] @ centre[..., None])[..., 0]  # (7, 3)
     # first moment of all that a joint carries, about a point of its axis
     carried = np.cumsum(mass[::-1])[::-1][:6]
     moment = np.cumsum((mass[:, None] * point)[::-1], axis=0)[::-1][:6]
-    lever = moment - carried[:, None] * frames[:6, :3, 3]
-    return np.cross(frames[:6, :3, 2], lever)
+    return np.cross(turn[:6, :, 2], moment - carried[:, None] * origin[:6])

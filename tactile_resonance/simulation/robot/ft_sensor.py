@@ -8,8 +8,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.simulation.plant import cross
-from tactile_resonance.simulation.robot.poses import moved_wrench
+from tactile_resonance.simulation.noise import NormalRows
+from tactile_resonance.simulation.robot.poses import (
+    ORIGIN,
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    cross,
+    difference,
+    rotated,
+    rotated_back,
+)
 from tactile_resonance.simulation.robot.target import CYCLE_S
 
 FloatArray = NDArray[np.float64]
@@ -51,28 +61,31 @@ class Payload:
     Attributes
     ----------
     mass_kg : float
-    cog_m : (3,) array
+    cog_m : Vector
         Centre of gravity in the flange.
-    inertia_kg_m2 : (6,) array
+    inertia_kg_m2 : 6 floats
         Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of gravity.
     """
 
     mass_kg: float = 0.0
-    cog_m: FloatArray = field(default_factory=lambda: np.zeros(3))
-    inertia_kg_m2: FloatArray = field(default_factory=lambda: np.zeros(6))
+    cog_m: Vector = ORIGIN
+    inertia_kg_m2: Six = ZERO
 
-    def weight(self, flange: FloatArray, gravity_m_s2: FloatArray) -> FloatArray:
-        """Return its weight as a wrench (6,) on the flange, in the flange's frame.
+    def weight(self, flange: Turn, gravity_m_s2: Vector) -> Six:
+        """Return its weight as a wrench on the flange, in the flange's frame.
 
         Parameters
         ----------
-        flange : (4, 4) array
-            Flange in the base.
-        gravity_m_s2 : (3,) array
+        flange : Turn
+            Rotation of the flange in the base.
+        gravity_m_s2 : Vector
             Acceleration of free fall in the base.
         """
-        force = flange[:3, :3].T @ gravity_m_s2 * self.mass_kg
-        return np.concatenate([force, cross(self.cog_m, force)])
+        if self.mass_kg == 0.0:
+            return ZERO
+        x, y, z = rotated_back(flange, gravity_m_s2)
+        force = (x * self.mass_kg, y * self.mass_kg, z * self.mass_kg)
+        return *force, *cross(self.cog_m, force)
 
 
 class FtSensor:
@@ -82,50 +95,61 @@ class FtSensor:
 
     Attributes
     ----------
-    raw : (6,) array
+    raw : 6 floats
         Measured at the flange, in its frame, nothing compensated (``ft_raw_wrench``).
     """
 
-    def __init__(self, specification: FtSpecification, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._offset = specification.accuracy / 2 * rng.standard_normal(6)
+    def __init__(self, specification: FtSpecification, random: np.random.Generator) -> None:
+        self._offset = (specification.accuracy / 2 * random.standard_normal(6)).tolist()
         sigma = specification.precision / 2
-        self._noise = sigma * np.sqrt(1 - specification.drift_share)
-        drift = sigma * np.sqrt(specification.drift_share)
+        self._noise = (sigma * np.sqrt(1 - specification.drift_share)).tolist()
+        self._drift_rms = sigma * np.sqrt(specification.drift_share)
         self._keep = float(np.exp(-CYCLE_S / specification.drift_time_s))
-        self._kick = drift * np.sqrt(1 - self._keep**2)
-        self._drift = drift * rng.standard_normal(6)
-        self._zero = np.zeros(6)
-        self._free = np.zeros(6)
-        self.raw = np.zeros(6)
+        self._kick = (self._drift_rms * np.sqrt(1 - self._keep**2)).tolist()
+        self.reseed(random)
+        self._zero = ZERO
+        self._free = ZERO
+        self.raw = ZERO
 
-    def step(
-        self, true: FloatArray, payload_weight: FloatArray, external: FloatArray | None = None
-    ) -> None:
-        """Measure for one cycle; all wrenches (6,) at and in the flange.
+    def reseed(self, random: np.random.Generator) -> None:
+        """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
+        self._drift: list[float] = (self._drift_rms * random.standard_normal(6)).tolist()
+        self._rows = NormalRows(random, 12)
+
+    def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
+        """Measure for one cycle; all wrenches at and in the flange.
 
         Parameters
         ----------
-        true : (6,) array
+        true : 6 floats
             What acts on the flange.
-        payload_weight : (6,) array
+        payload_weight : 6 floats
             Weight to be compensated.
-        external : (6,) array, optional
+        external : 6 floats, optional
             Measured by another sensor, to be used in place of this one's reading.
         """
-        noise = self._rng.standard_normal((2, 6))
-        self._drift = self._drift * self._keep + self._kick * noise[0]
-        self.raw = true + self._offset + self._drift + self._noise * noise[1]
-        self._free = (self.raw if external is None else external) - payload_weight
+        noise, keep = self._rows.take(), self._keep
+        kicks = zip(self._drift, self._kick, noise[:6], strict=True)
+        self._drift = [keep * drift + kick * n for drift, kick, n in kicks]
+        parts = zip(true, self._offset, self._drift, self._noise, noise[6:], strict=True)
+        self.raw = tuple([t + offset + drift + rms * n for t, offset, drift, rms, n in parts])
+        self._free = difference(self.raw if external is None else external, payload_weight)
 
     def zero(self) -> None:
         """Take the wrench without payload as zero (``zero_ftsensor``)."""
-        self._zero = self._free.copy()
+        self._zero = self._free
 
-    def at_tcp(self, flange: FloatArray, tcp: FloatArray) -> FloatArray:
-        """Return the compensated wrench (6,) at the TCP, along the axes of the base."""
-        shift = np.eye(4)
-        shift[:3, 3] = -tcp[:3, 3]
-        wrench = moved_wrench(self._free - self._zero, shift)
-        rotation = flange[:3, :3]
-        return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
+    def at_tcp(self, flange: Turn, tcp_m: Vector) -> Six:
+        """Return the compensated wrench at the TCP, along the axes of the base.
+
+        Parameters
+        ----------
+        flange : Turn
+            Rotation of the flange in the base.
+        tcp_m : Vector
+            Place of the TCP in the flange.
+        """
+        fx, fy, fz, mx, my, mz = difference(self._free, self._zero)
+        force = (fx, fy, fz)
+        x, y, z = cross(force, tcp_m)
+        return *rotated(flange, force), *rotated(flange, (mx + x, my + y, mz + z))

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tactile_resonance.simulation.robot.target import CYCLE_S
+from tactile_resonance.simulation.noise import Seed
+from tactile_resonance.simulation.robot.kinematics import Posture
+from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, Six, Vector
+from tactile_resonance.simulation.robot.target import CYCLE_S, rate
 from tactile_resonance.simulation.tracking import Jitter, Lag, TrackingParameters
-
-FloatArray = NDArray[np.float64]
 
 
 class Joints:
@@ -17,35 +15,51 @@ class Joints:
 
     Attributes
     ----------
-    q, qd, qdd : (6,) arrays
-        What the encoders say: angles [rad], speeds [rad/s], accelerations [rad/s^2].
-    tremble_m : (3,) array
+    posture : Posture
+        At the angles that the encoders say [rad]; the same object while they do not change.
+    qd : 6 floats
+        Speeds [rad/s].
+    tremble_m : Vector
         Vibration of the tool in the base, which the encoders do not see.
     """
 
-    def __init__(self, q: FloatArray, tracking: TrackingParameters, seed: int) -> None:
+    def __init__(self, q: Six, tracking: TrackingParameters, seed: Seed) -> None:
         self._tracking = tracking
         self._jitter = Jitter(tracking, CYCLE_S, seed) if tracking.jitter_rms_m > 0 else None
-        self._lag = Lag(tracking, q, CYCLE_S)
-        self.q = self._lag.value
-        self.qd = np.zeros(6)
-        self.qdd = np.zeros(6)
-        self.tremble_m = np.zeros(3)
+        self.posture = Posture(q)
+        self.tremble_m: Vector = ORIGIN
+        self.hold()
 
-    def step(self, target_q: FloatArray, powered: bool) -> None:
+    @property
+    def q(self) -> Six:
+        """Angles [rad]."""
+        return self.posture.q
+
+    @property
+    def qdd(self) -> Six:
+        """Accelerations [rad/s^2]."""
+        return rate(self._slower, self.qd)
+
+    def reseed(self, seed: Seed) -> None:
+        """Tremble from the next step on as a seed says."""
+        if self._jitter is not None:
+            self._jitter.reseed(seed)
+
+    def step(self, target_q: Six, powered: bool) -> None:
         """Follow for one cycle; without power the brakes hold the joints where they are."""
         if not powered:
-            self.qd = self.qdd = np.zeros(6)
+            self._slower = self.qd = ZERO
             return
-        before, slower = self.q, self.qd
-        self.q = self._lag.step(target_q)
-        self.qd = (self.q - before) / CYCLE_S
-        self.qdd = (self.qd - slower) / CYCLE_S
+        before, self._slower = self.posture.q, self.qd
+        q = self._lag.step(target_q)
+        if q != before:
+            self.posture = Posture(q)
+        self.qd = ZERO if q == before else rate(before, q)
         if self._jitter is not None:
             self.tremble_m = self._jitter.step()
 
-    def hold(self) -> FloatArray:
-        """Forget what is pending and return the angles (6,) at which the brakes caught the joints."""
+    def hold(self) -> Six:
+        """Forget what is pending and return the angles at which the brakes caught the joints."""
         self._lag = Lag(self._tracking, self.q, CYCLE_S)
-        self.qd = self.qdd = np.zeros(6)
+        self._slower = self.qd = ZERO
         return self.q

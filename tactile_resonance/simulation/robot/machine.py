@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -10,7 +11,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.robot.compliance import ForceMode
 from tactile_resonance.simulation.robot.ft_sensor import (
     STANDARD_GRAVITY_M_S2,
@@ -19,17 +19,22 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     Payload,
 )
 from tactile_resonance.simulation.robot.joints import Joints
-from tactile_resonance.simulation.robot.kinematics import (
-    forward,
-    jacobian,
-    link_frames,
-    nearest_inverse,
-)
+from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import (
-    inverse_transform,
-    matrix_from_pose,
+    NO_TURN,
+    ZERO,
+    Six,
+    Transform,
+    Vector,
+    cross,
+    difference,
+    dot,
+    largest,
     moved_wrench,
-    pose_from_matrix,
+    rotated_back,
+    rounded,
+    total,
+    transform_from_pose,
 )
 from tactile_resonance.simulation.robot.target import CYCLE_S, MotionLimits, ScriptError, Target
 from tactile_resonance.simulation.tracking import TrackingParameters
@@ -47,15 +52,15 @@ class Environment(Protocol):
 
     Attributes
     ----------
-    force_n, torque_nm : (3,) arrays
+    force_n, torque_nm : Vector
         On the tip and about it, along the axes of the base [N], [N m].
     """
 
-    force_n: FloatArray
-    torque_nm: FloatArray
+    force_n: Vector
+    torque_nm: Vector
 
-    def step(self, tip_pose: Pose, dt_s: float) -> None:
-        """Move the tip to a true pose in the base within `dt_s`."""
+    def step(self, tip: Transform, dt_s: float) -> None:
+        """Move the tip to a true place in the base within `dt_s`."""
         ...
 
 
@@ -99,13 +104,13 @@ class ExternalSensor:
     ----------
     mass_kg : float
         Of the sensor, part of the payload set.
-    offset_m, cog_m : (3,) arrays
+    offset_m, cog_m : Vector
         Where it measures, and its centre of gravity, in the flange.
     """
 
     mass_kg: float
-    offset_m: FloatArray
-    cog_m: FloatArray
+    offset_m: Vector
+    cog_m: Vector
 
 
 class Machine:
@@ -119,61 +124,65 @@ class Machine:
     force_mode : ForceMode
     payload : Payload
         As the program set it.
-    gravity_m_s2 : (3,) array
+    gravity_m_s2 : Vector
         Acceleration of free fall in the base.
     external : ExternalSensor or None
         Set while ``ft_rtde_input_enable`` is on.
-    external_wrench : (6,) array
+    external_wrench : 6 floats
         RTDE input ``external_force_torque``.
-    tcp_force : (6,) array
+    tcp_force : 6 floats
         Measured wrench on the TCP, along the axes of the base, payload and offset compensated.
-    frames : (7, 4, 4) array
-        Base and links at the joints' actual angles.
     """
 
     def __init__(
-        self, config: MachineConfig, environment: Environment | None, rng: np.random.Generator
+        self, config: MachineConfig, environment: Environment | None, random: np.random.Generator
     ) -> None:
         self.config = config
         self.environment = environment
-        self.target = Target(config.start_q, config.limits)
-        self.joints = Joints(config.start_q, config.tracking, int(rng.integers(2**31)))
-        self.sensor = FtSensor(config.ft, rng)
+        start_q = tuple(config.start_q.tolist())
+        self.target = Target(start_q, config.limits)
+        self.joints = Joints(start_q, config.tracking, int(random.integers(2**31)))
+        self.sensor = FtSensor(config.ft, random)
         self.force_mode = ForceMode(self.target)
         self.payload = config.tool
-        self.gravity_m_s2 = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
+        self.gravity_m_s2: Vector = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
         self.external: ExternalSensor | None = None
-        self.external_wrench = np.zeros(6)
-        self.tcp_force = np.zeros(6)
-        self._tip = matrix_from_pose(config.tip_in_flange)
+        self.external_wrench = ZERO
+        self.tcp_force = ZERO
+        self._tip = transform_from_pose(config.tip_in_flange)
         self._rest_cycles = 0
-        self._history: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=HISTORY)
+        self._history: deque[tuple[Six, Six]] = deque(maxlen=HISTORY)
         self._observe()
 
     @property
-    def flange(self) -> FloatArray:
-        """Actual flange in the base, shape (4, 4)."""
-        return self.frames[-1]
+    def posture(self) -> Posture:
+        """Actual posture of the arm."""
+        return self.joints.posture
 
     @property
-    def tcp(self) -> FloatArray:
-        """Actual TCP in the base, shape (4, 4)."""
-        return self.flange @ self.target.tcp
+    def tcp(self) -> Transform:
+        """Actual TCP in the base."""
+        return self.posture.tool(self.target.tcp)
 
     @property
-    def tcp_twist(self) -> FloatArray:
-        """Actual twist of the TCP in the base, shape (6,)."""
-        return jacobian(self.frames, self.tcp[:3, 3]) @ self.joints.qd
+    def tcp_twist(self) -> Six:
+        """Actual twist of the TCP in the base [m/s, rad/s]."""
+        return self.posture.twist(self.tcp[1], self.joints.qd)
 
     @property
-    def outer_torque(self) -> FloatArray:
-        """Torques (6,) [N m] of the joints against the measured force on the tool."""
-        return -jacobian(self.frames, self.tcp[:3, 3]).T @ self.tcp_force
+    def outer_torque(self) -> Six:
+        """Torques [N m] of the joints against the measured force on the tool."""
+        return difference(ZERO, self.posture.torques(self.tcp[1], self.tcp_force))
 
     @property
     def steady(self) -> bool:
         """At rest, with no speed asked for, for half a second."""
         return self._rest_cycles >= STEADY_CYCLES
+
+    def reseed(self, random: np.random.Generator) -> None:
+        """Take vibration and noise of the sensor from a generator, from the next step on."""
+        self.joints.reseed(int(random.integers(2**31)))
+        self.sensor.reseed(random)
 
     def comply(self) -> None:
         """Let force mode move the target aside; raises as `Target.command`."""
@@ -183,7 +192,7 @@ class Machine:
         """Follow the target for one cycle and feel what the tool touches."""
         self.target.end_cycle()
         self.joints.step(self.target.q, powered)
-        self._rest_cycles = 0 if self.target.qd.any() else self._rest_cycles + 1
+        self._rest_cycles = 0 if any(self.target.qd) else self._rest_cycles + 1
         self._observe()
 
     def catch_with_brakes(self) -> None:
@@ -191,31 +200,29 @@ class Machine:
         self.force_mode.end()
         self.target.hold(self.joints.hold())
 
-    def solve(self, tool: FloatArray, q_near: FloatArray | None = None) -> FloatArray | None:
-        """Return joint angles (6,) that bring the TCP to a transform (4, 4); None out of reach."""
-        flange = tool @ inverse_transform(self.target.tcp)
-        near = self.joints.q if q_near is None else q_near
-        return nearest_inverse(flange, near, self.config.limits.joint_range_rad)
+    def solve(self, tool: Transform, q_near: Six | None = None) -> Six | None:
+        """Return joint angles that bring the TCP to a place in the base; None out of reach."""
+        return self.target.solve(tool, self.joints.q if q_near is None else q_near)
 
-    def solved(self, tool: FloatArray, q_near: FloatArray | None = None) -> FloatArray:
+    def solved(self, tool: Transform, q_near: Six | None = None) -> Six:
         """Return joint angles as `solve`; raises ScriptError out of reach."""
         q = self.solve(tool, q_near)
         if q is None:
             raise ScriptError(
-                f"get_inverse_kin: no joint angles reach the position {np.round(tool[:3, 3], 4)} m"
+                f"get_inverse_kin: no joint angles reach the position {rounded(tool[1])} m"
             )
         return q
 
-    def within_limits(self, q: FloatArray | None) -> bool:
+    def within_limits(self, q: Six | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
         limits = self.config.limits
-        if q is None or np.abs(q).max() > limits.joint_range_rad:
+        if q is None or largest(q) > limits.joint_range_rad:
             return False
-        place = (forward(q) @ self.target.tcp)[:3, 3]
+        place = Posture(q).tool(self.target.tcp)[1]
         return all(plane.beyond(place) <= 0.0 for plane in limits.planes)
 
-    def past_joints(self, steps: int) -> FloatArray:
-        """Return the joint angles (6,) of some cycles ago.
+    def past_joints(self, steps: int) -> Six:
+        """Return the joint angles of some cycles ago.
 
         Raises
         ------
@@ -229,52 +236,53 @@ class Machine:
             )
         return self._history[-1 - steps][0]
 
-    def contact_steps(self, direction: FloatArray) -> int:
+    def contact_steps(self, direction: Vector) -> int:
         """Return how many cycles ago the tool began to press along a direction; 0 without contact.
 
         Parameters
         ----------
-        direction : (3,) array
+        direction : Vector
             In the base; zero for any direction.
         """
-        length = float(np.linalg.norm(direction))
+        length = math.hypot(*direction)
         threshold = self.config.contact_force_n
 
-        def pressing(force: FloatArray) -> float:
-            if length == 0.0:
-                return float(np.linalg.norm(force))
-            return float(-(force @ direction)) / length
+        def pressing(wrench: Six) -> float:
+            x, y, z = wrench[:3]
+            return math.hypot(x, y, z) if length == 0.0 else -dot((x, y, z), direction) / length
 
-        if pressing(self.tcp_force[:3]) < threshold:
+        if pressing(self.tcp_force) < threshold:
             return 0
         steps = 0
-        for _, force in reversed(self._history):
-            if pressing(force) < threshold / 3:
+        for _, wrench in reversed(self._history):
+            if pressing(wrench) < threshold / 3:
                 break
             steps += 1
         return min(max(1, steps), len(self._history) - 1)
 
     def _observe(self) -> None:
-        self.frames = link_frames(self.joints.q)
-        wrench = self.config.tool.weight(self.flange, self.gravity_m_s2)
+        """Touch what is there with the tip and measure the wrench at the flange."""
+        turn = self.posture.flange[0]
+        wrench = self.config.tool.weight(turn, self.gravity_m_s2)
         if self.environment is not None:
-            tip = self.flange @ self._tip
-            tip[:3, 3] += self.joints.tremble_m
-            self.environment.step(Pose.from_vector(pose_from_matrix(tip)), CYCLE_S)
-            felt = np.concatenate([self.environment.force_n, self.environment.torque_nm])
-            # from the tip's place and the base's axes to those of the flange
-            place = np.eye(4)
-            place[:3, :3] = self.flange[:3, :3].T
-            place[:3, 3] = self._tip[:3, 3]
-            wrench = wrench + moved_wrench(felt, place)
-        weight = self.payload.weight(self.flange, self.gravity_m_s2)
-        if self.external is None:
-            self.sensor.step(wrench, weight)
-        else:
-            place = np.eye(4)
-            place[:3, 3] = self.external.offset_m
+            wrench = total(wrench, self._touch(self.environment))
+        weight = self.payload.weight(turn, self.gravity_m_s2)
+        measured = None
+        if self.external is not None:
             own = Payload(self.external.mass_kg, self.external.cog_m)
-            weight = weight - own.weight(self.flange, self.gravity_m_s2)
-            self.sensor.step(wrench, weight, moved_wrench(self.external_wrench, place))
-        self.tcp_force = self.sensor.at_tcp(self.flange, self.target.tcp)
-        self._history.append((self.joints.q, self.tcp_force[:3]))
+            weight = difference(weight, own.weight(turn, self.gravity_m_s2))
+            measured = moved_wrench(self.external_wrench, (NO_TURN, self.external.offset_m))
+        self.sensor.step(wrench, weight, measured)
+        self.tcp_force = self.sensor.at_tcp(turn, self.target.tcp[1])
+        self._history.append((self.posture.q, self.tcp_force))
+
+    def _touch(self, environment: Environment) -> Six:
+        """Move the tip; return the wrench of what it touches on the flange, in the flange's frame."""
+        turn, (x, y, z) = self.posture.tool(self._tip)
+        dx, dy, dz = self.joints.tremble_m
+        environment.step((turn, (x + dx, y + dy, z + dz)), CYCLE_S)
+        flange = self.posture.flange[0]
+        force = rotated_back(flange, environment.force_n)
+        tx, ty, tz = rotated_back(flange, environment.torque_nm)
+        mx, my, mz = cross(self._tip[1], force)
+        return *force, tx + mx, ty + my, tz + mz

@@ -5,18 +5,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.simulation.robot import motion
-from tactile_resonance.simulation.robot.kinematics import forward
+from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.machine import Machine
-from tactile_resonance.simulation.robot.poses import matrix_from_pose
+from tactile_resonance.simulation.robot.poses import (
+    NO_TURN,
+    ZERO,
+    Six,
+    Transform,
+    Vector,
+    rotated,
+    transform_from_pose,
+)
 from tactile_resonance.simulation.robot.script import Script, Thread
 from tactile_resonance.simulation.robot.target import CYCLE_S, ScriptError, Target
 
-FloatArray = NDArray[np.float64]
-SpeedMotion = Callable[[Target, FloatArray, float, float], Thread]
+SpeedMotion = Callable[[Target, Six, float, float], Thread]
 
 # Set by the contact thread for the main loop: go back to where the contact began.
 CONTACT_FOUND = 254
@@ -35,14 +39,9 @@ class MotionCommands:
         self._target = machine.target
         # linear or in the joints; the client's program sets this by asynchronous stops alone
         self._stop_linear = False
-        self._speed: tuple[SpeedMotion, FloatArray, float, float] = (
-            motion.speedl,
-            np.zeros(6),
-            0.5,
-            0.5,
-        )
-        self._servo: tuple[FloatArray, float, float] = (self._target.q, CYCLE_S, 0.1)
-        self._jog_twist = np.zeros(6)
+        self._speed: tuple[SpeedMotion, Six, float, float] = (motion.speedl, ZERO, 0.5, 0.5)
+        self._servo: tuple[Six, float, float] = (self._target.q, CYCLE_S, 0.1)
+        self._jog_twist = ZERO
         self._contact_steps = 0
 
     def movej(self) -> Thread:
@@ -51,21 +50,21 @@ class MotionCommands:
 
     def movej_pose(self) -> Thread:
         """Move the joints to where the TCP has a pose."""
-        return self._movej(self._machine.solved(matrix_from_pose(self._script.doubles(0))))
+        return self._movej(self._machine.solved(transform_from_pose(self._script.doubles(0))))
 
     def movel(self) -> Thread:
         """Move straight to a pose."""
-        return self._movel(matrix_from_pose(self._script.doubles(0)))
+        return self._movel(transform_from_pose(self._script.doubles(0)))
 
     def movel_joints(self) -> Thread:
         """Move straight to the pose of joint angles."""
-        return self._movel(forward(self._script.doubles(0)) @ self._target.tcp)
+        return self._movel(Posture(self._script.doubles(0)).tool(self._target.tcp))
 
-    def _movej(self, goal: FloatArray) -> Thread:
+    def _movej(self, goal: Six) -> Thread:
         speed, acceleration = self._script.double(6), self._script.double(7)
         return self._move(motion.movej(self._target, goal, acceleration, speed))
 
-    def _movel(self, goal: FloatArray) -> Thread:
+    def _movel(self, goal: Transform) -> Thread:
         speed, acceleration = self._script.double(6), self._script.double(7)
         return self._move(motion.movel(self._target, goal, acceleration, speed))
 
@@ -135,9 +134,9 @@ class MotionCommands:
 
     def servol(self) -> None:
         """Follow poses, each taken as the joint angles nearest to the actual ones."""
-        self._servo_to(self._machine.solved(matrix_from_pose(self._script.doubles(0))))
+        self._servo_to(self._machine.solved(transform_from_pose(self._script.doubles(0))))
 
-    def _servo_to(self, goal: FloatArray) -> None:
+    def _servo_to(self, goal: Six) -> None:
         script = self._script
         gain = script.double(10)
         if not 100 <= gain <= 2000:
@@ -158,7 +157,7 @@ class MotionCommands:
     def move_until_contact(self) -> Thread:
         """Move with a twist until the tool touches something, and back to where it did."""
         script = self._script
-        speed, direction, acceleration = script.doubles(0), script.doubles(6, 3), script.double(12)
+        speed, direction, acceleration = script.doubles(0), script.vector(6), script.double(12)
         while (steps := self._machine.contact_steps(direction)) == 0:
             yield from motion.speedl(self._target, speed, acceleration, CYCLE_S)
         yield from self._return(steps)
@@ -167,22 +166,22 @@ class MotionCommands:
         """Stop, and go back to where the arm was some cycles ago."""
         q = self._machine.past_joints(steps)
         yield from motion.stopl(self._target, CONTACT_STOP)
-        goal = forward(q) @ self._target.tcp
+        goal = Posture(q).tool(self._target.tcp)
         yield from motion.movel(self._target, goal, MOVE_ACCELERATION, MOVE_SPEED)
 
     def start_contact(self) -> None:
         """Watch for a contact along a direction; zero: along the motion."""
         self._script.kill("contact")
-        self._script.run("contact", self._watching(self._script.doubles(0, 3)))
+        self._script.run("contact", self._watching(self._script.vector(0)))
 
-    def _watching(self, direction: FloatArray) -> Thread:
+    def _watching(self, direction: Vector) -> Thread:
         """Wait until nothing is touched, then for a contact; zero: along the motion."""
         self._contact_steps = 0
-        follow = not direction.any()
+        follow = not any(direction)
 
         def steps() -> int:
-            along = self._target.twist[:3] if follow else direction
-            return self._machine.contact_steps(along)
+            x, y, z = self._target.twist[:3] if follow else direction
+            return self._machine.contact_steps((x, y, z))
 
         while steps() > 0:
             yield
@@ -208,12 +207,12 @@ class MotionCommands:
     def start_jog(self) -> None:
         """Move with a twist in the base, the tool or another frame."""
         script = self._script
-        axes = [np.eye(3), self._machine.tcp[:3, :3], matrix_from_pose(script.doubles(8))[:3, :3]]
+        axes = [NO_TURN, self._machine.tcp[0], transform_from_pose(script.doubles(8))[0]]
         feature = round(script.double(6))
         if feature not in (0, 1, 2):
             raise ScriptError(f"jog: feature {feature}; accepted are 0 base, 1 tool, 2 custom")
-        twist = script.doubles(0)
-        self._jog_twist = np.concatenate([axes[feature] @ twist[:3], axes[feature] @ twist[3:]])
+        turn = axes[feature]
+        self._jog_twist = (*rotated(turn, script.vector(0)), *rotated(turn, script.vector(3)))
         if "jog" not in script.threads:
             script.run("jog", self._jogging(script.double(7)))
 

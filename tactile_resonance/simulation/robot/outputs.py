@@ -8,21 +8,24 @@ gravity alone. Currents are torques over an assumed constant, without friction o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.simulation.robot.dynamics import gravity_torque, momentum
 from tactile_resonance.simulation.robot.machine import Machine
 from tactile_resonance.simulation.robot.ports import Ports
-from tactile_resonance.simulation.robot.poses import pose_from_matrix
+from tactile_resonance.simulation.robot.poses import (
+    Six,
+    Vector,
+    pose_from_transform,
+    rotated_back,
+    total,
+)
 from tactile_resonance.simulation.robot.registers import REGISTER_COUNT, Registers
 from tactile_resonance.simulation.robot.safety import RobotMode, Safety
 
-FloatArray = NDArray[np.float64]
 OutputValue = float | int | list[float] | list[int]
 
 # Joint torque per motor current [N m/A]; the maker publishes none.
@@ -67,29 +70,30 @@ class Outputs:
 
     def value(self, name: str) -> OutputValue:
         """Return an output: an int or a float, for vectors a list of them. Raises KeyError."""
-        if name not in _OUTPUTS:
+        if name not in READERS:
             raise KeyError(f"RTDE output {name!r}: not known")
-        value = _OUTPUTS[name][1](self)
-        return value.tolist() if isinstance(value, np.ndarray) else value
+        value = READERS[name](self)
+        return list(value) if isinstance(value, tuple) else value
 
     @cached_property
-    def target_moment(self) -> FloatArray:
-        """Torques (6,) that hold the arm at its target."""
+    def target_moment(self) -> Six:
+        """Torques that hold the arm at its target."""
         machine = self.robot.machine
-        return gravity_torque(machine.target.frames, machine.gravity_m_s2, machine.payload)
+        return gravity_torque(machine.target.posture, machine.gravity_m_s2, machine.payload)
 
     @cached_property
-    def actual_moment(self) -> FloatArray:
-        """Torques (6,) that hold the arm against gravity and against what pushes the tool."""
+    def actual_moment(self) -> Six:
+        """Torques that hold the arm against gravity and against what pushes the tool."""
         machine = self.robot.machine
-        held = gravity_torque(machine.frames, machine.gravity_m_s2, machine.payload)
-        return held + machine.outer_torque
+        held = gravity_torque(machine.posture, machine.gravity_m_s2, machine.payload)
+        return total(held, machine.outer_torque)
 
     @property
-    def tool_accelerometer(self) -> FloatArray:
-        """What an accelerometer at rest in the flange feels (3,) [m/s^2]."""
+    def tool_accelerometer(self) -> Vector:
+        """What an accelerometer at rest in the flange feels [m/s^2]."""
         machine = self.robot.machine
-        return -(machine.flange[:3, :3].T @ machine.gravity_m_s2)
+        x, y, z = rotated_back(machine.posture.flange[0], machine.gravity_m_s2)
+        return -x, -y, -z
 
     @property
     def status_bits(self) -> int:
@@ -103,23 +107,28 @@ class Outputs:
         return [JOINT_RUNNING if self.robot.safety.powered else JOINT_POWER_OFF] * 6
 
 
-Reader = Callable[[Outputs], FloatArray | OutputValue]
+def _currents(moment: Six) -> Six:
+    """Motor currents [A] of joint torques [N m]."""
+    return tuple([torque / TORQUE_PER_CURRENT for torque in moment])
+
+
+Reader = Callable[[Outputs], tuple[float, ...] | OutputValue]
 
 _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "timestamp": ("DOUBLE", lambda o: o.robot.time_s + o.robot.stood_still_s),
     "target_q": ("VECTOR6D", lambda o: o.robot.machine.target.q),
     "target_qd": ("VECTOR6D", lambda o: o.robot.machine.target.qd),
     "target_qdd": ("VECTOR6D", lambda o: o.robot.machine.target.qdd),
-    "target_current": ("VECTOR6D", lambda o: o.target_moment / TORQUE_PER_CURRENT),
+    "target_current": ("VECTOR6D", lambda o: _currents(o.target_moment)),
     "target_moment": ("VECTOR6D", lambda o: o.target_moment),
     "actual_q": ("VECTOR6D", lambda o: o.robot.machine.joints.q),
     "actual_qd": ("VECTOR6D", lambda o: o.robot.machine.joints.qd),
     "actual_qdd": ("VECTOR6D", lambda o: o.robot.machine.joints.qdd),
     "actual_moment": ("VECTOR6D", lambda o: o.actual_moment),
-    "actual_current": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
+    "actual_current": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
     "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
-    "joint_control_output": ("VECTOR6D", lambda o: o.actual_moment / TORQUE_PER_CURRENT),
-    "actual_TCP_pose": ("VECTOR6D", lambda o: pose_from_matrix(o.robot.machine.tcp)),
+    "joint_control_output": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
+    "actual_TCP_pose": ("VECTOR6D", lambda o: pose_from_transform(o.robot.machine.tcp)),
     "actual_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.tcp_twist),
     "actual_TCP_force": ("VECTOR6D", lambda o: o.robot.machine.tcp_force),
     "target_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.target.pose),
@@ -140,14 +149,14 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "actual_momentum": (
         "DOUBLE",
         lambda o: momentum(
-            o.robot.machine.frames, o.robot.machine.joints.qd, o.robot.machine.payload
+            o.robot.machine.posture, o.robot.machine.joints.qd, o.robot.machine.payload
         ),
     ),
     "actual_main_voltage": ("DOUBLE", lambda o: MAINS_V),
     "actual_robot_voltage": ("DOUBLE", lambda o: ROBOT_BUS_V if o.robot.safety.powered else 0.0),
     "actual_robot_current": (
         "DOUBLE",
-        lambda o: float(np.abs(o.actual_moment).sum()) / TORQUE_PER_CURRENT,
+        lambda o: sum(map(abs, o.actual_moment)) / TORQUE_PER_CURRENT,
     ),
     "actual_joint_voltage": ("VECTOR6D", lambda o: [ROBOT_BUS_V * o.robot.safety.powered] * 6),
     "runtime_state": ("UINT32", lambda o: int(o.robot.runtime_state)),
@@ -161,13 +170,13 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "payload": ("DOUBLE", lambda o: o.robot.machine.payload.mass_kg),
     "payload_cog": ("VECTOR3D", lambda o: o.robot.machine.payload.cog_m),
     "payload_inertia": ("VECTOR6D", lambda o: o.robot.machine.payload.inertia_kg_m2),
-    "tcp_offset": ("VECTOR6D", lambda o: pose_from_matrix(o.robot.machine.target.tcp)),
+    "tcp_offset": ("VECTOR6D", lambda o: pose_from_transform(o.robot.machine.target.tcp)),
     # no program of the model writes boolean registers
     "output_bit_registers0_to_31": ("UINT32", lambda o: 0),
     "output_bit_registers32_to_63": ("UINT32", lambda o: 0),
     "tcp_force_scalar": (
         "DOUBLE",
-        lambda o: float(np.linalg.norm(o.robot.machine.tcp_force[:3])),
+        lambda o: math.hypot(*o.robot.machine.tcp_force[:3]),
     ),
 }
 
@@ -180,5 +189,6 @@ for _number in range(REGISTER_COUNT):
     _OUTPUTS[f"output_int_register_{_number}"] = ("INT32", _register("int", _number))
     _OUTPUTS[f"output_double_register_{_number}"] = ("DOUBLE", _register("double", _number))
 
-# RTDE types of all outputs, by name.
+# RTDE types of all outputs, and what reads them, by name.
 OUTPUT_TYPES: dict[str, str] = {name: kind for name, (kind, _) in _OUTPUTS.items()}
+READERS: dict[str, Reader] = {name: reader for name, (_, reader) in _OUTPUTS.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
+from typing import Any
 
 PROTOCOL_VERSION = 2
 LONGEST_PAYLOAD = 0xFFFF - 3
@@ -88,20 +89,21 @@ class Layout:
         self._lengths = [_LAYOUT[name][1] for name in types]
         codes = "".join(f"{_LAYOUT[name][1]}{_LAYOUT[name][0]}" for name in types)
         self._struct = struct.Struct(">B" + codes)
+        self._packet = struct.Struct(">HBB" + codes)
         if self._struct.size > LONGEST_PAYLOAD:
             raise ValueError(
                 f"RTDE recipe: {self._struct.size} bytes, expected at most {LONGEST_PAYLOAD}"
             )
 
-    def pack(self, recipe: int, values: Sequence[object]) -> bytes:
+    def pack(self, recipe: int, values: Sequence[Any]) -> bytes:
         """Return a data packet; a vector is a sequence of its length."""
-        flat: list[object] = [recipe]
+        flat: list[Any] = []
         for value, length in zip(values, self._lengths, strict=True):
             if length == 1:
                 flat.append(value)
             else:
-                flat.extend(value)  # type: ignore[arg-type]
-        return packet(Kind.DATA, self._struct.pack(*flat))
+                flat += value
+        return self._packet.pack(self._packet.size, Kind.DATA, recipe, *flat)
 
     def unpack(self, payload: bytes) -> list | None:
         """Return the values of a data packet; None where its size is not that of the recipe."""

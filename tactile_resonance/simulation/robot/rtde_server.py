@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 
 from tactile_resonance.simulation.robot.controller import UrController
-from tactile_resonance.simulation.robot.outputs import OutputValue
+from tactile_resonance.simulation.robot.outputs import READERS, Reader
 from tactile_resonance.simulation.robot.reactor import Connection
 from tactile_resonance.simulation.robot.rtde_packets import (
     PROTOCOL_VERSION,
@@ -25,6 +25,7 @@ CYCLE_HZ = 500.0
 class _Recipe:
     names: tuple[str, ...]
     layout: Layout
+    readers: tuple[Reader, ...] = ()  # of outputs
 
 
 class RtdeServer:
@@ -57,7 +58,7 @@ class RtdeServer:
 
     def publish(self, cycle: int) -> None:
         """Send this cycle's outputs to whom they are due."""
-        known: dict[str, OutputValue] = {}  # what several clients ask for is computed once
+        known: dict[tuple[str, ...], bytes] = {}  # what several clients ask for is computed once
         for service in list(self._services):
             service.publish(cycle, known)
 
@@ -126,20 +127,21 @@ class _Service:
         """Free the inputs."""
         self._server.forget(self)
 
-    def publish(self, cycle: int, known: dict[str, OutputValue]) -> None:
+    def publish(self, cycle: int, known: dict[tuple[str, ...], bytes]) -> None:
         """Send the outputs where they are due; a client that does not read misses them.
 
-        `known` holds outputs of this cycle by name and is added to.
+        `known` holds packets of this cycle by their variables and is added to.
         """
         recipe = self._outputs
         if not self._started or recipe is None or cycle % self._period:
             return
-        outputs = self._server.controller.outputs
-        for name in recipe.names:
-            if name not in known:
-                known[name] = outputs(name)
-        self._newest = recipe.layout.pack(1, [known[name] for name in recipe.names])
-        if self.connection.send(self._newest, droppable=True):
+        data = known.get(recipe.names)
+        if data is None:
+            now = self._server.controller.now
+            values = [read(now) for read in recipe.readers]
+            data = known[recipe.names] = recipe.layout.pack(1, values)
+        self._newest = data
+        if self.connection.send(data, droppable=True):
             controller = self._server.controller
             self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
 
@@ -166,7 +168,7 @@ class _Service:
         types = [known.get(name, "NOT_FOUND") for name in names]
         if "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
-        self._outputs = _Recipe(names, Layout(types))
+        self._outputs = _Recipe(names, Layout(types), tuple(READERS[name] for name in names))
         return b"\x01" + ",".join(types).encode()
 
     def _set_up_inputs(self, payload: bytes) -> bytes:

@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tactile_resonance.simulation.robot.poses import Vector
 from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.target import ScriptError
 
-FloatArray = NDArray[np.float64]
 # Steps once in a cycle, until it is done.
 Thread = Generator[None, None, None]
 
@@ -68,10 +65,15 @@ class Script:
 
     def double(self, number: int) -> float:
         """Return a double input register; raises as `doubles`."""
-        return float(self.doubles(number, 1)[0])
+        return self.doubles(number, 1)[0]
 
-    def doubles(self, number: int, count: int = 6) -> FloatArray:
-        """Return double input registers, shape (count,).
+    def vector(self, number: int) -> Vector:
+        """Return three double input registers; raises as `doubles`."""
+        x, y, z = self.doubles(number, 3)
+        return x, y, z
+
+    def doubles(self, number: int, count: int = 6) -> tuple[float, ...]:
+        """Return double input registers.
 
         Raises
         ------
@@ -80,12 +82,13 @@ class Script:
         """
         first = number + self.offset
         values = self._registers.input_double[first : first + count]
-        if not all(abs(value) <= LARGEST_FIGURE for value in values):
-            raise ScriptError(
-                f"input_double_register_{first}...: {values}; accepted are numbers within "
-                f"+-{LARGEST_FIGURE:g}"
-            )
-        return np.array(values, dtype=float)
+        for value in values:
+            if not -LARGEST_FIGURE <= value <= LARGEST_FIGURE:
+                raise ScriptError(
+                    f"input_double_register_{first}...: {values}; accepted are numbers within "
+                    f"+-{LARGEST_FIGURE:g}"
+                )
+        return tuple(values)
 
     def status(self, value: int) -> None:
         """Write the state of the command loop."""
@@ -95,9 +98,9 @@ class Script:
         """Write an integer result."""
         self._registers.output_int[1 + self.offset] = int(value)
 
-    def answer_doubles(self, values: FloatArray) -> None:
+    def answer_doubles(self, values: Iterable[float]) -> None:
         """Write a vector result."""
-        for place, value in enumerate(values.tolist()):
+        for place, value in enumerate(values):
             self._registers.output_double[place + self.offset] = value
 
     def begin_asynchronous(self) -> None:

@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_resonance.simulation.robot import motion
 from tactile_resonance.simulation.robot.compliance import ForceTask
 from tactile_resonance.simulation.robot.ft_sensor import Payload
-from tactile_resonance.simulation.robot.kinematics import forward
+from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.machine import ExternalSensor, Machine
-from tactile_resonance.simulation.robot.poses import matrix_from_pose, pose_from_matrix
+from tactile_resonance.simulation.robot.poses import (
+    Six,
+    Transform,
+    pose_from_transform,
+    product,
+    transform_from_pose,
+)
 from tactile_resonance.simulation.robot.script import Script, Thread
 from tactile_resonance.simulation.robot.target import CYCLE_S, ProtectiveStop, ScriptError
-
-FloatArray = NDArray[np.float64]
 
 # Deceleration [m/s^2] of the stop that ends force mode.
 FORCE_MODE_STOP = 10.0
@@ -32,9 +33,9 @@ class SettingCommands:
     def force_mode(self) -> None:
         """Give way along chosen axes until pressing with a wrench."""
         script = self._script
-        selection = np.array([script.integer(2 + axis) == 1 for axis in range(6)])
+        selection = tuple([script.integer(2 + axis) == 1 for axis in range(6)])
         task = ForceTask(
-            script.doubles(0), selection, script.doubles(6), script.integer(1), script.doubles(12)
+            self._pose(), selection, script.doubles(6), script.integer(1), script.doubles(12)
         )
         self._machine.force_mode.begin(task)
 
@@ -65,30 +66,31 @@ class SettingCommands:
         """Set the payload with its inertia."""
         self._set_payload(self._script.doubles(4))
 
-    def _set_payload(self, inertia: FloatArray) -> None:
-        mass, cog = self._script.double(0), self._script.doubles(1, 3)
+    def _set_payload(self, inertia: Six) -> None:
+        mass, cog = self._script.double(0), self._script.vector(1)
         if not mass >= 0.0:
             raise ScriptError(f"set_payload: mass {mass:g}; accepted is 0 kg or above")
-        if not cog.any():  # the client's program keeps the centre of gravity then
+        if not any(cog):  # the client's program keeps the centre of gravity then
             cog = self._machine.payload.cog_m
         self._machine.payload = Payload(mass, cog, inertia)
 
     def set_tcp(self) -> None:
         """Set the TCP in the flange."""
-        self._target.tcp = matrix_from_pose(self._script.doubles(0))
+        self._target.tcp = self._pose()
 
     def set_gravity(self) -> None:
         """Set the direction of gravity."""
         # the script's vector points against the fall: (0, 0, 9.82) for an arm on the floor
-        self._machine.gravity_m_s2 = -self._script.doubles(0, 3)
+        x, y, z = self._script.vector(0)
+        self._machine.gravity_m_s2 = (-x, -y, -z)
 
     def tool_contact(self) -> None:
         """How many cycles ago a contact began, 0 without contact."""
-        self._script.answer(self._machine.contact_steps(self._script.doubles(0, 3)))
+        self._script.answer(self._machine.contact_steps(self._script.vector(0)))
 
     def step_time(self) -> None:
         """The control period."""
-        self._script.answer_doubles(np.array([CYCLE_S]))
+        self._script.answer_doubles([CYCLE_S])
 
     def past_joints(self) -> None:
         """Joint angles of some cycles ago."""
@@ -102,27 +104,26 @@ class SettingCommands:
 
     def flange_pose(self) -> None:
         """Actual pose of the flange."""
-        self._script.answer_doubles(pose_from_matrix(self._machine.flange))
+        self._script.answer_doubles(pose_from_transform(self._machine.posture.flange))
 
     def tcp_offset(self) -> None:
         """Pose of the TCP in the flange."""
-        self._script.answer_doubles(pose_from_matrix(self._target.tcp))
+        self._script.answer_doubles(pose_from_transform(self._target.tcp))
 
     def pose_trans(self) -> None:
         """Product of two poses."""
-        script = self._script
-        product = matrix_from_pose(script.doubles(0)) @ matrix_from_pose(script.doubles(6))
-        script.answer_doubles(pose_from_matrix(product))
+        second = transform_from_pose(self._script.doubles(6))
+        self._script.answer_doubles(pose_from_transform(product(self._pose(), second)))
 
     def actual_forward(self) -> None:
         """Actual pose of the TCP."""
-        self._script.answer_doubles(pose_from_matrix(self._machine.tcp))
+        self._script.answer_doubles(pose_from_transform(self._machine.tcp))
 
     def forward(self) -> None:
         """Pose of a TCP at joint angles."""
         script = self._script
-        tool = forward(script.doubles(0)) @ matrix_from_pose(script.doubles(6))
-        script.answer_doubles(pose_from_matrix(tool))
+        tool = Posture(script.doubles(0)).tool(transform_from_pose(script.doubles(6)))
+        script.answer_doubles(pose_from_transform(tool))
 
     def inverse(self) -> None:
         """Joint angles for a pose, nearest to the actual ones."""
@@ -136,12 +137,12 @@ class SettingCommands:
         """Whether a pose can be reached."""
         self._script.answer(int(self._machine.solve(self._pose()) is not None))
 
-    def _pose(self) -> FloatArray:
-        return matrix_from_pose(self._script.doubles(0))
+    def _pose(self) -> Transform:
+        return transform_from_pose(self._script.doubles(0))
 
     def pose_within_limits(self) -> None:
         """Whether a pose is reachable within the limits of the joints."""
-        q = self._machine.solve(matrix_from_pose(self._script.doubles(0)))
+        q = self._machine.solve(self._pose())
         self._script.answer(int(self._machine.within_limits(q)))
 
     def joints_within_limits(self) -> None:
@@ -168,7 +169,7 @@ class SettingCommands:
         script = self._script
         if script.integer(1) == 1:
             self._machine.external = ExternalSensor(
-                script.double(0), script.doubles(1, 3), script.doubles(4, 3)
+                script.double(0), script.vector(1), script.vector(4)
             )
         else:
             self._machine.external = None

@@ -5,14 +5,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import sub
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tactile_resonance.simulation.robot.kinematics import jacobian, link_frames, nearest_inverse
-from tactile_resonance.simulation.robot.poses import inverse_transform, pose_from_matrix, turned
-
-FloatArray = NDArray[np.float64]
+from tactile_resonance.simulation.robot.kinematics import Posture, nearest_inverse
+from tactile_resonance.simulation.robot.poses import (
+    IDENTITY,
+    NO_TURN,
+    ORIGIN,
+    ZERO,
+    Six,
+    Transform,
+    Turn,
+    Vector,
+    difference,
+    dot,
+    inverse_transform,
+    largest,
+    pose_from_transform,
+    product,
+    rounded,
+    total,
+    transposed,
+    turn_product,
+    turned,
+)
 
 # The control period of an e-series [s].
 CYCLE_S = 0.002
@@ -32,18 +48,19 @@ class SafetyPlane:
 
     Attributes
     ----------
-    point_m : (3,) array
+    point_m : Vector
         A point of it in the base.
-    normal : (3,) array
+    normal : Vector
         Of length 1, to the side where the TCP may be.
     """
 
-    point_m: FloatArray
-    normal: FloatArray
+    point_m: Vector
+    normal: Vector
 
-    def beyond(self, place_m: FloatArray) -> float:
-        """How far a place (3,) is on the wrong side [m]; negative on the right one."""
-        return float(-self.normal @ (place_m - self.point_m))
+    def beyond(self, place_m: Vector) -> float:
+        """How far a place is on the wrong side [m]; negative on the right one."""
+        (x, y, z), (px, py, pz) = place_m, self.point_m
+        return -dot(self.normal, (x - px, y - py, z - pz))
 
 
 @dataclass(frozen=True)
@@ -80,64 +97,77 @@ class Target:
 
     Attributes
     ----------
-    q, qd, qdd : (6,) arrays
-        Target angles [rad], speeds [rad/s], accelerations [rad/s^2].
-    frames : (7, 4, 4) array
-        Base and links at `q`.
-    tcp : (4, 4) array
-        Tool centre point in the flange, as the program set it.
+    posture : Posture
+        At the target angles [rad].
+    qd : 6 floats
+        Target speeds [rad/s].
     pace : float
         Speed slider: share of the programmed speed, above 0 to 1.
     commanded : bool
         Whether the program moved the arm in this cycle.
-    yielded_q : (6,) array
-    yielded_m : (3,) array
-    yielded_turn : (3, 3) array
+    yielded_q : 6 floats
+    yielded_m : Vector
+    yielded_turn : Turn
         All that force mode has moved the target aside so far, of the joints and of the TCP. A path
         goes on beside itself by what was yielded since it began.
-    yield_began_q : (6,) array or None
+    yield_began_q : 6 floats or None
         `yielded_q` when force mode began; None without it.
     """
 
-    def __init__(self, q: FloatArray, limits: MotionLimits) -> None:
+    def __init__(self, q: Six, limits: MotionLimits) -> None:
         self.limits = limits
-        self.tcp = np.eye(4)
+        self._tcp = self._flange_in_tcp = IDENTITY
         self.pace = 1.0
-        self.q = np.array(q, dtype=float)
-        self.qd = np.zeros(6)
-        self.qdd = np.zeros(6)
-        self.frames = link_frames(self.q)
-        self._cycle_qd = self.qd
+        self.posture = Posture(q)
+        self.qd = ZERO
+        self._cycle_qd = ZERO
+        self._accelerated: tuple[Six, Six] = (ZERO, ZERO)  # from and to, in the last whole cycle
         self.commanded = False
-        self.yielded_q = np.zeros(6)
-        self.yielded_m = np.zeros(3)
-        self.yielded_turn = np.eye(3)
-        self.yield_began_q: FloatArray | None = None
+        self.yielded_q = ZERO
+        self.yielded_m: Vector = ORIGIN
+        self.yielded_turn: Turn = NO_TURN
+        self.yield_began_q: Six | None = None
 
     @property
-    def aside_q(self) -> FloatArray:
-        """How far force mode has moved the joints aside since it began (6,); 0 without it."""
-        return np.zeros(6) if self.yield_began_q is None else self.yielded_q - self.yield_began_q
+    def tcp(self) -> Transform:
+        """Tool centre point in the flange, as the program set it."""
+        return self._tcp
+
+    @tcp.setter
+    def tcp(self, value: Transform) -> None:
+        self._tcp, self._flange_in_tcp = value, inverse_transform(value)
 
     @property
-    def tool(self) -> FloatArray:
-        """Transform of the target TCP in the base, shape (4, 4)."""
-        return self.frames[-1] @ self.tcp
+    def q(self) -> Six:
+        """Target angles [rad]."""
+        return self.posture.q
 
     @property
-    def pose(self) -> FloatArray:
-        """Target pose of the TCP in the base, shape (6,)."""
-        return pose_from_matrix(self.tool)
+    def qdd(self) -> Six:
+        """Target accelerations [rad/s^2]."""
+        return rate(*self._accelerated)
 
     @property
-    def jacobian(self) -> FloatArray:
-        """Jacobian of the target TCP, shape (6, 6)."""
-        return jacobian(self.frames, self.tool[:3, 3])
+    def aside_q(self) -> Six:
+        """How far force mode has moved the joints aside since it began; 0 without it."""
+        return (
+            ZERO if self.yield_began_q is None else difference(self.yielded_q, self.yield_began_q)
+        )
 
     @property
-    def twist(self) -> FloatArray:
-        """Target velocity [m/s] and angular velocity [rad/s] of the TCP in the base, shape (6,)."""
-        return self.jacobian @ self.qd
+    def tool(self) -> Transform:
+        """The target TCP in the base."""
+        return self.posture.tool(self._tcp)
+
+    @property
+    def pose(self) -> Six:
+        """Target pose of the TCP in the base."""
+        return pose_from_transform(self.tool)
+
+    @property
+    def twist(self) -> Six:
+        """Target velocity [m/s] and angular velocity [rad/s] of the TCP in the base."""
+        return self.posture.twist(self.tool[1], self.qd)
 
     def begin_cycle(self) -> None:
         """Let one thread of the program move the arm in the cycle that begins."""
@@ -148,10 +178,10 @@ class Target:
         """Brake where nothing moved the arm, and note the acceleration of the cycle."""
         if not self.commanded:
             self.brake(self.limits.brake_rad_s2)
-        self.qdd = (self.qd - self._cycle_qd) / CYCLE_S
+        self._accelerated = self._cycle_qd, self.qd
 
-    def command(self, q: FloatArray, qd: FloatArray, frames: FloatArray | None = None) -> None:
-        """Set target angles and speeds (6,) for this cycle; `frames` where they are known.
+    def command(self, q: Six, qd: Six) -> None:
+        """Set target angles and speeds for this cycle.
 
         Raises
         ------
@@ -160,85 +190,91 @@ class Target:
         ProtectiveStop
             Where a joint would pass its range or its speed, as near a singularity.
         """
-        if self.commanded:
-            raise ScriptError("another thread is already controlling the robot")
-        if frames is None:
-            frames = link_frames(q)
-        self._check(q, frames, qd, (q - self.q) / CYCLE_S)
-        self.commanded = True
-        self._set(q, qd, frames)
+        self._command(Posture(q), qd)
 
-    def command_tool(self, tool: FloatArray, twist: FloatArray) -> None:
-        """Set the target TCP (4, 4) and its twist (6,) for this cycle; raises as `command`."""
-        q = self.solved(tool, self.q)
-        frames = link_frames(q)
-        point = frames[-1] @ self.tcp[:, 3]
-        try:
-            qd = np.linalg.solve(jacobian(frames, point[:3]), twist).astype(float, copy=False)
-        except np.linalg.LinAlgError:
-            raise ProtectiveStop("the path leads through a singularity") from None
-        self.command(q, qd, frames)
+    def command_tool(self, tool: Transform, twist: Six) -> None:
+        """Set the target TCP and its twist for this cycle; raises as `command`."""
+        posture = self._solved(tool)
+        qd = posture.speeds(posture.tool(self._tcp)[1], twist)
+        if qd is None:
+            raise ProtectiveStop("the path leads through a singularity")
+        self._command(posture, qd)
 
-    def shift(self, shift_m: FloatArray, turn_rad: FloatArray) -> None:
+    def stay(self) -> None:
+        """Stand still in this cycle, where the arm stands already; raises as `command`."""
+        self._require_turn()
+        self.commanded, self.qd = True, ZERO
+
+    def shift(self, shift_m: Vector, turn_rad: Vector) -> None:
         """Move the target TCP aside by a compliance, beside what the program commands."""
         before = self.tool
         aside = turned(before, shift_m, turn_rad)
-        q = self.solved(aside, self.q)
-        frames = link_frames(q)
-        self._check(q, frames, (q - self.q) / CYCLE_S)
-        self.yielded_q = self.yielded_q + (q - self.q)
-        self.yielded_m = self.yielded_m + shift_m
-        self.yielded_turn = aside[:3, :3] @ before[:3, :3].T @ self.yielded_turn
-        self._set(q, self.qd, frames)
+        posture = self._solved(aside)
+        self._check(posture)
+        self.yielded_q = total(self.yielded_q, difference(posture.q, self.q))
+        x, y, z = self.yielded_m
+        self.yielded_m = (x + shift_m[0], y + shift_m[1], z + shift_m[2])
+        turn = turn_product(aside[0], transposed(before[0]))
+        self.yielded_turn = turn_product(turn, self.yielded_turn)
+        self.posture = posture
 
     def brake(self, deceleration_rad_s2: float) -> None:
         """Brake by one cycle, all joints in proportion."""
-        fastest = float(np.abs(self.qd).max())
-        if fastest == 0.0:
+        if not any(self.qd):
             return
-        share = max(0.0, 1.0 - deceleration_rad_s2 * CYCLE_S / fastest)
-        slower = self.qd * share
-        q = self.q + (self.qd + slower) / 2 * CYCLE_S
-        limit = self.limits.joint_range_rad
-        self._set(np.clip(q, -limit, limit), slower)
+        share = max(0.0, 1.0 - deceleration_rad_s2 * CYCLE_S / largest(self.qd))
+        limit, way_s = self.limits.joint_range_rad, (1 + share) / 2 * CYCLE_S
+        reached = [q + qd * way_s for q, qd in zip(self.q, self.qd, strict=True)]
+        self.posture = Posture(tuple([max(-limit, min(limit, q)) for q in reached]))
+        self.qd = tuple([qd * share for qd in self.qd])
 
-    def hold(self, q: FloatArray) -> None:
-        """Stand still at joint angles (6,)."""
-        self._set(q, np.zeros(6))
+    def hold(self, q: Six) -> None:
+        """Stand still at joint angles."""
+        self.posture, self.qd = Posture(q), ZERO
 
-    def solved(self, tool: FloatArray, q_near: FloatArray) -> FloatArray:
-        """Return the joint angles (6,) for a TCP (4, 4), nearest to `q_near`.
+    def solve(self, tool: Transform, q_near: Six) -> Six | None:
+        """Return the joint angles for a TCP in the base, nearest to `q_near`; None out of reach."""
+        flange = product(tool, self._flange_in_tcp)
+        return nearest_inverse(flange, q_near, self.limits.joint_range_rad)
 
-        Raises
-        ------
-        ProtectiveStop
-            Where the pose is out of reach.
-        """
-        flange = tool @ inverse_transform(self.tcp)
-        q = nearest_inverse(flange, q_near, self.limits.joint_range_rad)
+    def _solved(self, tool: Transform) -> Posture:
+        """Return the posture for a TCP in the base, nearest to the present one."""
+        q = self.solve(tool, self.q)
         if q is None:
-            raise ProtectiveStop(f"no joint angles reach the position {np.round(tool[:3, 3], 4)} m")
-        return q
+            raise ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
+        return Posture(q)
 
-    def _check(self, q: FloatArray, frames: FloatArray, *speeds: FloatArray) -> None:
+    def _command(self, posture: Posture, qd: Six) -> None:
+        self._require_turn()
+        self._check(posture, qd)
+        self.commanded, self.posture, self.qd = True, posture, qd
+
+    def _require_turn(self) -> None:
+        if self.commanded:
+            raise ScriptError("another thread is already controlling the robot")
+
+    def _check(self, posture: Posture, qd: Six = ZERO) -> None:
+        """Refuse a posture out of limits, and speeds: those given and those with which it is reached."""
         limits = self.limits
         for plane in limits.planes:
-            here = plane.beyond(self.tool[:3, 3])
+            here = plane.beyond(self.tool[1])
             # a TCP found beyond, as after a change of TCP, may only come back
-            if plane.beyond((frames[-1] @ self.tcp)[:3, 3]) > max(0.0, here):
+            if plane.beyond(posture.tool(self._tcp)[1]) > max(0.0, here):
                 raise ProtectiveStop("the tool would pass a safety plane")
-        reached = float(np.abs(q).max())
+        reached = largest(posture.q)
         if reached > limits.joint_range_rad:
             raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")
-        for speed in speeds:
-            fastest = float(np.abs(speed).max())
+        for speeds in (qd, rate(self.posture.q, posture.q)):
+            fastest = largest(speeds)
             # rounding of a finite difference must not stop a joint that moves at its limit
             if fastest > limits.joint_speed_rad_s * (1 + 1e-6):
+                joint = [abs(speed) for speed in speeds].index(fastest) + 1
                 raise ProtectiveStop(
-                    f"joint {int(np.abs(speed).argmax()) + 1} would turn at {fastest:.2f} rad/s, "
+                    f"joint {joint} would turn at {fastest:.2f} rad/s, "
                     f"above its limit of {limits.joint_speed_rad_s:.2f} rad/s"
                 )
 
-    def _set(self, q: FloatArray, qd: FloatArray, frames: FloatArray | None = None) -> None:
-        self.q, self.qd = q, qd
-        self.frames = link_frames(q) if frames is None else frames
+
+def rate(before: Six, now: Six) -> Six:
+    """Return by how much six numbers change in a second, from their change in a cycle."""
+    return tuple([change / CYCLE_S for change in map(sub, now, before)])

@@ -9,12 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.robot.controller import RuntimeState
-from tactile_resonance.simulation.robot.kinematics import forward
-from tactile_resonance.simulation.robot.poses import matrix_from_pose, pose_from_matrix
 from tactile_resonance.simulation.robot.safety import SafetyMode
 
 sys.path.insert(0, str(Path(__file__).parent))
 from commands import SETTLED_S, apart, unpacked
+from matrices import forward, matrix_from_pose, pose_from_matrix
 
 TCP = [0.01, -0.02, 0.15, 0.2, 0.0, -0.3]
 

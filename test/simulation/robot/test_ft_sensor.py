@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The flange sensor: statistics of its errors, weights, offsets, and the place of a wrench."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,10 +16,12 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     Payload,
 )
 from tactile_resonance.simulation.robot.machine import MachineConfig
-from tactile_resonance.simulation.robot.poses import matrix_from_pose, moved_wrench
+from tactile_resonance.simulation.robot.poses import NO_TURN, ORIGIN, ZERO, moved_wrench
 
-NOTHING = np.zeros(6)
-TOOL = Payload(0.5, np.array([0.01, -0.02, 0.06]))
+sys.path.insert(0, str(Path(__file__).parent))
+from matrices import floats, matrix_from_pose, transform
+
+TOOL = Payload(0.5, (0.01, -0.02, 0.06))
 
 
 def assert_deviation(samples: np.ndarray, sigma: np.ndarray) -> None:
@@ -31,7 +36,7 @@ def test_offset_and_repeatability_follow_the_data_sheet_as_read():
     first = []
     for seed in range(400):
         sensor = FtSensor(specification, np.random.default_rng(seed))
-        sensor.step(NOTHING, NOTHING)
+        sensor.step(ZERO, ZERO)
         first.append(sensor.raw)
     # accuracy 4.0 N, 0.3 N m and precision 3.5 N, 0.2 N m at two standard deviations
     total = np.hypot([2.0] * 3 + [0.15] * 3, [1.75] * 3 + [0.1] * 3)
@@ -42,7 +47,7 @@ def test_noise_is_white_beside_a_slow_drift():
     sensor = FtSensor(FtSpecification(), np.random.default_rng(11))
     samples = []
     for _ in range(4001):
-        sensor.step(NOTHING, NOTHING)
+        sensor.step(ZERO, ZERO)
         samples.append(sensor.raw)
     # differences of disjoint pairs: twice the white variance, the drift of 2 ms is negligible
     pairs = np.diff(np.array(samples), axis=0)[::2]
@@ -53,12 +58,12 @@ def test_noise_is_white_beside_a_slow_drift():
 def test_zeroing_takes_the_offset_and_leaves_the_noise():
     sensor = FtSensor(FtSpecification(), np.random.default_rng(5))
     for _ in range(10):
-        sensor.step(NOTHING, NOTHING)
+        sensor.step(ZERO, ZERO)
     sensor.zero()
     readings = []
     for _ in range(2000):
-        sensor.step(NOTHING, NOTHING)
-        readings.append(sensor.at_tcp(np.eye(4), np.eye(4)))
+        sensor.step(ZERO, ZERO)
+        readings.append(sensor.at_tcp(NO_TURN, ORIGIN))
     # the zero itself is one noisy sample; within 4 s the drift is a quarter of its variance at most
     white = np.array([1.75] * 3 + [0.1] * 3) * np.sqrt(0.5)
     assert np.all(np.abs(np.mean(readings, axis=0)) < 5 * white)
@@ -72,7 +77,8 @@ def test_a_wrench_moved_to_another_frame_does_the_same_work():
     rotation, arm = frame[:3, :3], frame[:3, 3]
     turning = rotation @ twist[3:]
     moved_twist = [*(rotation @ twist[:3] - np.cross(turning, arm)), *turning]
-    assert moved_wrench(wrench, frame) @ moved_twist == pytest.approx(wrench @ twist)
+    moved = moved_wrench(floats(wrench), transform(frame))
+    assert np.dot(moved, moved_twist) == pytest.approx(wrench @ twist)
 
 
 def test_a_tool_known_as_payload_weighs_nothing_in_any_attitude(make_client):

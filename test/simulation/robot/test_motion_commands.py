@@ -9,12 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.robot.controller import RuntimeState
-from tactile_resonance.simulation.robot.kinematics import forward
-from tactile_resonance.simulation.robot.poses import pose_from_matrix
 from tactile_resonance.simulation.robot.safety import SafetyMode
 
 sys.path.insert(0, str(Path(__file__).parent))
 from commands import SETTLED_S, apart, unpacked
+from matrices import forward, pose_from_matrix
 
 
 def test_movej_to_a_pose_and_movel_to_joints(client):

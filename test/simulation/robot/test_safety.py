@@ -214,7 +214,7 @@ def test_same_seed_same_robot():
 
 def test_a_safety_plane_stops_the_tool_and_is_known_to_the_queries(make_client):
     height = 0.4
-    plane = SafetyPlane(np.array([0.0, 0.0, height]), np.array([0.0, 0.0, 1.0]))
+    plane = SafetyPlane((0.0, 0.0, height), (0.0, 0.0, 1.0))
     client = make_client(limits=MotionLimits(planes=(plane,)))
     pose = client.output("target_TCP_pose")
     assert pose[2] > height

@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arm against a rubber-like elastic block: what it feels, contact detection, force mode."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import Plane, Plant, RigidTip
-from tactile_resonance.simulation.robot.kinematics import forward
 from tactile_resonance.simulation.robot.machine import MachineConfig
-from tactile_resonance.simulation.robot.poses import matrix_from_pose
 from tactile_resonance.simulation.robot.safety import SafetyMode
 from tactile_resonance.simulation.tissue import Tissue
+
+sys.path.insert(0, str(Path(__file__).parent))
+from matrices import forward, matrix_from_pose
 
 RADIUS_M, MODULUS_PA, POISSON = 0.005, 2e6, 0.49
 TIP = np.array([0.0, 0.0, 0.12, 0.0, 0.0, 0.0])
