@@ -12,6 +12,7 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.housing_path import lowest_on_the_way
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.vectors import rotated
 
 FORCE_SHARE = 2 / 3
 """Of the abort force that may be asked for."""
@@ -44,7 +45,7 @@ def check_goal(
         raise ValueError(
             f"force_n: got {goal.aim.force_n}; accepted is up to {most:g}, two thirds of abort_force_n"
         )
-    box, normal = limits.workspace, goal.touch.rotation.as_matrix()[:, 2]
+    box, normal = limits.workspace, np.array(rotated(goal.touch.turn, (0.0, 0.0, 1.0)))
     for name, height in (
         ("standoff", parameters.standoff_m),
         ("deepest place", -parameters.search_m - limits.depth_m),

@@ -13,10 +13,18 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.vectors import Turn, Vector, dot, rotated, turn_from_vector
+from tactile_resonance.contact.vectors import (
+    Turn,
+    Vector,
+    dot,
+    rotated,
+    transposed,
+    turn_from_vector,
+    vector,
+    vector_from_turn,
+)
 from tactile_resonance.fields import require
 
 
@@ -53,19 +61,6 @@ class TipGeometry:
         rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
         run = self.beam_length_m * math.cos(self.beam_tilt_rad)
         return -run, 0.0, rise - self.housing_below_m
-
-    def clearance(self, depth_m: float, surface_tilt_rad: float = 0.0) -> float:
-        """Height of the housing above the undisturbed surface when pressed in [m].
-
-        Parameters
-        ----------
-        depth_m : float
-            Depth of the robot past the first touch [m].
-        surface_tilt_rad : float
-            By which the surface may rise towards the clamp, against the normal expected [rad].
-        """
-        back, _, up = self.housing_m
-        return self.ball_radius_m + up - depth_m + back * math.tan(surface_tilt_rad)
 
     def housing_height(self, turn: Turn, normal: Vector, height_m: float) -> float:
         """Height of the housing's lower edge above a plane [m].
@@ -115,11 +110,7 @@ def touch_pose(
     along = float(np.linalg.norm(x))
     require(1e-6 < along < math.inf, "towards", towards, "a direction not along the normal")
     x = x / along
-    turn = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+    columns = vector(x), vector(np.cross(z, x)), vector(z)
+    turn = transposed((*columns[0], *columns[1], *columns[2]))
     place = np.asarray(point_m, dtype=float) + ball_radius_m * z
-    return Pose(place, turn.as_rotvec())
-
-
-def misalignment_rad(pose: Pose, goal: Pose) -> float:
-    """Return the angle between two orientations [rad]."""
-    return float((goal.rotation * pose.rotation.inv()).magnitude())
+    return Pose(place, np.array(vector_from_turn(turn)))

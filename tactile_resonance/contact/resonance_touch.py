@@ -10,9 +10,10 @@ is chosen.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from tactile_resonance.fields import require
 
@@ -74,6 +75,9 @@ class ScatterTouch:
             bool(good), "reference", given.shape, f"(n, d), finite, n at least {LEAST_REFERENCE}"
         )
         _check_probability(false_alarm_probability)
+        # contact_node needs no scipy, and starts in two thirds of the time
+        from scipy import special
+
         n, d = given.shape
         self._mean = given.mean(axis=0)
         self._root = np.linalg.inv(np.linalg.cholesky(np.cov(given.T).reshape(d, d)))
@@ -106,7 +110,8 @@ class PolesTouch:
     def __init__(self, false_alarm_probability: float = 1e-6, blocks: int = 3) -> None:
         _check_probability(false_alarm_probability)
         require(blocks >= 1, "blocks", blocks, "1 or above")
-        self._threshold = float(special.chdtri(2, false_alarm_probability))
+        # of the chi-square distribution with two degrees of freedom
+        self._threshold = -2 * math.log(false_alarm_probability)
         self._blocks = blocks
         self._air: list[tuple[FloatArray, FloatArray]] = []
         self._mean: FloatArray = np.zeros(2)

@@ -8,13 +8,15 @@ Numbers are floats in tuples: arithmetic on those of numpy costs a control loop 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from tactile_resonance.contact.vectors import Six, Vector
+from tactile_resonance.contact.vectors import Six, Turn, Vector, turn_from_vector, vector
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,15 @@ class Pose:
     @property
     def rotation(self) -> Rotation:
         """Rotation from this frame into the one that the pose is given in."""
+        # a third of the start of a node that needs no scipy
+        from scipy.spatial.transform import Rotation
+
         return Rotation.from_rotvec(self.rotation_rad)
+
+    @property
+    def turn(self) -> Turn:
+        """The same as a matrix of floats."""
+        return turn_from_vector(vector(self.rotation_rad))
 
 
 class CellSample(NamedTuple):

@@ -144,6 +144,16 @@ def vector_from_turn(turn: Turn) -> Vector:
     return scale * x, scale * y, scale * z
 
 
+def turn_from_quaternion(x: float, y: float, z: float, w: float) -> Turn:
+    """Return the rotation of a quaternion of any length but 0."""
+    length = math.hypot(x, y, z, w)
+    sine = math.hypot(x, y, z)
+    if sine == 0.0:
+        return NO_TURN
+    angle = 2 * math.atan2(sine / length, w / length)
+    return turn_from_vector(scaled(angle / sine, (x, y, z)))
+
+
 def quaternion_from_vector(rotation_rad: Vector) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w) of a rotation vector [rad]."""
     x, y, z = rotation_rad

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from scipy.spatial.transform import Rotation
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
@@ -19,7 +18,7 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.vectors import Vector, quaternion_from_vector
+from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.nodes.conversions import time_message
 
 RosTime = Callable[[int], int]
@@ -48,7 +47,7 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     quaternion = [turn.x, turn.y, turn.z, turn.w]
     if not 0.99 < math.hypot(*quaternion) < 1.01:
         raise ValueError(f"pose: orientation {quaternion}, expected a unit quaternion")
-    axes = Rotation.from_quat(quaternion).as_matrix()
+    axes = np.reshape(turn_from_quaternion(*quaternion), (3, 3))
     given = np.array([request.normal.x, request.normal.y, request.normal.z])
     normal = given if given.any() else axes[:, 2]
     touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], ball_radius_m)

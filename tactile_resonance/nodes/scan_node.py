@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.vectors import rotated, turn_from_quaternion
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -297,12 +297,12 @@ def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
             raise ValueError(
                 f"poses[{index}]: orientation {quaternion}, expected a unit quaternion"
             )
-        normal = Rotation.from_quat(quaternion).apply([0.0, 0.0, 1.0])
+        normal = rotated(turn_from_quaternion(*quaternion), (0.0, 0.0, 1.0))
         points.append(
             ScanPoint(
                 index,
                 (place.x, place.y, place.z),
-                tuple(normal.tolist()),
+                normal,
                 quaternion,
                 f"{scene.name}, point {index + 1}",
             )

@@ -21,12 +21,7 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import require
-from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.robot.poses import (
-    IDENTITY,
-    ORIGIN,
-    Transform,
+from tactile_resonance.contact.vectors import (
     Vector,
     cross,
     dot,
@@ -35,6 +30,9 @@ from tactile_resonance.simulation.robot.poses import (
     turn_from_vector,
     turn_product,
 )
+from tactile_resonance.fields import require
+from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant import Plant
-from tactile_resonance.simulation.robot.poses import Vector
 
 KEEP_STEPS = 30_000
 """A minute at 500 Hz."""

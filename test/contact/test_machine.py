@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.geometry import TipGeometry, misalignment_rad, touch_pose
+from tactile_resonance.contact.geometry import TipGeometry, touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.law import Aim, HoldMode
@@ -64,7 +64,7 @@ def test_all_six_axes_go_to_the_pose_of_the_point():
     )
     assert made.loop.make(ContactGoal(touch, Aim(FORCE_N))).reached
     tip = made.bench.clock.motion.reported
-    assert misalignment_rad(tip, touch) < 0.01
+    assert (touch.rotation * tip.rotation.inv()).magnitude() < 0.01
     normal = touch.rotation.as_matrix()[:, 2]
     way = tip.position_m - touch.position_m
     assert np.linalg.norm(way - (normal @ way) * normal) < 1e-4
@@ -209,10 +209,11 @@ def test_wrong_idea_of_the_arm_is_survived():
 def test_housing_stays_clear_of_the_tissue():
     tip = TipGeometry()
     # 64 mm at 0.17 rad rise 10.8 mm; ball 2.5 mm; housing 6 mm below the beam
-    assert tip.clearance(0.0) == pytest.approx(2.5e-3 + 0.064 * np.sin(0.17) - 6e-3)
-    assert tip.clearance(3e-3) == pytest.approx(tip.clearance(0.0) - 3e-3)
-    assert tip.clearance(0.0, 0.05) == pytest.approx(
-        tip.clearance(0.0) - 0.064 * np.cos(0.17) * np.tan(0.05)
+    up, back = 0.064 * np.sin(0.17) - 6e-3, 0.064 * np.cos(0.17)
+    assert tip.worst_height(0.0, 0.0) == pytest.approx(2.5e-3 + up)
+    assert tip.worst_height(3e-3, 0.0) == pytest.approx(2.5e-3 + up - 3e-3)
+    assert tip.worst_height(0.0, 0.05) == pytest.approx(
+        2.5e-3 + up * np.cos(0.05) - back * np.sin(0.05)
     )
     with pytest.raises(ValueError, match="beam_tilt_rad: got 2"):
         TipGeometry(beam_tilt_rad=2)

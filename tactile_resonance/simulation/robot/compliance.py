@@ -6,17 +6,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tactile_resonance.simulation.robot.poses import (
-    ZERO,
-    Six,
-    Transform,
-    Turn,
-    Vector,
-    cross,
-    dot,
-    rotated,
-    rotated_back,
-)
+from tactile_resonance.contact.vectors import Turn, Vector, cross, dot, rotated, rotated_back
+from tactile_resonance.simulation.robot.poses import ZERO, Six, Transform
 from tactile_resonance.simulation.robot.target import CYCLE_S, ScriptError, Target
 
 # Speed per missing force or torque at a gain scaling of 1 [m/s/N, rad/s/(N m)], and the time constant

@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.simulation.robot.ft_sensor import Payload
 from tactile_resonance.simulation.robot.kinematics import Posture
-from tactile_resonance.simulation.robot.poses import Six, Vector
+from tactile_resonance.simulation.robot.poses import Six
 
 FloatArray = NDArray[np.float64]
 

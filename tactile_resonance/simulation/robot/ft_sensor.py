@@ -8,18 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
 from tactile_resonance.simulation.noise import NormalRows
-from tactile_resonance.simulation.robot.poses import (
-    ORIGIN,
-    ZERO,
-    Six,
-    Turn,
-    Vector,
-    cross,
-    difference,
-    rotated,
-    rotated_back,
-)
+from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, Six, difference
 from tactile_resonance.simulation.robot.target import CYCLE_S
 
 FloatArray = NDArray[np.float64]

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.robot.kinematics import Posture
-from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, Six, Vector
+from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, Six
 from tactile_resonance.simulation.robot.target import CYCLE_S, rate
 from tactile_resonance.simulation.tracking import Jitter, Lag, TrackingParameters
 

@@ -14,14 +14,8 @@ from __future__ import annotations
 import math
 from itertools import product as combinations
 
-from tactile_resonance.simulation.robot.poses import (
-    IDENTITY,
-    Six,
-    Transform,
-    Vector,
-    cross,
-    product,
-)
+from tactile_resonance.contact.vectors import Vector, cross
+from tactile_resonance.simulation.robot.poses import IDENTITY, Six, Transform, product
 
 # Figures of the table. Lengths in m; the twists alpha are 90, 0, 0, 90, -90 and 0 degrees.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.vectors import NO_TURN, Vector, cross, dot, rotated_back
 from tactile_resonance.simulation.robot.compliance import ForceMode
 from tactile_resonance.simulation.robot.ft_sensor import (
     STANDARD_GRAVITY_M_S2,
@@ -21,17 +22,12 @@ from tactile_resonance.simulation.robot.ft_sensor import (
 from tactile_resonance.simulation.robot.joints import Joints
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import (
-    NO_TURN,
     ZERO,
     Six,
     Transform,
-    Vector,
-    cross,
     difference,
-    dot,
     largest,
     moved_wrench,
-    rotated_back,
     rounded,
     total,
     transform_from_pose,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
+from tactile_resonance.contact.vectors import transposed, turn_product
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import (
     ZERO,
@@ -19,9 +20,7 @@ from tactile_resonance.simulation.robot.poses import (
     difference,
     largest,
     total,
-    transposed,
     turn_between,
-    turn_product,
     turned,
 )
 from tactile_resonance.simulation.robot.profile import Trapezoid

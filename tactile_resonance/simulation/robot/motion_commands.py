@@ -5,18 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.robot import motion
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.machine import Machine
-from tactile_resonance.simulation.robot.poses import (
-    NO_TURN,
-    ZERO,
-    Six,
-    Transform,
-    Vector,
-    rotated,
-    transform_from_pose,
-)
+from tactile_resonance.simulation.robot.poses import ZERO, Six, Transform, transform_from_pose
 from tactile_resonance.simulation.robot.script import Script, Thread
 from tactile_resonance.simulation.robot.target import CYCLE_S, ScriptError, Target
 

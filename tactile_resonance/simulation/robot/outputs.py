@@ -13,16 +13,11 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Protocol
 
+from tactile_resonance.contact.vectors import Vector, rotated_back
 from tactile_resonance.simulation.robot.dynamics import gravity_torque, momentum
 from tactile_resonance.simulation.robot.machine import Machine
 from tactile_resonance.simulation.robot.ports import Ports
-from tactile_resonance.simulation.robot.poses import (
-    Six,
-    Vector,
-    pose_from_transform,
-    rotated_back,
-    total,
-)
+from tactile_resonance.simulation.robot.poses import Six, pose_from_transform, total
 from tactile_resonance.simulation.robot.registers import REGISTER_COUNT, Registers
 from tactile_resonance.simulation.robot.safety import RobotMode, Safety
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterable
 
-from tactile_resonance.simulation.robot.poses import Vector
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.target import ScriptError
 

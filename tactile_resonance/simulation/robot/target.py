@@ -7,26 +7,21 @@ import math
 from dataclasses import dataclass
 from operator import sub
 
+from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, dot, transposed, turn_product
 from tactile_resonance.simulation.robot.kinematics import Posture, nearest_inverse
 from tactile_resonance.simulation.robot.poses import (
     IDENTITY,
-    NO_TURN,
     ORIGIN,
     ZERO,
     Six,
     Transform,
-    Turn,
-    Vector,
     difference,
-    dot,
     inverse_transform,
     largest,
     pose_from_transform,
     product,
     rounded,
     total,
-    transposed,
-    turn_product,
     turned,
 )
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from tactile_resonance.contact.vectors import NO_TURN
 from tactile_resonance.simulation.robot.ft_sensor import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
@@ -16,7 +17,7 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     Payload,
 )
 from tactile_resonance.simulation.robot.machine import MachineConfig
-from tactile_resonance.simulation.robot.poses import NO_TURN, ORIGIN, ZERO, moved_wrench
+from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, moved_wrench
 
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import floats, matrix_from_pose, transform
