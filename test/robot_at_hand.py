@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What whoever stands beside a simulated robot can do: its pendant, its emergency stop, its settings."""
 
+import os
 import socket
 import time
 
 from tactile_resonance.simulation.robot.control_port import order
+
+
+def own_host(last):
+    """Address that no other run of the tests uses; `last` tells the robots of one run apart."""
+    return f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.{last}"
 
 
 class RobotAtHand:

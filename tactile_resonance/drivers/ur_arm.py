@@ -57,6 +57,7 @@ class UrArm:
         self._led: SimulatedClock | None = None  # and is told it, while a loop leads it
         self._pending: Command | None = None  # goes with the next word on the time
         self._until_ns = 0
+        self._hurried = False  # something has come under way since the loop said what it needs
         self._said_s = self._heard_s = 0.0  # when the client was told something, the robot heard
         self._client: ClientProcess | None = None
         self._stream: RtdeStream | None = None
@@ -131,7 +132,7 @@ class UrArm:
         self._ask({"name": "connect", "config": self.config.to_dict(), **names})
         self._guard()
         if self._led is not None:
-            self._ask({"name": "lead"})
+            self._take_lead(self._led)
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -213,10 +214,7 @@ class UrArm:
             self._clock = self._led = led
             self._bus_port = bus_port
             self._name_ports()
-            self._ask({"name": "lead"})
-            led.refresh()
-            self._begin_states()
-            self._wait_for_first()
+            self._take_lead(led)
 
     def follow(self) -> None:
         """Leave the time to itself."""
@@ -246,8 +244,7 @@ class UrArm:
         command, self._pending = self._pending or Command(NOTHING), None
 
         def check() -> None:
-            client.check()
-            client.exchange.beat()
+            client.look()
             self._read()  # a robot whose time stands says so
             if while_waiting is not None:
                 while_waiting()
@@ -255,6 +252,8 @@ class UrArm:
         try:
             with self._speaking:
                 self._until_ns, self._said_s = time_ns, time.monotonic()
+                if self._hurried:
+                    demand, self._hurried = Demand.FAST, False
                 client.send(command._replace(until_ns=time_ns, demand=int(demand)))
             while led.now_ns() < time_ns:
                 led.wait_told(check)
@@ -268,9 +267,17 @@ class UrArm:
         client = self._client
         if self._led is not None and client is not None:
             with contextlib.suppress(ArmError), self._speaking:
+                self._hurried = True  # the loop may be about to say that it needs no time
                 client.send(Command(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
 
     # parts of these
+
+    def _take_lead(self, led: SimulatedClock) -> None:
+        """Time stands from here on, and states are dated on the clock that is told it."""
+        self._ask({"name": "lead"})
+        led.refresh()
+        self._begin_states()
+        self._wait_for_first()
 
     @property
     def _time_name(self) -> str:
@@ -293,6 +300,8 @@ class UrArm:
         self._states.guard(False)
         self._ask({"name": "restart"})
         self._guard()
+        if self._led is not None:
+            self._take_lead(self._led)
         return True
 
     def _begin(self) -> None:
@@ -418,7 +427,7 @@ class UrArm:
         """Return the newest state, and show the client that its owner lives."""
         if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        self._client.check()
+        self._client.look()
         self._read()
         states, config = self._states, self.config
         sample = states.sample

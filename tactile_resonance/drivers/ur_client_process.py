@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -47,6 +48,8 @@ class ClientProcess:
                 ArmFault.CLIENT_DIED, "ur_rtde is not installed: pip install 'ur-rtde>=1.6.5,<1.7'"
             )
         self._host, self._connect_timeout_s = config.host, config.connect_timeout_s
+        self._using = threading.Lock()  # one thread may end it while another waits for it
+        self._ended = False
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with tempfile.TemporaryFile() as page, theirs:
             page.truncate(SIZE)
@@ -74,10 +77,13 @@ class ClientProcess:
         """Of the process."""
         return self._process.pid
 
-    def check(self) -> None:
-        """Raise `ArmError` where the client is gone."""
-        if self._process.poll() is not None:
-            raise self._death()
+    def look(self) -> None:
+        """Tell the client that its owner lives; raise `ArmError` where it is gone."""
+        with self._using:
+            if not self._ended and self._process.poll() is None:
+                self.exchange.beat()
+                return
+        raise self._death()
 
     def send(self, command: Command) -> None:
         """Send a command and do not wait. Raises ArmError where the client is gone."""
@@ -128,8 +134,10 @@ class ClientProcess:
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()
-        for resource in (self._commands, self.exchange, self._errors):
-            resource.close()
+        with self._using:
+            self._ended = True
+            for resource in (self._commands, self.exchange, self._errors):
+                resource.close()
 
     @property
     def _late(self) -> str:
@@ -141,7 +149,10 @@ class ClientProcess:
             status = self._process.wait(GRACE_S)
         except subprocess.TimeoutExpired:
             return ArmError(ArmFault.CLIENT_DIED, "the client process does not answer")
-        said = self.last_error()
+        with self._using:
+            if self._ended:
+                return ArmError(ArmFault.CLIENT_DIED, "the client process was ended")
+            said = self.last_error()
         # on a lost connection the library connects anew by itself, says so, and now and then crashes
         # where a command is under way: the link is why
         if status == EXIT_LINK_LOST or (status < 0 and LIBRARY_LOST in said):

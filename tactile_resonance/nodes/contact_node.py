@@ -69,7 +69,7 @@ PARAMETERS = (
 POLL_S = 0.02
 FEEDBACK_EVERY = 5  # polls
 # How long the devices may be dead before the node gives up and is brought up anew.
-DEAD_CYCLES = 500
+DEAD_NS = 1_000_000_000
 
 
 class ContactNode(ManagedNode):
@@ -109,7 +109,9 @@ class ContactNode(ManagedNode):
         self._goal: ServerGoalHandle | None = None
         self._finished: Future | None = None
         self._fault: ArmError | ForceError | None = None
-        self._dead = self._polls = 0
+        self._sound_ns: int | None = None  # of the last cycle without a fault
+        self._dead = False
+        self._polls = 0
         from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
         clock = self._arm.clock
         began_ns = clock.ros_ns(clock.now_ns())
@@ -263,7 +265,7 @@ class ContactNode(ManagedNode):
             self._finish(None)
             self.fail(f"control loop ended: {thread.error!r}")
             return
-        if self._dead > DEAD_CYCLES:
+        if self._dead:
             self._finish(thread.controller.result)
             self.fail(f"{self._fault}; connecting anew")
             return
@@ -303,7 +305,9 @@ class ContactNode(ManagedNode):
     # each cycle, in the loop's thread
 
     def _on_cycle(self, cycle: Cycle) -> None:
-        self._dead = self._dead + 1 if cycle.fault is not None else 0
+        if cycle.fault is None or self._sound_ns is None:
+            self._sound_ns = cycle.time_ns
+        self._dead = cycle.time_ns - self._sound_ns > DEAD_NS
         self._fault = cycle.fault
         thread = self._thread
         if thread is None:  # it is being made

@@ -33,13 +33,12 @@ def module_domain():
 
 
 @pytest.fixture(scope="module")
-def bench(module_domain, tmp_path_factory, request):
-    """contact_node on a simulated robot, for the tests of one file, with that file's `PARAMETERS_OF_NODE`."""
+def bench(module_domain, tmp_path_factory):
+    """contact_node on a simulated robot, for the tests of one file."""
     sys.path.insert(0, str(Path(__file__).parent))
     from contact_rig import Bench
 
-    parameters = getattr(request.module, "PARAMETERS_OF_NODE", None)
-    made = Bench(tmp_path_factory.mktemp("log"), parameters=parameters)
+    made = Bench(tmp_path_factory.mktemp("log"))
     try:
         yield made
     finally:
@@ -55,6 +54,6 @@ def client(bench):
     with ContactClient(bench.nodes.check) as made:
         made.back()
         if bench.order("state")["runtime_state"] != "PLAYING":  # a stop while nothing was under way
-            made.wait(lambda: made.retract().success, 5.0, "the arm's program to be started again")
+            made.wait(lambda: made.retract().success, 60.0, "the arm's program to be started again")
             made.idle()
         yield made

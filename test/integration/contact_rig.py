@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""contact_node and its manager as processes on a simulated robot with tissue and load cell; their client."""
+"""contact_node and its manager as processes on a simulated robot with tissue and load cell; their client.
+
+All of it lives in simulated time, in which the test takes part: what it does at a moment of the contact, it
+does at that moment, however slow the machine is. Limits of waits are on this machine's clock and only end a
+test that hangs.
+"""
 
 import contextlib
-import os
 import select
 import subprocess
 import sys
@@ -15,19 +19,23 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.action import ActionClient
-from robot_at_hand import RobotAtHand
+from rclpy.time import Time
+from robot_at_hand import RobotAtHand, own_host
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
 
 from tactile_resonance import msg
+from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes.client import NoAnswer, NodeClient
 from tactile_resonance.nodes.running import NEWEST
-from tactile_resonance.processes import NodeProcesses, end_with_parent, may_take_priority
+from tactile_resonance.processes import NodeProcesses, end_with_parent
 from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
 
-PRIORITY = 20
-HOST = f"127.0.13.{1 + os.getpid() % 250}"
+HOST = own_host(13)
+HANGS_S = 60.0
+STEP_S = 0.002
 TURN = Rotation.from_rotvec(TABLE_IN_BASE[3:]).as_quat().tolist()
 
 
@@ -53,10 +61,15 @@ class ContactClient(NodeClient):
         if not self.states or self.states[-1] != message.state:
             self.states.append(message.state)
 
+    @property
+    def told_ns(self):
+        """Of which time the newest state tells."""
+        return 0 if self.state is None else Time.from_msg(self.state.header.stamp).nanoseconds
+
     def why(self):
         return "" if self.state is None else f"{self.state.state}: {self.state.message}"
 
-    def idle(self, anew=False, timeout_s=40.0):
+    def idle(self, anew=False, timeout_s=HANGS_S):
         """Wait until the node is active and nothing is under way; `anew`: its loop begun again."""
         cycles = self.state.cycles if anew else None
         self.state = None
@@ -67,7 +80,7 @@ class ContactClient(NodeClient):
 
         self.wait(there, timeout_s, "contact_node to be idle")
 
-    def back(self, timeout_s=30.0):
+    def back(self, timeout_s=HANGS_S):
         """Ask for a retraction while a fault stands, until nothing is under way."""
         deadline = time.monotonic() + timeout_s
         self.state = None
@@ -75,11 +88,11 @@ class ContactClient(NodeClient):
             assert time.monotonic() < deadline, f"contact_node does not come back ({self.why()})"
             if self.state is not None and self.state.state == "fault":
                 with contextlib.suppress(NoAnswer):  # the node may be being made anew
-                    self.retract()
+                    self.retract(timeout_s=5.0)
                 self.state = None
             self.spin(0.2)
 
-    def start(self, xy_m=(0.0, 0.0), timeout_s=20.0, **fields):
+    def start(self, xy_m=(0.0, 0.0), timeout_s=HANGS_S, **fields):
         """Ask for a contact until the node takes it; return the goal's handle."""
         goal = goal_message(xy_m, **fields)
         deadline = time.monotonic() + timeout_s
@@ -94,31 +107,27 @@ class ContactClient(NodeClient):
     def send(self, goal):
         """Send a goal once; return its handle."""
         future = self._action.send_goal_async(goal)
-        self.wait(future.done, 10.0, "an answer to the goal")
+        self.wait(future.done, HANGS_S, "an answer to the goal")
         return future.result()
 
-    def result(self, handle, timeout_s=15.0):
+    def result(self, handle, timeout_s=HANGS_S):
         future = handle.get_result_async()
         self.wait(future.done, timeout_s, "the result")
         return future.result().result
 
-    def in_state(self, state, timeout_s=10.0):
-        """Wait until a state is told."""
-        self.wait(lambda: self.state is not None and self.state.state == state, timeout_s, state)
-
     def cancel(self, handle):
         future = handle.cancel_goal_async()
-        self.wait(future.done, 5.0, "an answer to cancel")
+        self.wait(future.done, HANGS_S, "an answer to cancel")
 
-    def _answer(self, service, request, what):
-        self.wait(service.service_is_ready, 5.0, what)
+    def _answer(self, service, request, what, timeout_s=HANGS_S):
+        self.wait(service.service_is_ready, timeout_s, what)
         future = service.call_async(request)
-        self.wait(future.done, 5.0, f"an answer to {what}")
+        self.wait(future.done, timeout_s, f"an answer to {what}")
         return future.result()
 
     def change_state(self, transition):
         """Ask for a transition of contact_node's life, without waiting for its end."""
-        self.wait(self._change.service_is_ready, 5.0, "change_state")
+        self.wait(self._change.service_is_ready, HANGS_S, "change_state")
         self._change.call_async(ChangeState.Request(transition=Transition(id=transition)))
 
     def set(self, **values):
@@ -130,8 +139,8 @@ class ContactClient(NodeClient):
         result = self._answer(self._set, request, "parameters").result
         return "" if result.successful else result.reason
 
-    def retract(self):
-        return self._answer(self._retract, Trigger.Request(), "retract")
+    def retract(self, timeout_s=HANGS_S):
+        return self._answer(self._retract, Trigger.Request(), "retract", timeout_s)
 
 
 def goal_message(xy_m=(0.0, 0.0), **fields):
@@ -149,14 +158,14 @@ def goal_message(xy_m=(0.0, 0.0), **fields):
 class Bench(RobotAtHand):
     """The plant's process and the nodes."""
 
-    def __init__(self, log, tissue="gel10", parameters=None):
+    def __init__(self, log, tissue="gel10"):
         super().__init__(HOST)
-        self.parameters = {"robot_host": HOST, "force_host": HOST, **(parameters or {})}
-        priority = PRIORITY if may_take_priority(PRIORITY) else 0
+        server = f"{HOST}:{TIME_PORT}"
+        self.parameters = {"robot_host": HOST, "force_host": HOST, "time_server": server}
         self.plant = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
-                *("--tissue", tissue, "--priority", str(priority)),
+                *("--tissue", tissue, "--simulated-time"),
             ],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -166,26 +175,53 @@ class Bench(RobotAtHand):
         ready, _, _ = select.select([self.plant.stdout], [], [], 60)
         line = self.plant.stdout.readline() if ready else "nothing"
         assert line.startswith(READY), line
+        self.time = SimulatedClock(server, "test")
         self.nodes = NodeProcesses(log)
         self.nodes.bring_up(["contact_node"], {"contact_node": self.parameters})
 
     def recover(self):
-        """End what a test that failed may have left: a robot that is stopped, contact_node ended."""
+        """End what a test that failed may have left: time that stands, a robot that is stopped, a node ended."""
+        self.time.free()
         super().recover()
         process = self.nodes._processes.get("contact_node")
         if process is None or process.poll() is not None:
             self.nodes.start("contact_node", self.parameters)
 
-    def until_touching(self, ended=lambda: False, timeout_s=20.0):
-        """The plant's time [s] as soon as the tissue is touched anew; None where it ended before."""
-        deadline = time.monotonic() + timeout_s
+    def let_pass(self, seconds):
+        """Let some time pass, as fast as it goes."""
+        self.step(seconds)
+        self.time.free()
+
+    def step(self, seconds):
+        """Let some time pass; it stands then."""
+        self.time.wait_until(self.time.ask_ns() + round(1e9 * seconds), Demand.FAST)
+
+    def start_contact(self, client):
+        """Send a goal and stop the time at the first touch; its handle, the future result, the time [s] of it.
+
+        The time is None where it ended before.
+        """
+        # no contact is made in so little time
+        self.time.hold(self.time.ask_ns() + 200_000_000, Demand.NONE)
         touches = self.order("truth")["touches"]
-        while time.monotonic() < deadline and not ended():
+        handle = client.start()
+        future = handle.get_result_async()
+        deadline = time.monotonic() + HANGS_S
+        while not future.done():
+            assert time.monotonic() < deadline, f"neither touch nor end ({client.why()})"
+            self.step(STEP_S)
             true = self.order("truth")
             if true["in_contact"] and true["touches"] > touches:
-                return true["time_s"] - true["contact_s"]
-            time.sleep(0.004)
-        return None
+                return handle, future, true["time_s"]
+            client.spin(0.0)
+        return handle, future, None
+
+    def until_state(self, client, state):
+        """Let time pass until contact_node tells a state; it stands then, within 0.06 s of it."""
+        while client.state is None or client.state.state != state:
+            self.step(0.02)
+            now_ns = self.time.now_ns()
+            client.wait(lambda now=now_ns: client.told_ns > now - 60_000_000, HANGS_S, state)
 
     def history(self, since_s):
         """Time (n,), place of the tip (n, 3) and true force (n,) of all steps after a time."""
@@ -202,6 +238,7 @@ class Bench(RobotAtHand):
         )
 
     def close(self):
+        self.time.close()
         self.nodes.stop()
         self.plant.terminate()
         output, _ = self.plant.communicate(timeout=10)

@@ -2,7 +2,6 @@
 """What is asked of contact_node while a contact is under way, through the real drivers; judged by the truth."""
 
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +12,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.processes import may_take_priority
-from tactile_resonance.simulation.plant_defaults import PATIENT
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contact_rig import goal_message, height_m, last_way_down_s
+from contact_rig import HANGS_S, goal_message, height_m, last_way_down_s
 from lifecycle_msgs.msg import Transition
-
-pytestmark = pytest.mark.skipif(
-    not may_take_priority(20), reason="a simulated robot beside nodes on these cores needs rtprio"
-)
-
-PARAMETERS_OF_NODE = PATIENT
-"""A cell that is silent for 10 ms because the simulation stands still would have the node connect anew."""
 
 PARAMETERS, LIMITS = read_contact()
 STANDOFF_M = PARAMETERS.standoff_m
@@ -43,13 +33,13 @@ def test_a_held_contact_takes_no_goal_and_no_parameters_and_is_drawn_back_when_t
     bench, client
 ):
     first = client.start()
-    client.wait(lambda: client.state.state not in ("idle", "fault"), 5.0, "it to begin")
+    client.wait(lambda: client.state.state not in ("idle", "fault"), HANGS_S, "it to begin")
     assert not client.send(goal_message()).accepted, "one at a time"
     refused = client.set(contact__approach_speed_m_s=1e-3)
     assert "accepted in idle" in refused
     result = client.result(first)
     assert result.reached, result.message
-    client.spin(0.5)  # the force creeps into place
+    bench.let_pass(0.5)  # the force creeps into place
     at_s = bench.order("truth")["time_s"]
     # the goal has ended, the contact goes on: another one is taken as a goal and refused as a contact
     answer = client.result(client.start())
@@ -64,7 +54,7 @@ def test_a_held_contact_takes_no_goal_and_no_parameters_and_is_drawn_back_when_t
     assert "at most the limit" in client.set(
         contact__approach_speed_m_s=5e-3, limits__near_speed_m_s=2e-3
     )
-    time.sleep(0.3)
+    bench.let_pass(0.3)
     _, tip_m, force_n = bench.history(at_s)
     # nothing of that has moved the tip, but for the vibration of the robot and the creep of the tissue
     assert np.ptp(tip_m[:, 2]) < 1e-4
@@ -86,9 +76,10 @@ def test_a_goal_that_is_cancelled_in_any_state_is_drawn_back(bench, client, stat
     try:
         # travel is met from the other end of the table
         handle = client.start(xy_m=(0.04, 0.0) if state == "travel" else (0.0, 0.0))
-        client.in_state(state)
+        bench.until_state(client, state)
         at_s = bench.order("truth")["time_s"]
         client.cancel(handle)
+        bench.time.free()
         result = client.result(handle)
         assert (result.reached, result.cause) == (False, "cancelled"), result.message
         drawn_back(bench, client)
@@ -113,30 +104,32 @@ def test_stop_of_the_robot_in_any_state_is_named_and_moves_nothing_later(
     try:
         handle = client.start(xy_m=(0.04, 0.0) if state == "travel" else (0.0, 0.0))
         if state == "retract":
-            client.in_state("hold")
+            bench.until_state(client, "hold")
             assert client.retract().success
-        client.in_state(state)
+        bench.until_state(client, state)
         at_s = bench.order("truth")["time_s"]
         bench.order(stop)
+        bench.time.free()
         if state not in ("hold", "retract"):  # whose goals were reached
             result = client.result(handle)
             assert not result.reached
             assert result.cause in {"arm_stopped", "arm_link"}, result.message
-        client.in_state("fault")
+        bench.until_state(client, "fault")
+        bench.time.free()
         told = client.state
         assert told.message
         if state == "hold":
             assert told.cause in {"arm_stopped", "arm_link"}
         assert not client.retract().success, "not before it is released"
-        time.sleep(0.3)
+        bench.let_pass(0.3)
         time_s, tip_m, force_n = bench.history(at_s)
         assert max(force_n) < LIMITS.hard_force_n
         assert last_way_down_s(time_s, tip_m) - at_s < 0.2
         place = bench.order("truth")["tip_m"]
         bench.unlock() if stop == "protective_stop" else bench.power_up()
-        time.sleep(1.0)
+        bench.let_pass(1.0)
         assert np.linalg.norm(np.subtract(bench.order("truth")["tip_m"], place)) < 5e-5
-        client.wait(lambda: client.retract().success, 3.0, "a retraction to be taken")
+        client.wait(lambda: client.retract().success, HANGS_S, "a retraction to be taken")
         client.idle()
         assert height_m(bench) > STANDOFF_M - 2e-4
     finally:
@@ -148,10 +141,11 @@ def test_stop_of_the_robot_in_any_state_is_named_and_moves_nothing_later(
 def test_node_that_is_asked_to_end_in_a_contact_answers_its_goal(bench, client):
     assert client.set(**SLOW) == ""
     handle = client.start()
-    client.in_state("contact")
+    bench.until_state(client, "contact")
     future = handle.get_result_async()
     client.change_state(Transition.TRANSITION_DEACTIVATE)
-    client.wait(future.done, 15.0, "the result")
+    bench.time.free()
+    client.wait(future.done, HANGS_S, "the result")
     assert future.result().result.cause == "cancelled"
     assert height_m(bench) > STANDOFF_M - 2e-4
     client.change_state(Transition.TRANSITION_ACTIVATE)
