@@ -5,12 +5,18 @@ import os
 import socket
 import time
 
+from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.simulation.robot.control_port import order
 
 
 def own_host(last):
     """Address that no other run of the tests uses; `last` tells the robots of one run apart."""
     return f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.{last}"
+
+
+def own_time(last):
+    """Address of the simulated time of such a robot, or of a bench without one."""
+    return f"{own_host(last)}:{TIME_PORT}"
 
 
 class RobotAtHand:

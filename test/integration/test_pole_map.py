@@ -6,6 +6,7 @@ import time
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from robot_at_hand import own_time
 from sensor_msgs.msg import PointCloud2
 from tactile_resonance.action import Measure
 
@@ -15,14 +16,15 @@ from tactile_resonance.nodes.scan_session import ScanSession
 from tactile_resonance.processes import NodeProcesses
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "pole_map_node")
+TIME = own_time(16)
 PLACES = ((-0.01, -0.01, 0.0), (0.002, -0.001, 0.0), (0.01, 0.01, 0.0))
 
 
 def test_measured_points_are_on_the_map(domain, tmp_path):
     scene = share_path("config/scenes/inclusion_scan.yaml")
     parameters = {
-        "fake_hardware_node": {"scene": scene, "speed": 0.0},
-        "excitation_node": {"record_folder": tmp_path / "records"},
+        "fake_hardware_node": {"scene": scene, "time_server": TIME},
+        "excitation_node": {"record_folder": tmp_path / "records", "time_server": TIME},
         "pole_map_node": {"classes_file": scene},
     }
     with NodeProcesses(tmp_path / "log") as nodes, ScanSession(nodes.check) as session:

@@ -11,6 +11,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from robot_at_hand import own_time
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
@@ -27,6 +28,7 @@ TOPICS = {
     "poles": (msg.Poles, RESULTS),
     "bench/block": (msg.Record, RESULTS),
 }
+TIME = own_time(15)
 # short periods: many blocks in little time
 SHORT = {"samples_per_period": 2000, "f_min_hz": 100.0}
 
@@ -139,8 +141,8 @@ def test_kill_leaves_every_published_record_on_disk(domain, tmp_path):
         start(
             nodes,
             ("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),
-            excitation_node={"record_folder": records, **SHORT},
-            fake_hardware_node={"speed": 2.0},
+            excitation_node={"record_folder": records, "time_server": TIME, **SHORT},
+            fake_hardware_node={"time_server": TIME},
         )
         client.join(periods=3)
         client.heard["record"].clear()
@@ -164,15 +166,15 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_played(domain, tm
     blocked = tmp_path / "a file"
     blocked.write_text("no folder")
     with NodeProcesses(tmp_path / "log") as bench, Client() as client:
-        start(bench, ("fake_hardware_node",), fake_hardware_node={"speed": 0.0})
+        start(bench, ("fake_hardware_node",), fake_hardware_node={"time_server": TIME})
         with NodeProcesses(tmp_path / "log") as nodes:
-            start(nodes, ("excitation_node",), excitation_node={"record_folder": blocked / "x"})
+            start(nodes, ("excitation_node",), excitation_node={"record_folder": blocked / "x", "time_server": TIME})
             result = client.measure(periods=3)
             assert result.outcome == Measure.Result.REFUSED
             assert result.message.startswith("record_folder: ")
             assert "a file" in result.message
         with NodeProcesses(tmp_path / "log") as nodes:
-            start(nodes, ("excitation_node",), excitation_node={"record_folder": tmp_path / "r"})
+            start(nodes, ("excitation_node",), excitation_node={"record_folder": tmp_path / "r", "time_server": TIME})
             result = client.measure(periods=2**32 - 1)
             assert result.outcome == Measure.Result.REFUSED
             assert "MB free, the measurement may take 14" in result.message
@@ -189,8 +191,8 @@ def test_a_disk_that_goes_away_ends_the_measurement(domain, tmp_path):
         start(
             nodes,
             ("fake_hardware_node", "excitation_node"),
-            excitation_node={"record_folder": records, **SHORT},
-            fake_hardware_node={"speed": 2.0},
+            excitation_node={"record_folder": records, "time_server": TIME, **SHORT},
+            fake_hardware_node={"time_server": TIME},
         )
         result = client.ask(periods=100_000)
         client.wait(lambda: len(client.heard["record"]) >= 5)
@@ -217,8 +219,12 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
         start(
             nodes,
             ("fake_hardware_node", "excitation_node", *readers),
-            excitation_node={"record_folder": records, "frame_id": "left/tip"},
-            fake_hardware_node={"speed": 0.0},
+            excitation_node={
+                "record_folder": records,
+                "frame_id": "left/tip",
+                "time_server": TIME,
+            },
+            fake_hardware_node={"time_server": TIME},
         )
         client.join(periods=3)
         keys = [

@@ -14,6 +14,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message
+from robot_at_hand import own_time
 from rosbags.highlevel import AnyReader
 from tactile_resonance.action import Measure, Scan
 
@@ -23,6 +24,7 @@ from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 
+TIME = own_time(17)
 SCENE = """
 name: four points
 force_n: 0.01
@@ -111,9 +113,9 @@ def recorded(module_domain, tmp_path_factory):
     scene, run = folder / "scene.yaml", folder / "run"
     scene.write_text(SCENE)
     parameters = {
-        "fake_hardware_node": {"scene": scene, "speed": 0.0},
-        "excitation_node": {"record_folder": folder / "records"},
-        "scan_node": {"contact": "none"},
+        "fake_hardware_node": {"scene": scene, "time_server": TIME},
+        "excitation_node": {"record_folder": folder / "records", "time_server": TIME},
+        "scan_node": {"contact": "none", "time_server": TIME},
     }
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up(("fake_hardware_node", "excitation_node", *READERS, "scan_node"), parameters)

@@ -8,6 +8,7 @@ import pytest
 import rclpy
 from geometry_msgs.msg import Point
 from rclpy.executors import SingleThreadedExecutor
+from robot_at_hand import own_time
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
@@ -26,6 +27,7 @@ from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
+TIME = own_time(14)
 GEL_10 = (0.0, 0.0, 0.0)
 GEL_16 = (0.18, 0.0, 0.0)
 
@@ -77,8 +79,11 @@ def session(module_domain, tmp_path_factory):
     """Nodes that run, and a client of theirs."""
     with NodeProcesses(tmp_path_factory.mktemp("log")) as nodes:
         parameters = {
-            "fake_hardware_node": {"speed": 0.0},
-            "excitation_node": {"record_folder": tmp_path_factory.mktemp("records")},
+            "fake_hardware_node": {"time_server": TIME},
+            "excitation_node": {
+                "record_folder": tmp_path_factory.mktemp("records"),
+                "time_server": TIME,
+            },
         }
         nodes.bring_up(NODES, parameters)
         with ScanSession(nodes.check) as session:
@@ -94,7 +99,6 @@ def quiet(done, planned):
 def test_messages_of_a_measurement(session):
     with Listener() as listener:
         listener.join(session)
-        before_ns = time.time_ns()
         goal = Measure.Goal(label="here", periods=5, realisations=2, seed=3, level_v=0.5)
         result = session.measure(GEL_10, goal, quiet)
         key = result.origin.measurement_id
@@ -120,7 +124,7 @@ def test_messages_of_a_measurement(session):
     # stamps: records lie one period apart; results carry the middle of what they rest on
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
     assert np.all(np.abs(np.diff(stamps[:5]) - 400_000_000) <= 1)
-    assert stamps[0] > before_ns
+    assert 0 < stamps[0] < 600_000_000_000  # simulated time
     middle = (stamps[0] + stamps[-1] + 400_000_000) // 2
     last, last_poles = frfs[-1], poles[-1]
     assert abs(last.header.stamp.sec * 10**9 + last.header.stamp.nanosec - middle) <= 1
@@ -223,8 +227,8 @@ def test_a_node_that_refuses_to_come_up_says_why(domain, tmp_path):
 
 def test_a_node_that_ended_is_named(domain, tmp_path):
     with NodeProcesses(tmp_path) as nodes:
-        nodes.start("fake_hardware_node", {"speed": -1.0})
-        with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*speed"):
+        nodes.start("fake_hardware_node", {"seed": 0})
+        with pytest.raises(RuntimeError, match=r"fake_hardware_node ended.*seed"):
             wait_for_an_end(nodes)
 
 
