@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo as a user starts it: a whole scan, through robot, load cell and all nodes."""
 
-import os
 import re
 import signal
 import subprocess
@@ -14,12 +13,13 @@ import pytest
 
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
-from tactile_resonance.processes import may_take_priority
+from robot_at_hand import own_host
+
 from tactile_resonance.scan.bench_truth import deviations, truths_of
 from tactile_resonance.scan.run_content import read_run
 
 COMMAND = [sys.executable, "-m", "tactile_resonance.cli", "demo"]
-HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.8"
+HOST = own_host(8)
 NODES = 9  # with the manager and the simulated robot
 SCENE = """
 name: two dishes
@@ -51,9 +51,6 @@ def processes_of(domain):
     return found
 
 
-@pytest.mark.skipif(
-    not may_take_priority(30), reason="a simulated robot beside nodes on these cores needs rtprio"
-)
 def test_two_dishes_are_told_apart_and_nothing_is_left_running(domain, tmp_path):
     (tmp_path / "scene.yaml").write_text(SCENE)
     options = ["--scene", tmp_path / "scene.yaml", "--output", tmp_path / "run"]
@@ -61,7 +58,7 @@ def test_two_dishes_are_told_apart_and_nothing_is_left_running(domain, tmp_path)
         [*COMMAND, *options, "--robot-host", HOST],
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=600,
     )
     assert answer.returncode == 0, answer.stderr
     assert processes_of(domain) == []
@@ -69,10 +66,11 @@ def test_two_dishes_are_told_apart_and_nothing_is_left_running(domain, tmp_path)
     soft, stiff = run.latest
     assert (soft.tissue_class, stiff.tissue_class) == ("soft", "stiff")
     assert stiff.f0_hz - soft.f0_hz > 7
-    # as far from the truth of a contact that creeps as they say
+    # as far from the truth of a contact that creeps as they say, and nothing was late
     truths = truths_of(run)
     assert [truths[k].tissue for k in (0, 1)] == ["gel10", "gel16"]
-    assert np.max(np.abs(deviations(run.latest, truths))) < 5
+    assert np.max(np.abs(deviations(run.latest, truths))) < 4
+    assert [r.attempt for r in run.results] == [0, 0]
     for result in run.latest:
         # in air the mode is lower: Hertz contact adds stiffness
         assert result.f0_shift_hz == pytest.approx(result.f0_hz - result.f0_hz / result.f0_over_air)
@@ -94,7 +92,7 @@ def test_two_dishes_are_told_apart_and_nothing_is_left_running(domain, tmp_path)
 def test_interrupted_demo_leaves_no_process(domain, tmp_path, number):
     demo = start(tmp_path, domain)
     demo.send_signal(number)
-    _, errors = demo.communicate(timeout=30)
+    _, errors = demo.communicate(timeout=60)
     assert demo.returncode == 130
     assert "Traceback" not in errors
     assert processes_of(domain) == []
@@ -104,7 +102,7 @@ def test_killed_demo_takes_its_nodes_along(domain, tmp_path):
     demo = start(tmp_path, domain)
     demo.kill()
     demo.communicate()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while processes_of(domain) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert processes_of(domain) == []

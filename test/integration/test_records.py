@@ -168,13 +168,21 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_played(domain, tm
     with NodeProcesses(tmp_path / "log") as bench, Client() as client:
         start(bench, ("fake_hardware_node",), fake_hardware_node={"time_server": TIME})
         with NodeProcesses(tmp_path / "log") as nodes:
-            start(nodes, ("excitation_node",), excitation_node={"record_folder": blocked / "x", "time_server": TIME})
+            start(
+                nodes,
+                ("excitation_node",),
+                excitation_node={"record_folder": blocked / "x", "time_server": TIME},
+            )
             result = client.measure(periods=3)
             assert result.outcome == Measure.Result.REFUSED
             assert result.message.startswith("record_folder: ")
             assert "a file" in result.message
         with NodeProcesses(tmp_path / "log") as nodes:
-            start(nodes, ("excitation_node",), excitation_node={"record_folder": tmp_path / "r", "time_server": TIME})
+            start(
+                nodes,
+                ("excitation_node",),
+                excitation_node={"record_folder": tmp_path / "r", "time_server": TIME},
+            )
             result = client.measure(periods=2**32 - 1)
             assert result.outcome == Measure.Result.REFUSED
             assert "MB free, the measurement may take 14" in result.message

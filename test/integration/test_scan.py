@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan through robot, load cell and all nodes: killed in the middle, resumed, every message in its file."""
 
-import os
 import signal
 from collections import Counter
 
@@ -12,16 +11,17 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
+from robot_at_hand import own_host, own_time
 from rosbags.rosbag2 import Reader
 from tactile_resonance.action import Scan
 
 from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.scan_client import ScanClient
-from tactile_resonance.processes import NodeProcesses, may_take_priority
+from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant_defaults import PATIENT, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.truth import truth_of
 
 SCENE = """
@@ -34,12 +34,9 @@ positions:
 precision: {f0_std_hz: 0.02}
 blocks: {least: 3, most: 4}
 """
-HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.9"
+HOST, TIME = own_host(9), own_time(9)
 
 
-@pytest.mark.skipif(
-    not may_take_priority(20), reason="a simulated robot beside nodes on these cores needs rtprio"
-)
 def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     scene, run_path = tmp_path / "three.yaml", tmp_path / "run"
     scene.write_text(SCENE)
@@ -47,9 +44,11 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     parameters = {
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": table},
         "excitation_node": {"record_folder": tmp_path / "records"},
-        "contact_node": {"robot_host": HOST, "force_host": HOST, **PATIENT},
+        "contact_node": {"robot_host": HOST, "force_host": HOST},
         "scan_node": {"table_in_base": table},
     }
+    for node in parameters.values():
+        node["time_server"] = TIME
     with NodeProcesses(tmp_path / "log") as nodes, ScanClient(lambda: None) as client:
         nodes.bring_up(NODES, parameters)
         client.wait_until_up(90.0)

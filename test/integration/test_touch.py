@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A table that stands elsewhere than the scan believes is found by touch, through robot and load cell."""
 
-import os
-
 import numpy as np
 import pytest
 
@@ -10,14 +8,15 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
+from robot_at_hand import own_host, own_time
 from scipy.spatial.transform import Rotation
 from tactile_resonance.action import Scan
 
 from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.scan_client import ScanClient
-from tactile_resonance.processes import NodeProcesses, may_take_priority
+from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import PATIENT, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 SCENE = """
 name: tilted table
@@ -31,14 +30,11 @@ positions:
 precision: {f0_std_hz: 0.02}
 blocks: {least: 2, most: 4}
 """
-HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
+HOST, TIME = own_host(7), own_time(7)
 # beyond limits.misalignment_rad = 0.05 the contact node refuses to turn the tip where it stands
 TILT_RAD, LIFT_M = np.array([0.035, -0.025, 0.0]), 1e-3
 
 
-@pytest.mark.skipif(
-    not may_take_priority(30), reason="a simulated robot beside nodes on these cores needs rtprio"
-)
 @pytest.mark.slow
 def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
     scene, run_path = tmp_path / "tilted.yaml", tmp_path / "run"
@@ -50,9 +46,11 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
     parameters = {
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": listed(true)},
         "excitation_node": {"record_folder": tmp_path / "records"},
-        "contact_node": {"robot_host": HOST, "force_host": HOST, **PATIENT},
+        "contact_node": {"robot_host": HOST, "force_host": HOST},
         "scan_node": {"table_in_base": listed(told)},
     }
+    for node in parameters.values():
+        node["time_server"] = TIME
     with NodeProcesses(tmp_path / "log") as nodes, ScanClient(nodes.check) as client:
         nodes.bring_up(NODES, parameters)
         client.wait_until_up(90.0)
