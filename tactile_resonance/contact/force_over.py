@@ -54,9 +54,9 @@ class ForceOver:
     force_n : float
         Time-weighted mean of the force along the normal [N].
     force_std_n : float
-        Standard deviation of that mean [N] from the means of eight batches, so that correlated noise and
-        a slow decay count as they should (method of batch means; Law, *Simulation Modeling and Analysis*,
-        section 9.5.3); an error of the tare is not in it. NaN for fewer than 32 wrenches.
+        Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
+        correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
+        Modeling and Analysis*, section 9.5.3). NaN for fewer than 32 wrenches.
     force_min_n, force_max_n : float
         Smallest and largest mean over 20 ms within the interval [N]; that of all where it is shorter.
     coverage : float
@@ -99,7 +99,7 @@ class ForceRecord:
         self._forces = _Ring(1, math.ceil(SPARE * rate_hz * length_s) + 1)
         self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
         self._poses = _Ring(6, math.ceil(SPARE * length_s / period_s) + 1)
-        self._now_ns = 0
+        self._now_ns, self._zero_std_n = 0, 0.0
         self._lock = threading.Lock()
 
     @property
@@ -107,10 +107,17 @@ class ForceRecord:
         """Time of the newest wrench [ns]: up to then an interval can be asked for; 0 before the first."""
         return self._forces.newest_ns
 
-    def restart(self) -> None:
-        """Forget all forces, as of a new tare: earlier ones are not less its zero."""
+    def restart(self, zero_std_n: float = 0.0) -> None:
+        """Forget all forces, as of a new tare: earlier ones are not less its zero.
+
+        Parameters
+        ----------
+        zero_std_n : float
+            Standard deviation of the new zero along the normal [N].
+        """
         with self._lock:
             self._forces.clear()
+            self._zero_std_n = zero_std_n
 
     def add(
         self,
@@ -156,6 +163,7 @@ class ForceRecord:
         require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
         with self._lock:
             now_ns, oldest_ns = self._now_ns, self._forces.kept_since_ns
+            zero_std_n = self._zero_std_n
             times, rows = self._forces.around(t0_ns, t1_ns)
             pose_times, poses = self._poses.around(t0_ns, t1_ns)
         spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
@@ -169,7 +177,9 @@ class ForceRecord:
             unknown = math.nan, math.nan, math.nan, math.nan
             return ForceOver(*unknown, spans.coverage, position_m, rotation_rad, reason)
         heard = np.count_nonzero((times >= t0_ns) & (times <= t1_ns) & np.isfinite(rows[:, 0]))
-        std_n = spans.std_of_mean() if heard >= LEAST_WRENCHES else math.nan
+        std_n = math.nan
+        if heard >= LEAST_WRENCHES:
+            std_n = math.hypot(spans.std_of_mean(), zero_std_n)
         force_n = float(spans.mean()[0])
         least_n, most_n = spans.range_of_means(SMOOTH_NS)
         return ForceOver(

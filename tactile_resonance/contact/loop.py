@@ -34,6 +34,7 @@ class Cycle:
     state: State
     late_s: float
     bias_n: Vector  # of the last tare, not taken off the wrenches
+    bias_std_n: float  # its standard deviation along the normal
     fault: ArmError | ForceError | None  # what a device raised in this cycle
 
 
@@ -149,8 +150,8 @@ class ContactLoop:
         state = self.controller.state
         self._next_ns += period_ns * (IDLE_PERIODS if state is State.IDLE else 1)
         if self._listener is not None:
-            bias_n = self.controller.bias_n
-            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, bias_n, fault))
+            zero = self.controller.bias_n, self.controller.bias_std_n
+            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, *zero, fault))
 
     def _tell(self, command: Command | None, now: int) -> None:
         """Pass a command on; a stop that goes on is not told in every period."""

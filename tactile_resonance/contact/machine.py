@@ -102,6 +102,11 @@ class ContactController:
         """Force of the last tare [N], of the frame `tip`; zeros before it."""
         return self._observer.watch.bias_n
 
+    @property
+    def bias_std_n(self) -> float:
+        """Standard deviation of that along the normal [N]; 0 before it."""
+        return self._observer.bias_std_n
+
     # requests
 
     def configure(self, parameters: ContactParameters, limits: Limits) -> None:

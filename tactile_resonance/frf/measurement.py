@@ -226,17 +226,19 @@ def mean_force(blocks: Sequence[tuple[float, float, float]]) -> tuple[float, flo
     Parameters
     ----------
     blocks : sequence of (mean [N], its standard deviation [N], length [s])
-        NaN where unknown; errors of different blocks are independent.
+        NaN where unknown.
 
     Returns
     -------
     force_n, force_std_n : float
-        NaN where the force of more than a fifth of the time is unknown, or one of the deviations.
+        NaN where the force of more than a fifth of the time is unknown, or one of the deviations. The blocks
+        of a contact share the error of its zero, so their errors count as one and the same: the deviation
+        is an upper bound.
     """
     known = [block for block in blocks if math.isfinite(block[0])]
     length_s = sum(block[2] for block in known)
     if not known or length_s < LEAST_COVERAGE * sum(block[2] for block in blocks):
         return math.nan, math.nan
     mean_n = sum(force * seconds for force, _, seconds in known) / length_s
-    variance = sum((std * seconds) ** 2 for _, std, seconds in known)
-    return mean_n, math.sqrt(variance) / length_s
+    std_n = sum(std * seconds for _, std, seconds in known) / length_s
+    return mean_n, std_n

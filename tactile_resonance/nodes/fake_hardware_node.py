@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import replace
@@ -197,7 +198,14 @@ class FakeHardwareNode(ManagedNode):
         self._tip = tip
         self._publish_truth(pose, tip)
 
-    def _publish_truth(self, pose: PoseStamped, tip: BenchTip, measurement_id: int = 0) -> None:
+    def _publish_truth(
+        self,
+        pose: PoseStamped,
+        tip: BenchTip,
+        measurement_id: int = 0,
+        force_n: float | None = None,
+    ) -> None:
+        """Tell the exact modes of a tip; `force_n` where the force was another one on the mean."""
         modes = truth_of(tip.coupled(self._bench), ()).modes
         truth = Poles(
             poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
@@ -215,7 +223,7 @@ class FakeHardwareNode(ManagedNode):
             frame_id=self._frame_id,
             label=tip.tissue.name if tip.tissue else "air",
             simulated=True,
-            contact=contact_from_message(pose, tip.force_n, 0.0),
+            contact=contact_from_message(pose, tip.force_n if force_n is None else force_n, 0.0),
         )
         self._truth.publish(poles_to_message(truth, origin))
 
@@ -237,6 +245,7 @@ class FakeHardwareNode(ManagedNode):
         self._tip = BenchTip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
         x, y, z = true.tip_m.tolist()
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
+        self._plant_ahead_s = true.time_s - place.time_ns * 1e-9
         self._stays.add(Stay(place.time_ns, true.force_n, pose_to_message(place)))
         self._publish_truth(self._stays.newest.pose, self._tip)
 
@@ -340,7 +349,7 @@ class FakeHardwareNode(ManagedNode):
         """Publish block after block, each when its last sample would have been taken.
 
         A contact that creeps has its truth with every block: that of the middle of all blocks so far, with
-        the stamp that their poles will have.
+        the stamp that their poles will have, and the plant's mean force over them.
         """
         for block in run.play(excitation, excitation.periods):
             due_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
@@ -350,9 +359,19 @@ class FakeHardwareNode(ManagedNode):
                 half_s = (block.index + 1) * excitation.period_s / 2
                 middle = replace(tip, since_s=tip.since_s + half_s)
                 pose.header.stamp = time_message(start_ns + round(half_s * 1e9))
-                self._publish_truth(pose, middle, excitation.measurement_id)
+                force_n = self._plant_force_n(start_ns, due_ns)
+                self._publish_truth(pose, middle, excitation.measurement_id, force_n)
             first_ns = start_ns + round(block.start_time_s * 1e9)
             self._blocks.publish(record_to_message(self._record(block, excitation, first_ns)))
+
+    def _plant_force_n(self, from_ns: int, to_ns: int) -> float:
+        """Mean force of the plant over an interval; NaN where the plant has ended."""
+        assert self._plant is not None
+        from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
+        try:
+            return self._plant.mean_force_n(from_s, to_s)
+        except OSError:
+            return math.nan
 
     def _wait_until(self, due_ns: int, stop: threading.Event) -> bool:
         """Wait for a time; whether what is played goes on."""

@@ -59,7 +59,7 @@ class ForceService:
         """Take a cycle, in the loop's thread."""
         if cycle.bias_n != self._bias_n:
             self._bias_n = cycle.bias_n
-            self._record.restart()
+            self._record.restart(cycle.bias_std_n)
         valid = cycle.state in TARED and cycle.fault is None
         self._record.add(cycle.time_ns, cycle.wrenches, cycle.bias_n, cycle.arm, valid=valid)
         self._state, self._now_ns = cycle.state, cycle.time_ns

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import subprocess
 import sys
@@ -35,6 +36,8 @@ class TrueContact:
         Along the normal; 0 out of contact.
     since_s : float
         How long the contact has lasted.
+    time_s : float
+        Of the plant.
     stalls : int
         How often the simulation has stood still on the wall clock for more than 10 ms.
     """
@@ -42,6 +45,7 @@ class TrueContact:
     tip_m: NDArray[np.float64]
     force_n: float
     since_s: float
+    time_s: float
     stalls: int
 
 
@@ -123,8 +127,29 @@ class PlantChild:
             np.array(answer["tip_m"]),
             float(answer["normal_force_n"]),
             float(answer["contact_s"]),
+            float(answer["time_s"]),
             int(answer["stalls"]),
         )
+
+    def mean_force_n(self, after_s: float, until_s: float) -> float:
+        """Mean force along the normal between two times of the plant [N]; NaN where it is not known.
+
+        Raises
+        ------
+        OSError
+            If the plant does not answer.
+        """
+        try:
+            answer = order(
+                self._host,
+                "mean_force",
+                timeout_s=ANSWER_WITHIN_S,
+                after_s=after_s,
+                until_s=until_s,
+            )
+        except ValueError:
+            return math.nan
+        return float(answer["normal_force_n"])
 
     def close(self) -> None:
         """End the process."""

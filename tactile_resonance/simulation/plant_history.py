@@ -6,6 +6,7 @@ No instrument shows it: tests and benchmarks judge by it how deep, how hard and 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 from tactile_resonance.contact.vectors import Vector
@@ -35,6 +36,23 @@ class PlantHistory:
         """Note what is true now; to be called after each step of the plant."""
         plant = self._plant
         self._steps.append((plant.time_s, plant.tip_m, plant.normal_force_n))
+
+    def mean_force(self, fields: dict) -> dict:
+        """Control port: mean force from after field ``after_s`` to ``until_s``.
+
+        Answers ``normal_force_n``; raises ValueError where nothing of that time is kept.
+        """
+        after_s = number(fields.get("after_s"), "after_s")
+        until_s = number(fields.get("until_s"), "until_s")
+        forces = []
+        for time_s, _, force_n in reversed(self._steps):
+            if time_s <= after_s:
+                break
+            if time_s <= until_s:
+                forces.append(force_n)
+        if not forces:
+            raise ValueError(f"after_s, until_s: nothing is known of {after_s:g} to {until_s:g} s")
+        return {"normal_force_n": math.fsum(forces) / len(forces)}
 
     def since(self, fields: dict) -> dict:
         """Control port: the first steps after field ``after_s``, 250 at most, oldest first.

@@ -211,6 +211,7 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.pace.stalls}
     history = PlantHistory(tabletop.plant)
     commands["history"] = history.since
+    commands["mean_force"] = history.mean_force
     robot.after_step.append(history.step)
     if cell is not None:
         commands["cell_fault"] = cell.inject

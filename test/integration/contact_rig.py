@@ -180,7 +180,7 @@ class Bench(RobotAtHand):
         self.nodes.bring_up(["contact_node"], {"contact_node": self.parameters})
 
     def recover(self):
-        """End what a test that failed may have left: time that stands, a robot that is stopped, a node ended."""
+        """End what a test that failed may have left: time and robot that stand, a node that has ended."""
         self.time.free()
         super().recover()
         process = self.nodes._processes.get("contact_node")
