@@ -2,20 +2,17 @@
 """The Python in docs/force_sensors.md does what the page says."""
 
 import re
-import threading
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from tactile_resonance.simulation.cell_loop import CellLoop
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.socketcand import SocketcandServer
-from tactile_resonance.simulation.transducer import CellParameters
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "force_sensors.md"
 HOST = "127.0.6.6"
@@ -47,22 +44,25 @@ def test_the_payload_is_found(tmp_path, monkeypatch, capsys):
 def test_the_cell_is_read(tmp_path, monkeypatch, capsys):
     pytest.importorskip("can", reason="python-can is not installed")
     monkeypatch.chdir(tmp_path)
-    bus = SocketcandServer(HOST, 0)
-    loop = CellLoop(LoadCell(CellParameters.from_yaml()), bus, lambda _: np.zeros(6))
-    ended = threading.Event()
-    thread = threading.Thread(target=loop.run, args=(ended.is_set,))
-    thread.start()
+    command = [sys.executable, "-m", "tactile_resonance.cli", "simulate-cell"]
+    cell = subprocess.Popen(
+        [*command, "--host", HOST, "--port", "0"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     try:
+        port = int(cell.stdout.readline().rsplit(":", 1)[1])
         content = yaml.safe_load(
             share_path("config/force/can_simulated.yaml").read_text(encoding="utf-8")
         )
-        content["bus"].update(host=HOST, port=bus.port)
+        content["bus"].update(host=HOST, port=port)
         content["limits"]["silent_s"] = 1.0
         Path("mine.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
         exec(compile(block_with("cell.read()"), str(PAGE), "exec"), {})
     finally:
-        ended.set()
-        thread.join()
-        bus.close()
-    lines = re.findall(r"^\d{19} \(", capsys.readouterr().out, re.MULTILINE)
-    assert len(lines) > 500
+        cell.terminate()
+        cell.communicate(timeout=60.0)
+    stamps = [int(ns) for ns in re.findall(r"^(\d+) \(", capsys.readouterr().out, re.MULTILINE)]
+    assert len(stamps) > 500
+    assert stamps == sorted(set(stamps))

@@ -79,4 +79,6 @@ def test_a_port_in_use_is_said(capsys):
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["simulate-cell", "--host", HOST, "--port", str(port)]) == 1
-    assert f"{HOST}:{port}: Address already in use" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"port {port} of {HOST}: Address already in use; does another simulation run" in said
+    assert said.count("\n") == 1

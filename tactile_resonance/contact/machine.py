@@ -125,7 +125,7 @@ class ContactController:
         self._envelope = Envelope(limits)
 
     def start(self, goal: ContactGoal, now_ns: int, arm: ArmSample | None = None) -> None:
-        """Begin a contact, from where the arm is; None: its way to the standoff is not judged.
+        """Begin a contact, from where the arm is; None: its way is judged in the first cycle that sees it.
 
         Raises
         ------
@@ -136,6 +136,7 @@ class ContactController:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
         start = arm if arm is not None and is_finite(arm) else None
         check_goal(goal, self.parameters, self.limits, self._tip, start)
+        self._way_judged = start is not None
         p, limits = self.parameters, self.limits
         self.goal = goal
         self._observer = Observer(p, limits)
@@ -199,6 +200,8 @@ class ContactController:
             self._heed_wish(now_ns, breach)
         if arm is None or place is None:
             return self._stop()
+        if self.state is State.TRAVEL and not self._way_judged:
+            self._judge_way(now_ns, arm)
         move = self._act(now_ns, arm, place)
         self._follow(move, now_ns)
         if move.twist is None:
@@ -215,6 +218,15 @@ class ContactController:
         limit = self.limits.stop_deceleration_m_s2
         self._observer.arm_model.step(0.0, limit)
         return Command(None, limit)
+
+    def _judge_way(self, now_ns: int, arm: ArmSample) -> None:
+        """Judge the way to the standoff of a contact that was begun while no arm was seen."""
+        assert self.goal is not None
+        self._way_judged = True
+        try:
+            check_goal(self.goal, self.parameters, self.limits, self._tip, arm)
+        except ValueError as error:
+            self._fail(Breach(Cause.HOUSING, str(error)), now_ns)
 
     def _heed_wish(self, now_ns: int, breach: Breach | None) -> None:
         """Draw back as asked for; a wish that the arm cannot follow soon is forgotten."""

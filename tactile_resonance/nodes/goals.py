@@ -8,6 +8,7 @@ answer came or not. No goal is left of which nobody knows.
 
 from __future__ import annotations
 
+import contextlib
 import time
 import uuid
 from collections.abc import Callable
@@ -88,7 +89,7 @@ class Goals:
                 self.pause(POLL_S)
             if future.result().status == GoalStatus.STATUS_UNKNOWN:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
-        except (PointFailed, Interrupted):
+        except (PointFailed, Interrupted, ScanEnded):
             # one that was started anew, or is gone, does not know the goal: there is no end to wait for
             cancelled = handle.cancel_goal_async()
             if self._done(cancelled, ASK_AGAIN_S) and cancelled.result().goals_canceling:
@@ -116,7 +117,10 @@ class Goals:
                 if futures[-1].done():
                     # of one that was asked for twice a refusal may mean that it is known already
                     refused = futures[-1].result()
-                    return refused if len(futures) > 1 and self._known(refused) else None
+                    if len(futures) > 1 and self._known(refused):
+                        return refused
+                    _drop(futures)
+                    return None
                 if not self.client.server_is_ready():
                     raise NodeAway(f"{self.name}: its node went away", "node went away")
                 if time.monotonic() - asked_s > ASK_AGAIN_S:
@@ -126,8 +130,10 @@ class Goals:
                 check()
                 self.pause(POLL_S)
         except BaseException:
-            for future in futures:
-                future.add_done_callback(_cancel_if_taken)
+            _drop(futures)
+            # its answer may be lost, and a cancellation needs none; where ROS has ended nobody takes it
+            with contextlib.suppress(RuntimeError):
+                ClientGoalHandle(self.client, goal_id, None).cancel_goal_async()
             raise
 
     def _known(self, refused: ClientGoalHandle) -> bool:
@@ -143,6 +149,12 @@ class Goals:
         while not future.done() and time.monotonic() < deadline:
             self.pause(POLL_S)
         return future.done()
+
+
+def _drop(futures: list[Future]) -> None:
+    """Take no notice of answers any more, but cancel what they accept."""
+    for future in futures:
+        future.add_done_callback(_cancel_if_taken)
 
 
 def _cancel_if_taken(future: Future) -> None:

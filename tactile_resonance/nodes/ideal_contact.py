@@ -85,6 +85,9 @@ class Stays:
                 response.tip_pose = stay.pose
             until_ns = min(until_ns, stay.since_ns)
         response.coverage = seen_ns / (end_ns - start_ns)
+        if until_ns > start_ns:
+            response.reason = f"the block begins before what is kept, {MOST_STAYS} places"
+            return response
         response.force_n, response.force_std_n = total / seen_ns, 0.0
         return response
 
@@ -143,6 +146,7 @@ class IdealContact:
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
         if goal.is_cancel_requested:
+            self._draw_back()  # where that was asked for before the work began
             goal.canceled()
         elif result.reached:
             goal.succeed()
@@ -183,6 +187,8 @@ class IdealContact:
             self._stays.add(Stay(now_ns, request.force_n, pose))
             self._placed()
             self._say("hold", "none", "")
+            if self._drawn_back.is_set():  # asked for after the wait
+                self._draw_back()
             result.reached, result.cause, result.depth_m = True, "none", self._depth_m
             result.force_n, result.force_std_n = request.force_n, 0.0
             result.peak_force_n, result.surface_std_m = request.force_n, 0.0

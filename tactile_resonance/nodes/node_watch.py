@@ -55,7 +55,6 @@ class NodeWatch:
         self._node, self._topics, self._silent_s = node, tuple(topics), silent_s
         self._lock = threading.Lock()
         self._signs: dict[str, _Sign] = {}
-        self._said = ""
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
     def missing(self) -> str | None:
@@ -108,7 +107,7 @@ class NodeWatch:
         except error:
             with self._lock:
                 for name, sign in self._signs.items():
-                    self._signs[name] = _Sign("silent", sign.instance, sign.heard_s)
+                    self._signs[name] = _Sign("in doubt", sign.instance, sign.heard_s)
             raise
 
     def _problem(self, node: str) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ Fields = dict[str, npt.NDArray[Any]]
 _FORMAT = "tactile_resonance {} 1"
 _DTYPE = ":dtype"  # suffix of the field that tells which integer type an array had
 _DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
-           SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+           SyntaxError, MemoryError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 
 
 def write_stored(path: Path, value: Excitation | Record) -> None:

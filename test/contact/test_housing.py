@@ -132,11 +132,15 @@ def test_housing_is_nowhere_lower_on_the_way_than_told():
     assert np.median(spare) < 8e-3
 
 
-@pytest.mark.parametrize("turn_rad", [(0.0, -0.35, 0.0), (0.25, -0.2, 0.6)])
+TURNED_DOWN = [(0.0, -0.35, 0.0), (0.25, -0.2, 0.6)]
+
+
+@pytest.mark.parametrize("turn_rad", TURNED_DOWN)
 def test_goal_on_whose_way_the_housing_would_touch_is_refused(turn_rad):
     tip = TipGeometry()
     made = with_tip(tip)
     turned_start(made, 0.012, turn_rad)  # the clamp is turned down by so much
+    made.loop.cycle()
     with pytest.raises(ValueError, match="housing would be at -.* mm above the plane") as told:
         made.loop.start(made.goal)
     assert "begin from higher" in str(told.value)
@@ -145,5 +149,20 @@ def test_goal_on_whose_way_the_housing_would_touch_is_refused(turn_rad):
     for height_m, turn in ((0.05, np.array(turn_rad)), (0.012, -np.array(turn_rad) * [1, 1, 0])):
         made = with_tip(tip)
         turned_start(made, height_m, turn)
+        made.loop.cycle()
         made.loop.start(made.goal)
+        made.loop.cycle()
         assert made.controller.state is State.TRAVEL
+
+
+@pytest.mark.parametrize("turn_rad", TURNED_DOWN)
+def test_goal_begun_before_the_arm_was_seen_ends_before_it_turns(turn_rad):
+    made = with_tip(TipGeometry())
+    turned_start(made, 0.012, turn_rad)
+    turns, motion = [], made.bench.clock.motion
+    made.bench.clock.on_step.append(lambda: turns.append(np.abs(motion.twist[3:]).max()))
+    result = made.loop.make(made.goal)
+    assert result.cause is Cause.HOUSING
+    assert "begin from higher" in result.message
+    assert made.run_until(State.IDLE, 3.0)
+    assert max(turns) < 1e-6

@@ -9,17 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import (
     NO_TURN,
     ZERO,
     cross,
     difference,
     dot,
+    quaternion_from_vector,
     rotated,
     rotated_back,
     scaled,
     six,
     transposed,
+    turn_from_quaternion,
     turn_from_vector,
     turn_product,
     vector,
@@ -118,3 +121,34 @@ def test_turn_from_one_orientation_to_another_is_that_of_scipy(start, end):
     between = turn_product(turn_from_vector(end), transposed(turn_from_vector(start)))
     want = Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()
     close(Rotation.from_rotvec(vector_from_turn(between)).as_matrix(), want.as_matrix(), 1e-13)
+
+
+@settings(max_examples=200, deadline=None)
+@given(vectors, st.floats(-10, 10), st.floats(1e-3, 1e3))
+def test_quaternions_are_those_of_scipy_whatever_their_length_and_sign(axis, w, length):
+    quaternion = np.array([*axis, w])
+    norm = np.linalg.norm(quaternion)
+    if norm < 1e-100:
+        return
+    quaternion = length * quaternion / norm
+    want = Rotation.from_quat(quaternion).as_matrix()
+    close(matrix(turn_from_quaternion(*quaternion.tolist())), want)
+    close(matrix(turn_from_quaternion(*(-quaternion).tolist())), want)
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("angle", [0.0, 1e-160, 1e-8, 0.3, math.pi, 4.0, 2 * math.pi, 7.0])
+def test_quaternion_of_a_rotation_vector_is_of_length_one_and_comes_back(axis, angle):
+    rotation = vector(angle * axis)
+    quaternion = quaternion_from_vector(rotation)
+    assert math.hypot(*quaternion) == pytest.approx(1.0, rel=1e-15)
+    close(Rotation.from_quat(quaternion).as_matrix(), Rotation.from_rotvec(rotation).as_matrix())
+    close(turn_from_quaternion(*quaternion), turn_from_vector(rotation))
+
+
+@settings(deadline=None)
+@given(vectors)
+def test_turn_of_a_pose_is_its_rotation(rotation):
+    pose = Pose(np.zeros(3), np.array(rotation))
+    close(matrix(pose.turn), pose.rotation.as_matrix())
+    close(matrix(pose.turn), Rotation.from_rotvec(rotation).as_matrix())

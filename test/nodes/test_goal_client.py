@@ -12,16 +12,20 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 import rclpy
 from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.client import ClientGoalHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from tactile_resonance.action import Measure
+from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import is_done
+from tactile_resonance.nodes.goals import Goals
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.scan.hands import Interrupted
 
 PREEMPTED_S = 0.2
+WITHIN_S = 60.0
 
 
 class Preempted:
@@ -56,7 +60,8 @@ def client():
             return Measure.Result(message="cancelled")
 
         def cancel(_):
-            cancelled.set_result(None)
+            if not cancelled.done():
+                cancelled.set_result(None)
             return CancelResponse.ACCEPT
 
         server = ActionServer(node, Measure, "measure", keep, cancel_callback=cancel)
@@ -77,12 +82,53 @@ def client():
             node.destroy_node()
 
 
+def comes(future):
+    """Wait for an answer."""
+    deadline_s = time.monotonic() + WITHIN_S
+    while not future.done() and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    return future.done()
+
+
 def test_answers_that_come_before_the_question_is_noted(client):
     goal = client.send_goal_async(Measure.Goal())
-    assert is_done(goal, 10.0)
+    assert comes(goal)
     cancel = goal.result().cancel_goal_async()
-    assert is_done(cancel, 10.0)
+    assert comes(cancel)
     assert cancel.result().goals_canceling
     result = goal.result().get_result_async()
-    assert is_done(result, 10.0)
+    assert comes(result)
+    assert result.result().result.message == "cancelled"
+
+
+def test_server_takes_a_goal_that_is_asked_for_twice_once(client):
+    """What `Goals` builds on: the second question is refused, and its result is that of the goal."""
+    goal_id = UUID(uuid=list(range(16)))
+    first = client.send_goal_async(Measure.Goal(), goal_uuid=goal_id)
+    second = client.send_goal_async(Measure.Goal(), goal_uuid=goal_id)
+    assert comes(first)
+    assert comes(second)
+    assert [first.result().accepted, second.result().accepted] == [True, False]
+    result = second.result().get_result_async()
+    other = client.send_goal_async(Measure.Goal())  # answered after what is asked before it
+    assert comes(other)
+    assert not result.done()
+    # cancelled by its id alone
+    cancel = ClientGoalHandle(client, goal_id, None).cancel_goal_async()
+    assert comes(cancel)
+    assert comes(result)
+    assert result.result().result.message == "cancelled"
+
+
+def test_a_goal_that_is_left_is_cancelled_at_its_server(client):
+    goals = Goals(client, "measure")
+
+    def check():
+        raise Interrupted("enough")
+
+    handle = goals.send(Measure.Goal(), lambda: None, lambda: None)
+    with pytest.raises(Interrupted):
+        goals.follow(handle, check, lambda: None)
+    result = handle.get_result_async()
+    assert comes(result)
     assert result.result().result.message == "cancelled"

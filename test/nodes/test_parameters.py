@@ -78,7 +78,7 @@ def test_every_parameter_is_described():
         ("excitation_node", "max_level_v", 10.0),
         ("excitation_node", "periods", 0),
         ("poles_node", "order", 21),
-        ("fake_hardware_node", "speed", -1.0),
+        ("fake_hardware_node", "seed", 0),
     ],
 )
 def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):

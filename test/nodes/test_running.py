@@ -4,6 +4,7 @@
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,21 +12,39 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 import rclpy
 
-from tactile_resonance.nodes.running import initialised, run_node
+from tactile_resonance.nodes import running
+from tactile_resonance.nodes.running import END_WITHIN_S, initialised, run_node
+from tactile_resonance.processes import free_domain_id
 
 
 @pytest.fixture
-def node(monkeypatch):
-    """What `run_node` is given; the test's own handler of interrupts is put back."""
-    from tactile_resonance.processes import free_domain_id
+def limits(monkeypatch):
+    """What is to end the process that hangs: when, and what then; this one goes on after its node."""
+    set_to = []
 
+    class Timer:
+        def __init__(self, seconds, function, arguments):
+            self.what = (seconds, function, arguments)
+
+        def start(self):
+            assert self.daemon
+            set_to.append(self.what)
+
+    monkeypatch.setattr(running, "threading", SimpleNamespace(Timer=Timer))
+    return set_to
+
+
+@pytest.fixture
+def node(monkeypatch, limits):
+    """What `run_node` is given; the test's own handlers of signals are put back."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id(os.environ)))
-    before = signal.getsignal(signal.SIGINT)
+    before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM)}
     yield lambda: rclpy.create_node("ending")
-    signal.signal(signal.SIGINT, before)
+    for which, handler in before.items():
+        signal.signal(which, handler)
 
 
-def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkeypatch):
+def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkeypatch, limits):
     def spin(_):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -35,15 +54,23 @@ def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkey
 
     monkeypatch.setattr(rclpy, "spin", spin)
     run_node(node)
+    assert limits == [(END_WITHIN_S, os._exit, (1,))]
 
 
-def test_what_goes_wrong_without_an_interrupt_is_told(node, monkeypatch):
+def test_a_node_that_is_asked_to_end_and_hangs_is_ended(node, monkeypatch, limits):
+    monkeypatch.setattr(rclpy, "spin", lambda _: signal.raise_signal(signal.SIGTERM))
+    run_node(node)
+    assert limits == [(END_WITHIN_S, os._exit, (1,))]
+
+
+def test_what_goes_wrong_without_an_interrupt_is_told(node, monkeypatch, limits):
     def spin(_):
         raise RuntimeError("a defect")
 
     monkeypatch.setattr(rclpy, "spin", spin)
     with pytest.raises(RuntimeError, match="a defect"):
         run_node(node)
+    assert limits == []
 
 
 def test_an_interrupt_shuts_ros_down_each_time_it_is_initialised(node):

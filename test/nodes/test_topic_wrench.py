@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wrenches of another ROS 2 driver, through a real topic."""
+"""Wrenches of another ROS 2 driver, through a real topic, on a clock that is told."""
 
-import contextlib
+import math
 import os
-import threading
 import time
-from dataclasses import replace
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,150 +12,179 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from dataclasses import replace
+from pathlib import Path
+
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from tactile_resonance.contact.cell_checks import samples_until_stuck
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.drivers.force_config import read_force_config
+from tactile_resonance.nodes import topic_wrench
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.nodes.topic_wrench import TopicWrench
+from tactile_resonance.nodes.topic_wrench import EARLIEST_S, FIRST_WITHIN_S, LATEST_S, TopicWrench
 from tactile_resonance.processes import free_domain_id
 
-CONFIG = read_force_config(Path("topic.yaml"), force_n=0.01)
-PATIENCE_S = 30.0
+CONFIG = replace(read_force_config(Path("topic.yaml"), force_n=0.01), latency_s=0.003)
+SILENT_S = CONFIG.limits.silent_s
+AHEAD_NS = 1_700_000_000 * 10**9  # ROS time less the clock's
+WITHIN_S = 60.0
 
 
-class Driver:
-    """Publishes noise of 1 mN about 10 mN, as fast as it can up to 500 Hz, from a thread of its own."""
+class Link:
+    """A driver, the source that hears it, and the clock of both."""
 
-    def __init__(self, node):
-        self._publisher = node.create_publisher(WrenchStamped, CONFIG.topic, 100)  # reliable
-        self.offset_s = 0.0
-        self.noise_n = 1e-3
-        self.force_n = 0.01
-        self.stamped = self.speaking = True
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+    def __init__(self, monkeypatch):
+        self.now_ns = 3_600 * 10**9
+        clock = SimpleNamespace(
+            monotonic=lambda: self.now_ns * 1e-9, time_ns=lambda: self.now_ns + AHEAD_NS
+        )
+        monkeypatch.setattr(topic_wrench, "time", clock)
+        self._heard, takes = [], TopicWrench._on_wrench
 
-    def end(self):
-        self._ended.set()
-        self._thread.join()
+        def take(source, message):
+            takes(source, message)
+            self._heard.append(message)
 
-    def _run(self):
-        rng = np.random.default_rng(1)
-        while not self._ended.wait(0.002):
-            if not self.speaking:
-                continue
+        monkeypatch.setattr(TopicWrench, "_on_wrench", take)
+        self.rng = np.random.default_rng(1)
+        self.node = Node("topic_wrench_test")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._publisher = self.node.create_publisher(WrenchStamped, CONFIG.topic, 100)  # reliable
+        self.source = TopicWrench(
+            self.node, CONFIG, SimpleNamespace(own_ns=lambda ros_ns: ros_ns - AHEAD_NS)
+        )
+        self.source.start()
+        self.wait(lambda: self._publisher.get_subscription_count() == 1)
+
+    def wait(self, holds):
+        deadline_s = time.monotonic() + WITHIN_S
+        while not holds() and time.monotonic() < deadline_s:
+            self._executor.spin_once(0.05)
+        assert holds()
+
+    def close(self):
+        self.source.close()
+        self.node.destroy_node()
+
+    def send(self, count=1, *, force_n=0.01, noise_n=1e-3, stamp_ns=None, later_ns=2_000_000):
+        """Send wrenches, the clock going on before each; returns what was sent."""
+        sent = []
+        for _ in range(count):
+            self.now_ns += later_ns
             message = WrenchStamped()
-            stamp_ns = time.time_ns() + round(self.offset_s * 1e9)
-            message.header.stamp = time_message(stamp_ns if self.stamped else 0)
-            noise = self.noise_n * rng.standard_normal(3)
-            message.wrench.force.x, message.wrench.force.y = noise[:2]
-            message.wrench.force.z = self.force_n + noise[2]
+            stamp = self.now_ns + AHEAD_NS if stamp_ns is None else stamp_ns
+            message.header.stamp = time_message(stamp)
+            noise = noise_n * self.rng.standard_normal(3)
+            force, torque = message.wrench.force, message.wrench.torque
+            force.x, force.y, force.z = *noise[:2], force_n + noise[2]
+            torque.x, torque.z = 0.01, 0.03
+            heard = len(self._heard)
             self._publisher.publish(message)
+            self.wait(lambda heard=heard: len(self._heard) > heard)
+            sent.append((self.now_ns, (force.x, force.y, force.z, 0.01, 0.0, 0.03)))
+        return sent
 
 
 @pytest.fixture
-def driver_and_source():
+def link(monkeypatch):
     with initialised(domain_id=free_domain_id(os.environ)):
-        node = Node("topic_wrench_test")
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        spinning = threading.Thread(target=executor.spin)
-        spinning.start()
-        driver = Driver(node)
-        # tests share their machine: slower to call the topic silent
-        config = replace(CONFIG, limits=replace(CONFIG.limits, silent_s=1.0))
-        source = TopicWrench(node, config)
-        yield driver, source
-        driver.end()
-        source.close()
-        executor.shutdown()
-        spinning.join()
-        node.destroy_node()
+        made = Link(monkeypatch)
+        yield made
+        made.close()
 
 
-def read_until(source, count):
-    """Samples in a row; begins anew where this machine stood still meanwhile."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    samples = []
-    while len(samples) < count:
-        try:
-            samples += source.read()
-        except ForceError:
-            assert time.monotonic() < deadline_s
-            samples = []
-            start(source)
-        time.sleep(0.002)
-    return samples
+def test_wrenches_arrive_in_order_as_sent_and_dated_when_they_were_measured(link):
+    sent = link.send(20)
+    samples = link.source.read()
+    assert [sample.wrench for sample in samples] == [wrench for _, wrench in sent]
+    assert [sample.time_ns for sample in samples] == [at - 3_000_000 for at, _ in sent]
+    assert not any(sample.overload for sample in samples)
+    assert link.source.read() == []
 
 
-def start(source):
-    """Start; again where this machine stood still meanwhile."""
-    for _ in range(5):
-        with contextlib.suppress(ForceError):
-            return source.start()
-    return source.start()
-
-
-def faults_of(source):
-    """Names of five faults on end: one that comes from a stall of this machine does not stay."""
-    names = []
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(names) < 5 and time.monotonic() < deadline_s:
-        try:
-            source.read()
-        except ForceError as error:
-            names.append(error.fault)
-            try:
-                source.start()
-            except ForceError as again:
-                names.append(again.fault)
-        time.sleep(0.002)
-    return names
-
-
-def test_wrenches_arrive_in_order_and_as_sent(driver_and_source):
-    _, source = driver_and_source
-    start(source)
-    samples = read_until(source, 200)
-    stamps = [sample.time_ns for sample in samples]
-    assert stamps == sorted(set(stamps))
-    mean = np.mean([sample.wrench for sample in samples], axis=0)
-    np.testing.assert_allclose(mean, [0, 0, 0.01, 0, 0, 0], atol=5e-3 / np.sqrt(len(samples)))
+STUCK = samples_until_stuck(CONFIG.info)
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "fault"),
+    ("count", "how", "fault", "text"),
     [
-        ("speaking", False, ForceFault.SILENT),
-        ("noise_n", 0.0, ForceFault.STUCK),
-        ("stamped", False, ForceFault.INVALID),
-        ("offset_s", -3.0, ForceFault.INVALID),
-        ("offset_s", 3.0, ForceFault.INVALID),
-        ("force_n", 6.0, ForceFault.OVERLOAD),
-        ("force_n", float("nan"), ForceFault.INVALID),
+        (STUCK, {"noise_n": 0.0}, ForceFault.STUCK, "equal on all axes"),
+        (1, {"stamp_ns": 0}, ForceFault.INVALID, "its messages have no time stamp"),
+        (2, {"stamp_ns": 3_600 * 10**9 + AHEAD_NS + 2_000_000}, ForceFault.INVALID, "do not incr"),
+        (3, {"force_n": 6.0}, ForceFault.OVERLOAD, "3 samples beyond the range; Fz is 6"),
+        (1, {"force_n": math.nan}, ForceFault.INVALID, "Fz is not finite"),
     ],
 )
-def test_faults_are_named_and_end(driver_and_source, name, value, fault):
-    driver, source = driver_and_source
-    start(source)
-    good = getattr(driver, name)
-    setattr(driver, name, value)
-    assert faults_of(source).count(fault) >= 3
-    setattr(driver, name, good)
-    time.sleep(0.1)
-    start(source)
-    read_until(source, 20)
+def test_faults_are_named_stay_and_end_with_a_new_start(link, count, how, fault, text):
+    if count > 1:
+        link.send(count - 1, **how)
+        link.source.read()  # not one too early
+    link.send(**how)
+    for _ in range(2):
+        with pytest.raises(ForceError, match=text) as caught:
+            link.source.read()
+        assert caught.value.fault is fault
+    link.send(5)
+    with pytest.raises(ForceError, match=text):
+        link.source.read()
+    link.source.start()
+    if count > 1:
+        link.send(count - 1, **how)  # what was before does not count
+    link.send(5)
+    assert len(link.source.read()) == count - 1 + 5
 
 
-def test_a_topic_on_which_nobody_speaks_is_silent(driver_and_source):
-    driver, source = driver_and_source
-    driver.speaking = False
-    time.sleep(0.1)
-    with pytest.raises(ForceError, match="no wrench within") as caught:
-        source.start()
+@pytest.mark.parametrize(
+    ("age_s", "taken"),
+    [(0.99 * LATEST_S, True), (1.01 * LATEST_S, False), (3.0, False)]
+    + [(-0.9 * EARLIEST_S, True), (-1.1 * EARLIEST_S, False), (-3.0, False)],
+)
+def test_stamps_of_another_clock_are_refused(link, age_s, taken):
+    link.send(stamp_ns=link.now_ns + 2_000_000 + AHEAD_NS - round(age_s * 1e9))
+    if taken:
+        assert len(link.source.read()) == 1
+        return
+    with pytest.raises(ForceError, match="are the clocks of both machines synchronised") as caught:
+        link.source.read()
+    assert caught.value.fault is ForceFault.INVALID
+    assert f"is {age_s:.3g} s old" in str(caught.value)
+
+
+def test_a_topic_that_falls_silent_is_said_to_be_so_after_its_limit(link):
+    link.send(3)
+    link.now_ns += round(0.99 * SILENT_S * 1e9)
+    assert len(link.source.read()) == 3  # what came counts, also where it is read late
+    assert link.source.read() == []
+    link.now_ns += round(0.02 * SILENT_S * 1e9)
+    with pytest.raises(ForceError, match=r"topic wrench_raw: silent for 20 ms") as caught:
+        link.source.read()
     assert caught.value.fault is ForceFault.SILENT
+
+
+def test_a_topic_on_which_nobody_speaks_is_silent_two_seconds_after_the_start(link):
+    link.source.start()
+    link.now_ns += round(0.99 * FIRST_WITHIN_S * 1e9)
+    assert link.source.read() == []
+    link.now_ns += round(0.02 * FIRST_WITHIN_S * 1e9)
+    with pytest.raises(ForceError, match="silent for 2020 ms") as caught:
+        link.source.read()
+    assert caught.value.fault is ForceFault.SILENT
+    # a driver that comes up later is heard from the next start on
+    link.send(2)
+    link.source.start()
+    link.send(2)
+    assert len(link.source.read()) == 2
+
+
+def test_what_is_not_listened_to_is_not_read(link):
+    link.send(2)
+    link.source.close()
+    link.send(2)
+    with pytest.raises(ForceError, match="topic wrench_raw: not started") as caught:
+        link.source.read()
+    assert caught.value.fault is ForceFault.LINK_LOST

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which poles are a reference of air and which tell a touch, by when their measurement was taken."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -15,6 +13,7 @@ from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 SECOND_NS = 10**9
+BEGAN_NS = 1000 * SECOND_NS
 AIR, GELATINE = (246.60, 0.0119), (249.0, 0.020)
 STD = np.array([0.01, 5e-5])
 
@@ -42,9 +41,9 @@ class Listener:
     """A `TouchFromPoles` with a clock that is told."""
 
     def __init__(self, references=3):
-        self.told, self.now_ns = 0, time.time_ns() + 2 * SECOND_NS
+        self.told, self.now_ns = 0, BEGAN_NS + 2 * SECOND_NS
         self.rng = np.random.default_rng(2)
-        self.touch = TouchFromPoles(1e-6, self._tell)
+        self.touch = TouchFromPoles(1e-6, self._tell, BEGAN_NS)
         for _ in range(references):
             self.hear(AIR, State.IDLE)
 
@@ -101,6 +100,17 @@ def test_measurement_that_began_in_contact_is_no_reference_and_no_touch():
     listener.stay(State.APPROACH, 0.5)
     assert not listener.hear(AIR, State.APPROACH)
     assert listener.hear(GELATINE, State.APPROACH)
+
+
+def test_measurement_that_began_before_all_that_is_known_is_no_reference():
+    listener = Listener(references=0)
+    # whether the tip was in air then nobody can tell
+    listener.hear(AIR, State.IDLE, length_s=1.5, passed=True)
+    for _ in range(2):
+        listener.hear(AIR, State.IDLE)
+    listener.stay(State.APPROACH, 1.5)
+    assert not listener.hear(GELATINE, State.APPROACH)
+    assert listener.told == 0
 
 
 def test_poles_without_covariance_are_said_to_be_of_no_use():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bench without robot and nodes, whose poles have a known spread, and scans on it."""
+"""A bench without robot and nodes, whose poles have a known spread and whose time is told, and scans on it."""
 
 import time
 from dataclasses import dataclass, field, replace
@@ -19,17 +19,29 @@ from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import ScanScene
 
 SPREAD_HZ = 0.02
+TOUCH_S, BLOCK_S = 0.01, 0.01
 
 
 @dataclass
 class Bench:
-    """Hands on a bench whose poles have a spread that falls with the root of the blocks."""
+    """Hands on a bench whose poles have a spread that falls with the root of the blocks.
+
+    Its time goes on by `TOUCH_S` in a touch and by `BLOCK_S` in a block.
+    """
 
     log: list = field(default_factory=list)
     failing: tuple = ()
     on_measure: object = None
     holding: bool = False
     free_air: bool = True
+    time_s: float = 1000.0
+    seeds: list = field(default_factory=list)
+
+    def now_s(self):
+        return self.time_s
+
+    def begin(self, *integers):
+        self.seeds.append(integers)
 
     def missing(self):
         return None
@@ -39,6 +51,7 @@ class Bench:
         assert not self.holding, "the tip was not drawn back before the next point"
         if point.index in self.failing:
             raise PointFailed("contact: surface_missing: nothing there")
+        self.time_s += TOUCH_S
         self.holding = True
         self.log.append(("touch", point.index))
 
@@ -48,6 +61,7 @@ class Bench:
         while blocks < design.periods:
             check()
             blocks += 1
+            self.time_s += BLOCK_S
             covariance = np.diag([SPREAD_HZ**2, 1e-9]) / blocks
             poles = Poles(
                 poles_rad_s=np.array([-50 + 1600j]),

@@ -23,7 +23,7 @@ from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from bench_hands import SPREAD_HZ, Bench, begin, scan, scene
+from bench_hands import BLOCK_S, SPREAD_HZ, TOUCH_S, Bench, begin, scan, scene
 
 
 def test_each_point_is_measured_until_it_is_precise_enough_and_kept(tmp_path):
@@ -41,6 +41,12 @@ def test_each_point_is_measured_until_it_is_precise_enough_and_kept(tmp_path):
     seeds = [entry[2] for entry in bench.log if entry[0] == "measure" and entry[1] != "air"]
     assert seeds == [1, 2, 3, 4]
     assert [entry[1] for entry in bench.log if entry[0] == "measure"][::5] == ["air", "air"]
+    # simulated noise is that of run, place and attempt, whatever was measured before
+    assert bench.seeds == [(1, 4, 0), *((1, index, 0) for index in range(4)), (1, 5, 0)]
+    # durations are those of the bench's time
+    assert [result.duration_s for result in run.latest] == pytest.approx(
+        [TOUCH_S + 4 * BLOCK_S] * 4
+    )
     assert not bench.holding
     assert told[-1].finished == 4
 
@@ -96,7 +102,9 @@ def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     with run:
         ScanRunner(made, plan, run, Bench(), controls, lambda progress: None).run()
         controls.ask(Request.REPEAT)
-        ScanRunner(made, plan, run, Bench(), controls, lambda progress: None).run()
+        again = Bench()
+        ScanRunner(made, plan, run, again, controls, lambda progress: None).run()
+    assert again.seeds == [(1, 1, 1)]  # it has noise of its own
     content = read_run(tmp_path / "run")
     assert [(r.index, r.attempt) for r in content.results] == [(0, 0), (1, 0), (1, 1)]
 
@@ -160,8 +168,8 @@ def test_killed_at_random_moments_no_finished_point_is_lost_or_repeated(tmp_path
         text=True,
     ) as scans:
         for run in range(60):
-            # longer from run to run: a machine with much other work comes to the end too
-            print(rng.uniform(0.0, 0.15 + 0.01 * run), file=scans.stdin, flush=True)
+            # ever longer: a machine with much other work comes to the end too
+            print(rng.uniform(0.0, 0.15 * 1.12**run), file=scans.stdin, flush=True)
             status = int(scans.stdout.readline())
             assert status in (0, -signal.SIGKILL)
             kills += status != 0

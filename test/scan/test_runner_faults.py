@@ -96,6 +96,7 @@ class Leaving(Bench):
 
     def missing(self):
         assert not self.holding, "waits with the tip on the tissue"
+        self.time_s += 1.0 if self.away else 0.0
         self.away = max(0, self.away - 1)
         return "frf: /frf_node is not active" if self.away else None
 

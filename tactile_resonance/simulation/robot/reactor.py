@@ -199,7 +199,7 @@ class Reactor:
         except OSError as error:
             channel.close()
             raise ValueError(
-                f"port {port} of {self.host}: {error.strerror}; does another simulated robot run "
+                f"port {port} of {self.host}: {error.strerror}; does another simulation run "
                 "there? --host takes any address 127.x.y.z"
             ) from error
         channel.setblocking(False)

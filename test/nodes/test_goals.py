@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goals whose answers are late or lost, on a clock that is told: none is left of which nobody knows."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+from action_msgs.msg import GoalStatus
+from rclpy.action.client import ClientGoalHandle
+from rclpy.task import Future
+
+from tactile_resonance.nodes import goals as goals_module
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, TAKEN_WITHIN_S, Goals
+from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
+
+REFUSED = "refused"
+LOST = None
+
+
+@dataclass
+class Late:
+    """The question itself comes so late [s]."""
+
+    by_s: float
+
+
+def nothing():
+    """Neither poll nor check has anything to say."""
+
+
+class Node:
+    """A node that takes goals, seen through a client; time goes on in `pause` alone.
+
+    As rclpy's server does, it refuses an id that it knows, and answers for the result of one that it does not
+    know that it is unknown.
+
+    Parameters
+    ----------
+    answers : dict
+        Delay of the answer to the n-th question [s], `LOST`, `REFUSED`, or `Late`; by default at once.
+    """
+
+    def __init__(self, answers):
+        self.now_s, self.up = 0.0, True
+        self.answers = answers
+        self.asked, self.running, self.cancelled = [], [], []
+        self.results = {}
+        self._due = []
+
+    # the clock
+
+    def monotonic(self):
+        return self.now_s
+
+    def pause(self, seconds):
+        self.now_s += seconds
+        due = [entry for entry in self._due if entry[0] <= self.now_s]
+        self._due = [entry for entry in self._due if entry[0] > self.now_s]
+        for _, happens in due:
+            happens()
+
+    def _later(self, delay_s, result):
+        future = Future(executor=None)
+        if delay_s is not LOST:
+            self._due.append((self.now_s + delay_s, lambda: future.set_result(result)))
+        return future
+
+    # the client
+
+    def server_is_ready(self):
+        return self.up
+
+    def send_goal_async(self, goal, feedback, goal_uuid):
+        answer = self.answers.get(len(self.asked), 0.0)
+        self.asked.append(bytes(goal_uuid.uuid))
+        if not isinstance(answer, Late):
+            handle = self._take(goal_uuid, answer != REFUSED)
+            return self._later(0.0 if answer == REFUSED else answer, handle)
+        future = Future(executor=None)
+        arrives = (self.now_s + answer.by_s, lambda: future.set_result(self._take(goal_uuid, True)))
+        self._due.append(arrives)
+        return future
+
+    def _take(self, goal_uuid, ready):
+        goal_id = bytes(goal_uuid.uuid)
+        accepted = ready and goal_id not in self.results
+        if accepted:
+            self.running.append(goal_id)
+            self.results[goal_id] = Future()
+        return ClientGoalHandle(self, goal_uuid, SimpleNamespace(accepted=accepted))
+
+    def _cancel_goal_async(self, handle):
+        goal_id = bytes(handle.goal_id.uuid)
+        self.cancelled.append(goal_id)
+        known = goal_id in self.running
+        if known:
+            self.end(goal_id, GoalStatus.STATUS_CANCELED)
+        return self._later(0.0, SimpleNamespace(goals_canceling=[goal_id] if known else []))
+
+    def _get_result_async(self, handle):
+        goal_id = bytes(handle.goal_id.uuid)
+        unknown = SimpleNamespace(status=GoalStatus.STATUS_UNKNOWN, result=None)
+        return self.results.get(goal_id) or self._later(0.0, unknown)
+
+    def end(self, goal_id, status=GoalStatus.STATUS_SUCCEEDED):
+        self.running.remove(goal_id)
+        self.results[goal_id].set_result(SimpleNamespace(status=status, result=status))
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """Makes a node and the goals asked of it."""
+
+    def make(answers=None):
+        node = Node(answers or {})
+        monkeypatch.setattr(goals_module, "time", node)
+        return node, Goals(node, "measure", node.pause)
+
+    return make
+
+
+def ended_by(node, error, after_s):
+    """A check that raises from a time on."""
+
+    def check():
+        if node.now_s > after_s:
+            raise error
+
+    return check
+
+
+def test_a_goal_is_asked_for_once_and_followed_to_its_end(taken):
+    node, goals = taken()
+    handle = goals.send("goal", nothing, nothing)
+    assert handle.accepted
+    (goal_id,) = node.asked
+    node.end(goal_id)
+    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert node.cancelled == []
+
+
+@pytest.mark.parametrize(
+    "answers", [{0: 5.0}, {0: 5.0, 1: LOST, 2: LOST}, {0: LOST}, {0: LOST, 1: 1.0}]
+)
+def test_a_late_or_lost_answer_is_asked_for_under_the_same_id_and_the_goal_is_taken_once(
+    taken, answers
+):
+    node, goals = taken(answers)
+    handle = goals.send("goal", nothing, nothing)
+    assert node.now_s > ASK_AGAIN_S
+    assert len(node.asked) > 1
+    assert len(set(node.asked)) == 1
+    assert node.running == [bytes(handle.goal_id.uuid)]
+    node.end(node.asked[0])
+    # it is the goal that is followed, whatever its second question was answered
+    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert node.cancelled == []
+
+
+def test_a_goal_that_is_refused_is_asked_for_again_as_another(taken):
+    node, goals = taken({0: REFUSED, 1: REFUSED})
+    handle = goals.send("goal", nothing, nothing)
+    assert len(set(node.asked)) == 3
+    assert node.running == [bytes(handle.goal_id.uuid)] == node.asked[-1:]
+
+
+def test_a_question_that_comes_after_the_same_was_refused_leaves_no_goal_behind(taken):
+    node, goals = taken({0: Late(10.0), 1: REFUSED})
+    handle = goals.send("goal", nothing, nothing)
+    assert node.running == [bytes(handle.goal_id.uuid)]
+    assert node.running[0] != node.asked[0]
+    node.pause(20.0)
+    assert node.cancelled == node.asked[:1]
+    assert node.running == [bytes(handle.goal_id.uuid)]
+
+
+@pytest.mark.parametrize("answers", [{0: 1.0}, {0: LOST}, {0: 3.0}, {0: Late(1.0)}, {0: Late(5.0)}])
+@pytest.mark.parametrize(
+    "error", [Interrupted("enough"), PointFailed("no"), ScanEnded("no"), KeyboardInterrupt()]
+)
+def test_a_goal_that_is_given_up_before_its_answer_came_does_not_go_on(taken, answers, error):
+    node, goals = taken(answers)
+    with pytest.raises(type(error)):
+        goals.send("goal", ended_by(node, error, 0.5), nothing)
+    node.pause(10.0)  # what is late comes now
+    assert node.running == []
+    assert set(node.cancelled) == set(node.asked)
+
+
+def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was_taken(taken):
+    node, goals = taken({0: 3.0})
+
+    def poll():
+        node.up = node.now_s < 1.0
+
+    with pytest.raises(NodeAway, match="measure: its node went away"):
+        goals.send("goal", nothing, poll)
+    node.pause(10.0)
+    assert node.running == []
+
+
+def test_a_goal_that_nobody_takes_ends_the_scan(taken):
+    node, goals = taken(dict.fromkeys(range(10000), REFUSED))
+    with pytest.raises(ScanEnded, match="measure: no node takes the goal for 60 s"):
+        goals.send("goal", nothing, nothing)
+    assert node.now_s == pytest.approx(TAKEN_WITHIN_S, abs=0.1)
+    node, goals = taken()
+    node.up = False
+    with pytest.raises(ScanEnded):
+        goals.send("goal", nothing, nothing)
+    assert node.asked == []
+
+
+@pytest.mark.parametrize("error", [Interrupted("enough"), PointFailed("no"), ScanEnded("no")])
+def test_a_goal_that_is_left_is_cancelled_and_waited_for(taken, error):
+    node, goals = taken()
+    handle = goals.send("goal", nothing, nothing)
+    with pytest.raises(type(error)):
+        goals.follow(handle, ended_by(node, error, node.now_s + 1.0), nothing)
+    assert node.cancelled == node.asked
+    assert node.running == []
+
+
+def test_a_goal_of_a_node_that_was_started_anew_is_not_waited_for(taken):
+    node, goals = taken()
+    handle = goals.send("goal", nothing, nothing)
+    node.results.clear()
+    node.running.clear()
+    with pytest.raises(NodeAway, match="its node does not know the goal"):
+        goals.follow(handle, nothing, nothing)
+    assert node.now_s < 1.0
