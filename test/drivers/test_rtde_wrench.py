@@ -106,9 +106,9 @@ def test_a_robot_clock_that_stands_still_is_silence():
     config = replace(CONFIG, limits=replace(CONFIG.limits, silent_s=0.004))
     source = RtdeWrench(config, states, clock)
     source.start()
-    clock.ns += 4_000_000
+    clock.ns += 3_900_000
     assert source.read() == []
-    clock.ns += 100_000
+    clock.ns += 200_000
     with pytest.raises(ForceError, match="no new state") as caught:
         source.read()
     assert caught.value.fault is ForceFault.SILENT
