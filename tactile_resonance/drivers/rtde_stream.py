@@ -117,12 +117,9 @@ class RtdeStream:
         ConnectionError
             Where the robot has closed the connection, or sends what is no RTDE.
         """
-        try:
-            data = self._socket.recv(_AT_ONCE)
-        except BlockingIOError:
-            return []
+        data = self._received()
         if not data:
-            raise ConnectionError("the robot has closed the connection")
+            return []
         buffer = self._buffer + data if self._buffer else data
         states, at, size = [], 0, _STATE.size
         while len(buffer) - at >= size:
@@ -142,6 +139,18 @@ class RtdeStream:
     def close(self) -> None:
         """Disconnect."""
         self._socket.close()
+
+    def _received(self) -> bytes:
+        """All that has come: who has not looked for long wants the newest state too."""
+        parts: list[bytes] = []
+        while not parts or len(parts[-1]) == _AT_ONCE:
+            try:
+                parts.append(self._socket.recv(_AT_ONCE))
+            except BlockingIOError:
+                break
+        if parts == [b""]:
+            raise ConnectionError("the robot has closed the connection")
+        return b"".join(parts)
 
     def _skip(self, buffer: bytes, at: int) -> int | None:
         """Where the packet after one that is no state begins; None where it is not whole yet."""

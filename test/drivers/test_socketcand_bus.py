@@ -5,9 +5,12 @@ Texts are those of linux-can/socketcand, doc/protocol.md.
 """
 
 import contextlib
+import fcntl
 import socket
+import termios
 import threading
 import time
+from array import array
 
 import numpy as np
 import pytest
@@ -139,6 +142,10 @@ def test_it_is_drained_once_nothing_more_waits(opened, monkeypatch):
     assert bus.read() == []
     assert bus.drained
     server.channel.sendall(TEXTS[0][0] * 25)
+    there, end_s = array("i", [0]), time.monotonic() + PATIENCE_S
+    while there[0] < 25 * len(TEXTS[0][0]):
+        assert time.monotonic() < end_s
+        fcntl.ioctl(bus._socket.fileno(), termios.FIONREAD, there)
     seen = []
     while bus.frames < 25:
         bus.wait(PATIENCE_S)
@@ -162,6 +169,7 @@ def test_a_server_that_closes_is_found_after_its_last_frame(opened, said):
     server.channel.sendall(said)
     server.channel.close()
     if said:
+        bus.wait(PATIENCE_S)
         assert len(bus.read()) == 1
     with pytest.raises(ConnectionError, match="closed the connection"):
         read(bus, 1)

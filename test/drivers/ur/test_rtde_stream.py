@@ -6,15 +6,19 @@ Universal Robots, "Real-Time Data Exchange (RTDE) Guide": a packet is its length
 """
 
 import contextlib
+import fcntl
 import os
 import socket
 import struct
+import termios
 import threading
 import time
+from array import array
 
 import numpy as np
 import pytest
 
+from tactile_resonance.drivers import rtde_stream
 from tactile_resonance.drivers.rtde_stream import PORT, RobotState, RtdeStream
 
 HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.231"
@@ -121,6 +125,14 @@ def read(stream, count):
     return states
 
 
+def arrived(stream, size):
+    """Wait until so many bytes are there to be read."""
+    there, end_s = array("i", [0]), time.monotonic() + PATIENCE_S
+    while there[0] < size:
+        assert time.monotonic() < end_s, f"{there[0]} bytes of {size}"
+        fcntl.ioctl(stream.fileno(), termios.FIONREAD, there)
+
+
 def test_it_asks_for_version_2_and_its_variables_at_its_rate(connected):
     robot, stream = connected
     assert tuple(robot.heard) == REQUESTS
@@ -169,11 +181,24 @@ def test_a_state_is_there_as_soon_as_its_last_byte_is(connected):
     assert read(stream, 1) == [state(1)]
 
 
+@pytest.mark.parametrize("at_once", [100, len(data(state(0))), 5 * len(data(state(0))), 1 << 16])
+def test_one_look_brings_all_that_has_come(connected, monkeypatch, at_once):
+    """However long nobody has looked: the newest state is among them."""
+    robot, stream = connected
+    monkeypatch.setattr(rtde_stream, "_AT_ONCE", at_once)
+    states = [state(n) for n in range(50)]
+    text = b"".join(map(data, states))
+    robot.channel.sendall(text)
+    arrived(stream, len(text))
+    assert stream.read() == states
+
+
 def test_nothing_to_read_is_nothing_and_a_closed_connection_an_error(connected):
     robot, stream = connected
     assert stream.read() == []
     robot.channel.sendall(data(state(1)))
     robot.channel.close()
+    arrived(stream, len(data(state(1))))
     assert stream.read() == [state(1)]
     with pytest.raises(ConnectionError, match="the robot has closed the connection"):
         read(stream, 1)
