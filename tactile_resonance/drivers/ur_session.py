@@ -120,7 +120,8 @@ class Session:
     def _settle(self) -> None:
         """In simulated time: let the library see that the program is ready for the next command."""
         if self._clock is not None:
-            self._clock.wait_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ), Demand.REAL)
+            # told itself, also where a loop that leads is told in its place
+            self._clock.sleep_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ))
 
     def _limit_time(self) -> None:
         """A watchdog counts as soon as it is set: simulated time waits for the library before it expires."""
