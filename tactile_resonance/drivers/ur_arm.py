@@ -55,6 +55,7 @@ class UrArm:
         self._clock: Clock = WallClock()
         self._own: SimulatedClock | None = None  # in simulated time: asks for it
         self._led: SimulatedClock | None = None  # and is told it, while a loop leads it
+        self._dated = True  # states are, by the time that is told; else from the next one on
         self._pending: Command | None = None  # goes with the next word on the time
         self._until_ns = 0
         self._said_s = self._heard_s = 0.0  # when the client was told something, the robot heard
@@ -132,6 +133,7 @@ class UrArm:
         self._guard()
         if self._led is not None:
             self._ask({"name": "lead"})
+            self._dated = False  # time has gone on while nobody was told
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -210,13 +212,12 @@ class UrArm:
         if self._time:
             name = self._time_name
             led = SimulatedClock(self._time, f"{name}: loop", told_with=name)
-            self._clock = self._led = led
             self._bus_port = bus_port
+            self._led = led
             self._name_ports()
             self._ask({"name": "lead"})
             led.refresh()
-            self._begin_states()
-            self._wait_for_first()
+            self._clock, self._dated = led, False
 
     def follow(self) -> None:
         """Leave the time to itself."""
@@ -259,6 +260,9 @@ class UrArm:
             while led.now_ns() < time_ns:
                 led.wait_told(check)
             self._catch_up(led.robot_ns)
+            if not self._dated and self._states is not None:
+                self._states.date_anew()
+                self._dated = True
         except ArmError:  # told by `state`
             time.sleep(AWAY_S)
             led.ask_ns()
@@ -282,7 +286,8 @@ class UrArm:
         try:
             self._fresh()
         except ArmError:
-            self._client.end()
+            if self._client is not None:  # else it was given up just now
+                self._client.end()
             self._forget()
             return False
         assert self._states is not None
@@ -293,6 +298,7 @@ class UrArm:
         self._states.guard(False)
         self._ask({"name": "restart"})
         self._guard()
+        self._dated = self._led is None
         return True
 
     def _begin(self) -> None:
@@ -302,7 +308,8 @@ class UrArm:
                 self._own = SimulatedClock(self._time, f"{self._time_name}: owner")
                 self._clock = _Asked(self._own)
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
-            self._begin_states()
+            trip_s = 0.0 if self._time else self._stream.round_trip_s
+            self._states = StateReader(self._stream, lambda: self._clock.now_ns(), trip_s)
             if self._led is not None:
                 self._name_ports()
             self._wait_for_first()
@@ -313,12 +320,6 @@ class UrArm:
         except ArmError:
             self._forget()
             raise
-
-    def _begin_states(self) -> None:
-        assert self._stream is not None
-        guarded = self._states is not None
-        self._states = StateReader(self._stream, self._clock)
-        self._states.guard(guarded)
 
     def _name_ports(self) -> None:
         assert self._led is not None

@@ -93,8 +93,8 @@ class States:
     def __init__(self, round_trip_s=2e-4):
         self.sent = []
         self.now = 10**12
-        stream = SimpleNamespace(read=self._take, round_trip_s=round_trip_s)
-        self.reader = StateReader(stream, SimpleNamespace(now_ns=lambda: self.now))
+        stream = SimpleNamespace(read=self._take)
+        self.reader = StateReader(stream, lambda: self.now, round_trip_s)
 
     def _take(self):
         sent, self.sent = self.sent, []
