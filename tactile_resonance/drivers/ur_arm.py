@@ -127,13 +127,14 @@ class UrArm:
         if self._client is not None and self._connect_again():
             return
         self._begin()
-        self._client = ClientProcess(self.config)
+        client = ClientProcess(self.config)
         names = {"time": self._time, "time_name": self._time_name}
-        self._ask({"name": "connect", "config": self.config.to_dict(), **names})
-        self._guard()
+        self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
         if self._led is not None:
-            self._ask({"name": "lead"})
+            self._ask({"name": "lead"}, client)
             self._dated = False  # time has gone on while nobody was told
+        self._client = client  # not before: a loop in another thread would speak to it
+        self._guard()
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -212,11 +213,10 @@ class UrArm:
         if self._time:
             name = self._time_name
             led = SimulatedClock(self._time, f"{name}: loop", told_with=name)
-            self._bus_port = bus_port
+            self._bus_port, self._named = bus_port, (0, 0)
             self._led = led
-            self._name_ports()
             self._ask({"name": "lead"})
-            led.refresh()
+            led.ask_ns()
             self._clock, self._dated = led, False
 
     def follow(self) -> None:
@@ -244,6 +244,7 @@ class UrArm:
             time.sleep(AWAY_S)
             led.ask_ns()
             return
+        self._name_ports(led)
         command, self._pending = self._pending or Command(NOTHING), None
 
         def check() -> None:
@@ -259,6 +260,8 @@ class UrArm:
                 client.send(command._replace(until_ns=time_ns, demand=int(demand)))
             while led.now_ns() < time_ns:
                 led.wait_told(check)
+            if not self._dated:
+                led.ask_ns()  # what was told while it connected lies behind
             self._catch_up(led.robot_ns)
             if not self._dated and self._states is not None:
                 self._states.date_anew()
@@ -310,8 +313,6 @@ class UrArm:
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
             trip_s = 0.0 if self._time else self._stream.round_trip_s
             self._states = StateReader(self._stream, lambda: self._clock.now_ns(), trip_s)
-            if self._led is not None:
-                self._name_ports()
             self._wait_for_first()
             self._check_stop()
         except ConnectionError as error:
@@ -321,10 +322,13 @@ class UrArm:
             self._forget()
             raise
 
-    def _name_ports(self) -> None:
-        assert self._led is not None
-        assert self._stream is not None
-        self._led.ports(self._stream.local_port, self._bus_port())
+    def _name_ports(self, led: SimulatedClock) -> None:
+        """Have the bench tell of the connections to robot and cell, either of which may be a new one."""
+        ports = 0 if self._stream is None else self._stream.local_port, self._bus_port()
+        if ports != self._named:
+            led.ports(*ports)
+            led.ask_ns()  # it has heard that
+            self._named = ports
 
     def _guard(self) -> None:
         """See that the program runs; from now on no other counts as ours."""
@@ -364,11 +368,13 @@ class UrArm:
         if stop is not None:  # not released yet; the connection is good
             raise ArmError(*stop)
 
-    def _ask(self, request: dict) -> None:
-        assert self._client is not None
+    def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
+        client = client or self._client
+        assert client is not None
         try:
-            self._client.ask(request, self._read)
-        except ArmError as error:  # it has ended
+            client.ask(request, self._read)
+        except ArmError as error:
+            client.end()
             runs = self._states is not None and self._states.newest is not None
             runs = runs and self._states.newest.runtime_state == PROGRAM_PLAYING
             self._forget()
@@ -390,12 +396,12 @@ class UrArm:
         else:
             self._client.send(command)
 
-    def _read(self) -> None:
-        """Take the states that have come."""
+    def _read(self, told: bool = False) -> None:
+        """Take the states that have come; `told`: whoever leads knows what time it is now."""
         assert self._states is not None
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read():
+                if self._states.read(told or self._led is None):
                     self._heard_s = time.monotonic()
         except ConnectionError as error:
             if self._client is not None:
@@ -408,12 +414,12 @@ class UrArm:
         """Wait for the state that the bench has sent."""
         assert self._stream is not None
         assert self._states is not None
-        self._read()
+        self._read(told=True)
         while (newest := self._states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
             select.select([self._stream], [], [], 0.1)
-            self._read()
+            self._read(told=True)
 
     def _fresh(self) -> ArmSample:
         """Return the newest state, and show the client that its owner lives."""

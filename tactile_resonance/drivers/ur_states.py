@@ -69,8 +69,11 @@ class StateReader:
         """From now on no program but the one that runs counts as ours; or forget that."""
         self._guarded, self._ended = on, False
 
-    def read(self) -> bool:
-        """Take what has come, without waiting; whether that was anything. Raises `ConnectionError`."""
+    def read(self, now_known: bool = True) -> bool:
+        """Take what has come, without waiting; whether that was anything. Raises `ConnectionError`.
+
+        Where it is not known what time it is now, states are dated by those before.
+        """
         states = self._stream.read()
         last_s = -math.inf if self.newest is None else self.newest.robot_time_s
         # a robot that stands still in simulated time says the same again
@@ -83,22 +86,23 @@ class StateReader:
         newest = self.newest = fresh[-1]
         while self._stamps[0] < newest.robot_time_s - 1.0 or self._stamps[0] > newest.robot_time_s:
             self._stamps.popleft()
-        self._date(newest)
+        self._date(newest, now_known)
         return True
 
     def date_anew(self) -> None:
         """Forget how the robot's clock was related to this one: the newest state is of now."""
         self._tracker = self._new_tracker()
         if self.newest is not None:
-            self._date(self.newest)
+            self._date(self.newest, True)
 
     def _new_tracker(self) -> ClockTracker:
         # what all messages share cannot be seen by listening: half of the round trip, and how long a
         # state waits in the robot before it is sent, at most a cycle
         return ClockTracker(self._trip_s / 2, math.hypot(self._trip_s, CYCLE_S) / 12**0.5)
 
-    def _date(self, newest: RobotState) -> None:
-        self._tracker.add(newest.robot_time_s, self._now_ns())
+    def _date(self, newest: RobotState, now_known: bool) -> None:
+        if now_known or self.sample is None:
+            self._tracker.add(newest.robot_time_s, self._now_ns())
         runtime = PROGRAM_STOPPED if self.revived else newest.runtime_state
         self.fault = motion_fault(newest.safety_bits, newest.robot_mode, runtime)
         self.sample = ArmSample(

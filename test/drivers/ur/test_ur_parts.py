@@ -164,6 +164,23 @@ def test_times_are_those_of_the_quickest_states_however_late_others_come():
     assert 0.002 / 12**0.5 < std_s < 1e-3
 
 
+def test_where_the_time_is_not_known_states_are_dated_by_those_before():
+    states = States(round_trip_s=0.0)
+    states.sent = [state(1.0)]
+    states.reader.read()
+    begun_ns = states.reader.sample.time_ns
+    states.sent = [state(1.002)]  # come, while this clock still shows the time before
+    states.reader.read(now_known=False)
+    assert states.reader.sample.time_ns == begun_ns + 2_000_000
+    states.now += 4_000_000
+    states.read(state(1.004))
+    assert states.reader.sample.time_ns == states.now
+    states.now += 1_000_000_000
+    states.read(state(1.006))
+    states.reader.date_anew()
+    assert states.reader.sample.time_ns == states.now
+
+
 @pytest.mark.parametrize(
     ("states_of_program", "fault", "revived"),
     [
