@@ -117,37 +117,47 @@ class RtdeStream:
         ConnectionError
             Where the robot has closed the connection, or sends what is no RTDE.
         """
-        try:
-            data = self._socket.recv(_AT_ONCE)
-        except BlockingIOError:
-            return []
+        data = self._received()
         if not data:
-            raise ConnectionError("the robot has closed the connection")
+            return []
         buffer = self._buffer + data if self._buffer else data
         states, at, size = [], 0, _STATE.size
         while len(buffer) - at >= size:
             length, kind, _, *values = _STATE.unpack_from(buffer, at)
             if length != size or kind != _DATA:
-                at = self._skip(buffer, at)
-                if at < 0:
+                begin = self._skip(buffer, at)
+                if begin is None:
                     break
+                at = begin
                 continue
             at += size
             v = values
             states.append(RobotState(v[0], tuple(v[1:7]), tuple(v[7:13]), tuple(v[13:19]), *v[19:]))
-        self._buffer = buffer[at:] if at >= 0 else buffer
+        self._buffer = buffer[at:]
         return states
 
     def close(self) -> None:
         """Disconnect."""
         self._socket.close()
 
-    def _skip(self, buffer: bytes, at: int) -> int:
-        """Where the packet after one that is no state begins; below 0 where it is not whole yet."""
+    def _received(self) -> bytes:
+        """All that has come: who has not looked for long wants the newest state too."""
+        parts: list[bytes] = []
+        while not parts or len(parts[-1]) == _AT_ONCE:
+            try:
+                parts.append(self._socket.recv(_AT_ONCE))
+            except BlockingIOError:
+                break
+        if parts == [b""]:
+            raise ConnectionError("the robot has closed the connection")
+        return b"".join(parts)
+
+    def _skip(self, buffer: bytes, at: int) -> int | None:
+        """Where the packet after one that is no state begins; None where it is not whole yet."""
         (length, _) = _HEAD.unpack_from(buffer, at)
         if length < _HEAD.size:
             raise ConnectionError(f"the robot sends a packet of {length} bytes")
-        return at + length if len(buffer) - at >= length else -1
+        return at + length if len(buffer) - at >= length else None
 
     def _begin(self, rate_hz: float) -> None:
         """Agree on the protocol and on what is sent, and start."""

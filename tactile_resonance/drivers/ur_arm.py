@@ -55,6 +55,7 @@ class UrArm:
         self._clock: Clock = WallClock()
         self._own: SimulatedClock | None = None  # in simulated time: asks for it
         self._led: SimulatedClock | None = None  # and is told it, while a loop leads it
+        self._dated = True  # states are, by the time that is told; else from the next one on
         self._pending: Command | None = None  # goes with the next word on the time
         self._until_ns = 0
         self._hurried = False  # something has come under way since the loop said what it needs
@@ -127,12 +128,14 @@ class UrArm:
         if self._client is not None and self._connect_again():
             return
         self._begin()
-        self._client = ClientProcess(self.config)
+        client = ClientProcess(self.config)
         names = {"time": self._time, "time_name": self._time_name}
-        self._ask({"name": "connect", "config": self.config.to_dict(), **names})
-        self._guard()
+        self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
         if self._led is not None:
-            self._take_lead(self._led)
+            self._ask({"name": "lead"}, client)
+            self._dated = False  # time has gone on while nobody was told
+        self._client = client  # not before: a loop in another thread would speak to it
+        self._guard()
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -211,10 +214,11 @@ class UrArm:
         if self._time:
             name = self._time_name
             led = SimulatedClock(self._time, f"{name}: loop", told_with=name)
-            self._clock = self._led = led
-            self._bus_port = bus_port
-            self._name_ports()
-            self._take_lead(led)
+            self._bus_port, self._named = bus_port, (0, 0)
+            self._led = led
+            self._ask({"name": "lead"})
+            led.ask_ns()
+            self._clock, self._dated = led, False
 
     def follow(self) -> None:
         """Leave the time to itself."""
@@ -241,6 +245,7 @@ class UrArm:
             time.sleep(AWAY_S)
             led.ask_ns()
             return
+        self._name_ports(led)
         command, self._pending = self._pending or Command(NOTHING), None
 
         def check() -> None:
@@ -257,7 +262,12 @@ class UrArm:
                 client.send(command._replace(until_ns=time_ns, demand=int(demand)))
             while led.now_ns() < time_ns:
                 led.wait_told(check)
+            if not self._dated:
+                led.ask_ns()  # what was told while it connected lies behind
             self._catch_up(led.robot_ns)
+            if not self._dated and self._states is not None:
+                self._states.date_anew()
+                self._dated = True
         except ArmError:  # told by `state`
             time.sleep(AWAY_S)
             led.ask_ns()
@@ -272,13 +282,6 @@ class UrArm:
 
     # parts of these
 
-    def _take_lead(self, led: SimulatedClock) -> None:
-        """Time stands from here on, and states are dated on the clock that is told it."""
-        self._ask({"name": "lead"})
-        led.refresh()
-        self._begin_states()
-        self._wait_for_first()
-
     @property
     def _time_name(self) -> str:
         return f"client of the arm, process {os.getpid()}"
@@ -289,7 +292,8 @@ class UrArm:
         try:
             self._fresh()
         except ArmError:
-            self._client.end()
+            if self._client is not None:  # else it was given up just now
+                self._client.end()
             self._forget()
             return False
         assert self._states is not None
@@ -300,8 +304,7 @@ class UrArm:
         self._states.guard(False)
         self._ask({"name": "restart"})
         self._guard()
-        if self._led is not None:
-            self._take_lead(self._led)
+        self._dated = self._led is None
         return True
 
     def _begin(self) -> None:
@@ -311,9 +314,8 @@ class UrArm:
                 self._own = SimulatedClock(self._time, f"{self._time_name}: owner")
                 self._clock = _Asked(self._own)
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
-            self._begin_states()
-            if self._led is not None:
-                self._name_ports()
+            trip_s = 0.0 if self._time else self._stream.round_trip_s
+            self._states = StateReader(self._stream, lambda: self._clock.now_ns(), trip_s)
             self._wait_for_first()
             self._check_stop()
         except ConnectionError as error:
@@ -323,16 +325,13 @@ class UrArm:
             self._forget()
             raise
 
-    def _begin_states(self) -> None:
-        assert self._stream is not None
-        guarded = self._states is not None
-        self._states = StateReader(self._stream, self._clock)
-        self._states.guard(guarded)
-
-    def _name_ports(self) -> None:
-        assert self._led is not None
-        assert self._stream is not None
-        self._led.ports(self._stream.local_port, self._bus_port())
+    def _name_ports(self, led: SimulatedClock) -> None:
+        """Have the bench tell of the connections to robot and cell, either of which may be a new one."""
+        ports = 0 if self._stream is None else self._stream.local_port, self._bus_port()
+        if ports != self._named:
+            led.ports(*ports)
+            led.ask_ns()  # it has heard that
+            self._named = ports
 
     def _guard(self) -> None:
         """See that the program runs; from now on no other counts as ours."""
@@ -372,11 +371,13 @@ class UrArm:
         if stop is not None:  # not released yet; the connection is good
             raise ArmError(*stop)
 
-    def _ask(self, request: dict) -> None:
-        assert self._client is not None
+    def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
+        client = client or self._client
+        assert client is not None
         try:
-            self._client.ask(request, self._read)
-        except ArmError as error:  # it has ended
+            client.ask(request, self._read)
+        except ArmError as error:
+            client.end()
             runs = self._states is not None and self._states.newest is not None
             runs = runs and self._states.newest.runtime_state == PROGRAM_PLAYING
             self._forget()
@@ -398,12 +399,12 @@ class UrArm:
         else:
             self._client.send(command)
 
-    def _read(self) -> None:
-        """Take the states that have come."""
+    def _read(self, told: bool = False) -> None:
+        """Take the states that have come; `told`: whoever leads knows what time it is now."""
         assert self._states is not None
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read():
+                if self._states.read(told or self._led is None):
                     self._heard_s = time.monotonic()
         except ConnectionError as error:
             if self._client is not None:
@@ -416,12 +417,12 @@ class UrArm:
         """Wait for the state that the bench has sent."""
         assert self._stream is not None
         assert self._states is not None
-        self._read()
+        self._read(told=True)
         while (newest := self._states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
             select.select([self._stream], [], [], 0.1)
-            self._read()
+            self._read(told=True)
 
     def _fresh(self) -> ArmSample:
         """Return the newest state, and show the client that its owner lives."""

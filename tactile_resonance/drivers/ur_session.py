@@ -120,7 +120,7 @@ class Session:
     def _settle(self) -> None:
         """In simulated time: let the library see that the program is ready for the next command."""
         if self._clock is not None:
-            # a loop that leads is told in our place where we hold the time, so nothing is held here
+            # told itself, also where a loop that leads is told in its place
             self._clock.sleep_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ))
 
     def _limit_time(self) -> None:

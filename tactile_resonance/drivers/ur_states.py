@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
-from tactile_resonance.clock import Clock
 from tactile_resonance.contact.clocks import ClockTracker
 from tactile_resonance.contact.interfaces import ArmFault
 from tactile_resonance.contact.samples import ArmSample
@@ -22,8 +22,10 @@ class StateReader:
     Parameters
     ----------
     stream : RtdeStream
-    clock : Clock
-        On which states are dated.
+    now_ns : callable
+        Time of the clock on which states are dated [ns].
+    round_trip_s : float
+        Of the network [s].
 
     Attributes
     ----------
@@ -34,15 +36,12 @@ class StateReader:
         Why no command would be followed in it.
     """
 
-    def __init__(self, stream: RtdeStream, clock: Clock) -> None:
+    def __init__(self, stream: RtdeStream, now_ns: Callable[[], int], round_trip_s: float) -> None:
         self.newest: RobotState | None = None
         self.sample: ArmSample | None = None
         self.fault: tuple[ArmFault, str] | None = None
-        self._stream, self._clock = stream, clock
-        # what all messages share cannot be seen by listening: half of the round trip, and how long a
-        # state waits in the robot before it is sent, at most a cycle
-        trip_s = stream.round_trip_s
-        self._tracker = ClockTracker(trip_s / 2, math.hypot(trip_s, CYCLE_S) / 12**0.5)
+        self._stream, self._now_ns, self._trip_s = stream, now_ns, round_trip_s
+        self._tracker = self._new_tracker()
         self._stamps: deque[float] = deque()
         self._guarded = self._ended = False
 
@@ -70,8 +69,11 @@ class StateReader:
         """From now on no program but the one that runs counts as ours; or forget that."""
         self._guarded, self._ended = on, False
 
-    def read(self) -> bool:
-        """Take what has come, without waiting; whether that was anything. Raises `ConnectionError`."""
+    def read(self, now_known: bool = True) -> bool:
+        """Take what has come, without waiting; whether that was anything. Raises `ConnectionError`.
+
+        Where it is not known what time it is now, states are dated by those before.
+        """
         states = self._stream.read()
         last_s = -math.inf if self.newest is None else self.newest.robot_time_s
         # a robot that stands still in simulated time says the same again
@@ -84,7 +86,23 @@ class StateReader:
         newest = self.newest = fresh[-1]
         while self._stamps[0] < newest.robot_time_s - 1.0 or self._stamps[0] > newest.robot_time_s:
             self._stamps.popleft()
-        self._tracker.add(newest.robot_time_s, self._clock.now_ns())
+        self._date(newest, now_known)
+        return True
+
+    def date_anew(self) -> None:
+        """Forget how the robot's clock was related to this one: the newest state is of now."""
+        self._tracker = self._new_tracker()
+        if self.newest is not None:
+            self._date(self.newest, True)
+
+    def _new_tracker(self) -> ClockTracker:
+        # what all messages share cannot be seen by listening: half of the round trip, and how long a
+        # state waits in the robot before it is sent, at most a cycle
+        return ClockTracker(self._trip_s / 2, math.hypot(self._trip_s, CYCLE_S) / 12**0.5)
+
+    def _date(self, newest: RobotState, now_known: bool) -> None:
+        if now_known or self.sample is None:
+            self._tracker.add(newest.robot_time_s, self._now_ns())
         runtime = PROGRAM_STOPPED if self.revived else newest.runtime_state
         self.fault = motion_fault(newest.safety_bits, newest.robot_mode, runtime)
         self.sample = ArmSample(
@@ -97,4 +115,3 @@ class StateReader:
             message="" if self.fault is None else self.fault[1],
             tool_wrench=newest.force,
         )
-        return True

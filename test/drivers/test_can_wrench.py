@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver over the unmodified python-can, on a simulated cell in a process of its own."""
+"""The driver on a simulated cell in simulated time; what a real adapter does, on the wall clock."""
 
 import socket
 import struct
@@ -20,229 +20,212 @@ from tactile_resonance.drivers.force_config import read_force_config
 
 can = pytest.importorskip("can", reason="python-can is not installed")
 
+sys.path.insert(0, str(Path(__file__).parent))
+from cell_bench import HOST, STEP_NS, CellBench, cell_config  # noqa: E402
+
+from tactile_resonance.drivers import can_wrench  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
+from tactile_resonance.simulation.socketcand import QUIET_S  # noqa: E402
 
-HOST = "127.0.6.2"
-PATIENCE_S = 30.0
-
-
-class CellProcess:
-    """``tactile_resonance simulate-cell``."""
-
-    def __init__(self, port=0):
-        command = [sys.executable, "-m", "tactile_resonance.cli", "simulate-cell"]
-        self._process = subprocess.Popen(
-            [*command, "--host", HOST, "--port", str(port)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.port = int(self._process.stdout.readline().rsplit(":", 1)[1])
-
-    def say(self, line):
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
-
-    def kill(self):
-        self._process.kill()
-        self._process.wait()
-
-    def end(self):
-        self._process.terminate()
-        assert self._process.wait(PATIENCE_S) in (0, -9)
-        for stream in (self._process.stdin, self._process.stdout):
-            stream.close()
-
-
-@pytest.fixture(scope="module")
-def cell():
-    process = CellProcess()
-    yield process
-    process.end()
-
-
-def config_for(port, **changes):
-    """The shipped configuration; slower to call the cell silent, since tests share their machine."""
-    config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-    config = replace(config, limits=replace(config.limits, silent_s=1.0))
-    bus = {**config.can.bus, "host": HOST, "port": port}
-    return replace(config, can=replace(config.can, bus=bus, **changes))
+PATIENCE_S = 60.0
+SHORTEST_DELAY_S = 1e-4  # of config/force/can_simulated.yaml: taken off every stamp
 
 
 @pytest.fixture
-def source(cell):
-    driver = CanWrench(config_for(cell.port))
-    yield driver
-    driver.close()
+def bench():
+    made = CellBench()
+    yield made
+    made.close()
 
 
-def read_until(source, count):
-    samples = []
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(samples) < count and time.monotonic() < deadline_s:
-        samples += source.read()
-        time.sleep(0.001)
-    assert len(samples) >= count
-    return samples
+@pytest.fixture
+def make_source(bench):
+    """Make drivers of the bench's cell; all are closed after the test."""
+    made = []
+
+    def make(**changes):
+        made.append(CanWrench(bench.config(**changes), bench.clock))
+        return made[-1]
+
+    yield make
+    for source in made:
+        source.close()
 
 
-def fault_of(source):
-    """Read until the driver gives up; the fault and how many samples came before."""
-    count = 0
-    deadline_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline_s:
+def fault_of(bench, source, limit=5000):
+    """Let time go on until the driver gives up; the error, and after how many wrenches of the cell."""
+    for ticks in range(1, limit):
         try:
-            count += len(source.read())
+            bench.go(source, 1)
         except ForceError as error:
-            return error.fault, count
-        time.sleep(0.001)
+            return error, ticks
     pytest.fail("no fault was found")
 
 
-def test_a_thousand_wrenches_a_second_arrive_without_loss(source):
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_a_thousand_wrenches_a_second_arrive_without_loss(bench, make_source, steps):
+    source = make_source()
     source.start()
-    samples = read_until(source, 4000)
+    begun_ns = bench.clock.now_ns()
+    samples = bench.go(source, 4000 // steps, steps)
+    count = 4000 // steps * steps
+    assert len(samples) == source.received == count
     assert source.lost == 0
-    # the cell's own clock: 1 ms from each to the next, none missing, none twice
-    stamps = np.array([sample.time_ns for sample in samples[2500:]])
-    np.testing.assert_allclose(np.diff(stamps), 1e6, atol=0.2e6)
-    ages_s = (time.time_ns() - stamps[-1]) * 1e-9
-    assert -1e-3 < ages_s < PATIENCE_S
-    assert 0 < source.info.clock_uncertainty_s < 0.02
+    # one a millisecond, none missing, none twice; those of one look were not taken when it was
+    taken = begun_ns + STEP_NS * np.arange(1, count + 1)
+    stamps = np.array([sample.time_ns for sample in samples])
+    later = slice(2500, None)  # by then the clocks' relation is known
+    assert np.all(np.diff(stamps) > 0)
+    late_ns = stamps[later] - taken[later]
+    # what a look is late by is least for the last wrench that it finds
+    np.testing.assert_allclose(late_ns, -SHORTEST_DELAY_S * 1e9, atol=2e3)
+    assert 0 < source.info.clock_uncertainty_s < 2e-3 * steps
     force = np.array([sample.wrench[:3] for sample in samples])
-    # config/load_cells/fine.yaml: bias, and 1 mN rms
-    np.testing.assert_allclose(force.mean(axis=0), [0.02, -0.01, 0.03], atol=2e-4)
-    np.testing.assert_allclose(force.std(axis=0), 1e-3, rtol=0.1)
+    # config/load_cells/fine.yaml: bias, 1 mN rms and steps of 0.2 mN
+    rms_n = np.hypot(1e-3, 2e-4 / 12**0.5)
+    np.testing.assert_allclose(
+        force.mean(axis=0), [0.02, -0.01, 0.03], atol=5 * rms_n / count**0.5 + 2e-5
+    )
+    np.testing.assert_allclose(force.std(axis=0), rms_n, rtol=5 / (2 * count) ** 0.5)
 
 
-def test_a_force_on_the_cell_is_read(cell, source):
-    cell.say("force 0.0")
+def test_a_force_on_the_cell_is_read_from_the_wrench_on_in_which_it_acts(bench, make_source):
+    source = make_source()
     source.start()
-    before = np.mean([s.wrench for s in read_until(source, 400)], axis=0)
-    cell.say("force 0.01")
-    time.sleep(0.1)
-    source.read()
-    after = np.mean([s.wrench for s in read_until(source, 400)], axis=0)
-    cell.say("force 0.0")
+    before = np.array([s.wrench for s in bench.go(source, 400)])
+    bench.wrench = (0.0, 0.0, 0.01, 0.0, 0.0, 0.0)
+    after = np.array([s.wrench for s in bench.go(source, 400)])
+    assert len(before) == len(after) == 400
     # standard error of either mean: 1 mN / 20
-    assert after[2] - before[2] == pytest.approx(0.01, abs=5 * 1e-3 / 20 * 2**0.5)
+    step_n = after.mean(axis=0)[2] - before.mean(axis=0)[2]
+    assert step_n == pytest.approx(0.01, abs=5 * 1e-3 / 20 * 2**0.5)
+    assert after[0, 2] - before[:, 2].mean() > 0.005
 
 
 @pytest.mark.parametrize(
-    ("fault", "value", "named"),
+    ("fault", "value", "named", "within"),
     [
-        ("silent", 1, ForceFault.SILENT),
-        ("stuck", 1, ForceFault.STUCK),
-        ("lose_second_every", 1, ForceFault.INCOMPLETE),
-        ("lose_second_every", 10, ForceFault.INCOMPLETE),
-        ("invalid", 1, ForceFault.INVALID),
-        ("saturated", 1, ForceFault.OVERLOAD),
-        ("flipped", 1, ForceFault.JUMP),
-        ("bias_step_n", 0.025, ForceFault.JUMP),
+        ("silent", 1, ForceFault.SILENT, 11),  # limits.silent_s is 10 ms
+        ("stuck", 1, ForceFault.STUCK, 30),
+        ("lose_second_every", 1, ForceFault.INCOMPLETE, 5),  # 3 of the last hundred are tolerated
+        ("lose_second_every", 10, ForceFault.INCOMPLETE, 41),
+        ("invalid", 1, ForceFault.INVALID, 1),
+        ("saturated", 1, ForceFault.OVERLOAD, 3),  # limits.overload_samples
+        ("flipped", 1, ForceFault.JUMP, 1),
+        ("bias_step_n", 0.025, ForceFault.JUMP, 1),
     ],
 )
-def test_every_fault_is_named_and_its_end_brings_the_source_back(cell, source, fault, value, named):
+def test_every_fault_is_named_in_time_and_its_end_brings_the_source_back(
+    bench, make_source, fault, value, named, within
+):
+    source = make_source()
     source.start()
-    read_until(source, 50)
-    try:
-        cell.say(f"{fault} {value}")
-        assert fault_of(source)[0] is named
-        with pytest.raises(ForceError):
-            source.read()  # and stays so
-    finally:
-        cell.say(f"{fault} 0")
-        time.sleep(0.05)
+    bench.go(source, 50)
+    bench.cell.faults.inject(fault, value)
+    error, ticks = fault_of(bench, source)
+    assert error.fault is named
+    assert ticks <= within
+    with pytest.raises(ForceError):
+        source.read()  # and stays so
+    bench.cell.faults.inject(fault, 0)
     source.start()
-    read_until(source, 200)
+    assert len(bench.go(source, 200)) == 200
 
 
-def test_a_cell_that_is_silent_from_the_start_is_named(cell, source):
-    cell.say("silent 1")
-    time.sleep(0.05)
-    with pytest.raises(ForceError, match="no answer to 'filter off'") as caught:
-        source.start()
-    assert caught.value.fault is ForceFault.SILENT
-    cell.say("silent 0")
-    time.sleep(0.05)
-    source.start()
-    read_until(source, 50)
-
-
-def test_a_server_that_dies_is_a_lost_link_and_another_in_its_place_is_found():
-    first = CellProcess()
-    source = CanWrench(config_for(first.port))
-    source.start()
-    read_until(source, 50)
-    first.kill()
-    assert fault_of(source)[0] is ForceFault.LINK_LOST
-    with pytest.raises(ForceError, match="refused") as caught:
-        source.start()
-    assert caught.value.fault is ForceFault.LINK_LOST
-    first.end()
-    second = CellProcess(first.port)
-    try:
-        source.start()
-        read_until(source, 50)
-    finally:
-        source.close()
-        second.end()
-
-
-def test_a_server_that_says_nothing_does_not_hold_up_the_start():
-    with socket.create_server((HOST, 0)) as mute:
-        source = CanWrench(config_for(mute.getsockname()[1]))
-        with pytest.raises(ForceError, match="not open after") as caught:
+def test_a_cell_that_is_silent_from_the_start_is_named(bench, make_source, monkeypatch):
+    source = make_source()
+    bench.cell.faults.inject("silent", 1)
+    with monkeypatch.context() as quick:
+        quick.setattr(can_wrench, "SIMULATED_WITHIN_S", 0.1)
+        with pytest.raises(ForceError, match="no answer to 'filter off'") as caught:
             source.start()
-        assert caught.value.fault is ForceFault.LINK_LOST
+    assert caught.value.fault is ForceFault.SILENT
+    bench.cell.faults.inject("silent", 0)
+    source.start()
+    assert len(bench.go(source, 50)) == 50
 
 
-def test_two_readers_share_the_bus(cell):
-    config = config_for(cell.port)
-    first = CanWrench(config)
+def test_a_link_that_is_cut_is_lost_and_found_again(bench, make_source):
+    source = make_source()
+    source.start()
+    bench.go(source, 50)
+    bench.bus.drop_clients()
+    error, ticks = fault_of(bench, source)
+    assert error.fault is ForceFault.LINK_LOST
+    assert ticks <= 2
+    source.start()
+    assert len(bench.go(source, 50)) == 50
+
+
+def test_two_readers_share_the_bus(bench, make_source):
+    """The other is python-can's own client of socketcand."""
+    first = make_source()
     second = can.Bus(
-        interface="socketcand", host=HOST, port=cell.port, channel="can0", tcp_tune=True
+        interface="socketcand", host=HOST, port=bench.port, channel="can0", tcp_tune=True
     )
     try:
         first.start()
-        own = read_until(first, 200)[100:]
-        heard = set()
-        while message := second.recv(0.2):
+        time.sleep(QUIET_S)  # python-can reads its last `ok` alone: frames come after a while
+        wrenches = np.array([sample.wrench[:3] for sample in bench.go(first, 100)])
+        own = [tuple(counts) for counts in np.rint(wrenches * 5000).astype(int).tolist()]
+        heard = []
+        while len(heard) < len(own):
+            message = second.recv(PATIENCE_S)
+            assert message is not None, f"{len(heard)} wrenches of {len(own)}"
             if message.arbitration_id == 1 and message.data[0] == 0x0B:
-                heard.add(tuple(struct.unpack(">3h", message.data[1:7])))
-            if len(heard) > 400:
-                break
-        own_counts = {tuple(np.rint(np.array(s.wrench[:3]) * 5000).astype(int)) for s in own}
-        assert own_counts & heard
+                heard.append(struct.unpack(">3h", message.data[1:7]))
+        assert heard == own
     finally:
-        first.close()
         second.shutdown()
 
 
-def test_times_of_arrival_serve_where_an_adapter_stamps_nothing(cell):
-    source = CanWrench(config_for(cell.port, stamps="arrival"))
-    try:
-        source.start()
-        samples = read_until(source, 100)
-        stamps = [sample.time_ns for sample in samples]
-        assert stamps == sorted(stamps)
-        assert source.info.clock_uncertainty_s == 1e-4
-    finally:
-        source.close()
+def test_times_of_arrival_serve_where_an_adapter_stamps_nothing(bench, make_source):
+    source = make_source(stamps="arrival")
+    source.start()
+    begun_ns = bench.clock.now_ns()
+    stamps = np.array([sample.time_ns for sample in bench.go(source, 50, steps=2)])
+    assert len(stamps) == 100
+    looked = begun_ns + 2 * STEP_NS * np.arange(1, 51)
+    # those that were found together came one after the other
+    np.testing.assert_array_equal(stamps[::2], looked - round(SHORTEST_DELAY_S * 1e9))
+    np.testing.assert_array_equal(stamps[1::2], stamps[::2] + 1)
+    assert source.info.clock_uncertainty_s == 1e-4
 
 
-def test_before_its_start_nothing_is_read(cell):
+def test_before_its_start_nothing_is_read(make_source):
     with pytest.raises(ForceError, match="not started"):
-        CanWrench(config_for(cell.port)).read()
+        make_source().read()
 
 
-def test_a_refused_setting_is_named(cell):
-    config = config_for(cell.port)
-    description = config.can.description
+def test_a_refused_setting_is_named(bench, make_source):
+    description = bench.config().can.description
     odd = replace(description.setup[0], name="filter 7", data=bytes([0x08, 7, 0]))
-    config = config_for(cell.port, description=replace(description, setup=(odd,)))
     with pytest.raises(ForceError, match="filter 7: out of range") as caught:
-        CanWrench(config).start()
+        make_source(description=replace(description, setup=(odd,))).start()
     assert caught.value.fault is ForceFault.REFUSED
+
+
+def test_wrenches_that_pile_up_are_told_by_their_rate(bench, make_source):
+    """A cell that sends half of what its configuration says looks to the driver like a slow interface."""
+    description = bench.config().can.description
+    source = make_source(
+        description=replace(description, rates={1000: description.rates[500]}),
+    )
+    source.start()
+    error, ticks = fault_of(bench, source)
+    assert error.fault is ForceFault.INCOMPLETE
+    assert ticks == pytest.approx(1000, abs=4)  # two windows of half a second
+    with pytest.raises(ForceError, match=r"(499|500|501) wrenches/s of 1000"):
+        source.read()
+
+
+class StandingClock:
+    """Simulated time that stands: nothing is ever late."""
+
+    simulated = True
+
+    def now_ns(self):
+        return 1_000_000_000
 
 
 def test_another_make_of_cell_is_a_description(tmp_path):
@@ -263,7 +246,7 @@ def test_another_make_of_cell_is_a_description(tmp_path):
     config = replace(
         base,
         info=replace(base.info, rate_hz=500.0),
-        limits=replace(base.limits, silent_s=0.5, stuck_samples=10**6),
+        limits=replace(base.limits, stuck_samples=10**6),
         can=replace(
             base.can,
             bus={"interface": "virtual", "channel": "polled"},
@@ -289,7 +272,7 @@ def test_another_make_of_cell_is_a_description(tmp_path):
 
     player = threading.Thread(target=play)
     player.start()
-    source = CanWrench(config)
+    source = CanWrench(config, StandingClock())
     try:
         source.start()
         for sample in read_until(source, 50):
@@ -301,16 +284,70 @@ def test_another_make_of_cell_is_a_description(tmp_path):
         bus.shutdown()
 
 
-def test_wrenches_that_pile_up_are_told_by_their_rate(cell):
-    """A cell that sends half of what its configuration says looks to the driver like a slow interface."""
-    config = config_for(cell.port)
-    description = config.can.description
-    slow = replace(description, rates={1000: description.rates[500]})
-    source = CanWrench(config_for(cell.port, description=slow))
+# On the wall clock, for a real adapter's connection is made, lost and judged in this machine's time.
+
+
+def read_until(source, count):
+    samples = []
+    deadline_s = time.monotonic() + PATIENCE_S
+    while len(samples) < count:
+        assert time.monotonic() < deadline_s
+        samples += source.read()
+        time.sleep(0.001)
+    return samples
+
+
+def patient(config):
+    """Slower to call the cell silent, since tests share their machine."""
+    return replace(config, limits=replace(config.limits, silent_s=1.0))
+
+
+class CellProcess:
+    """``tactile_resonance simulate-cell``."""
+
+    def __init__(self, port=0):
+        command = [sys.executable, "-m", "tactile_resonance.cli", "simulate-cell"]
+        self._process = subprocess.Popen(
+            [*command, "--host", HOST, "--port", str(port)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.port = int(self._process.stdout.readline().rsplit(":", 1)[1])
+
+    def kill(self):
+        self._process.kill()
+        self._process.wait()
+        self._process.stdout.close()
+
+
+def test_a_server_that_dies_is_a_lost_link_and_another_in_its_place_is_found(monkeypatch):
+    monkeypatch.setattr(can_wrench, "ANSWER_WITHIN_S", PATIENCE_S)
+    first = CellProcess()
+    source = CanWrench(patient(cell_config(HOST, first.port)))
+    begun_ns = time.monotonic_ns()
+    source.start()
+    for sample in read_until(source, 50):  # dated on this machine's clock
+        assert begun_ns - 1e9 < sample.time_ns < time.monotonic_ns()
+    first.kill()
+    with pytest.raises(ForceError) as caught:
+        read_until(source, 10**6)
+    assert caught.value.fault is ForceFault.LINK_LOST
+    with pytest.raises(ForceError, match="refused") as caught:
+        source.start()
+    assert caught.value.fault is ForceFault.LINK_LOST
+    second = CellProcess(first.port)
     try:
         source.start()
-        assert fault_of(source)[0] is ForceFault.INCOMPLETE
-        with pytest.raises(ForceError, match=r"[45]\d\d wrenches/s of 1000"):
-            source.read()
+        read_until(source, 50)
     finally:
         source.close()
+        second.kill()
+
+
+def test_a_server_that_says_nothing_does_not_hold_up_the_start():
+    with socket.create_server((HOST, 0)) as mute:
+        source = CanWrench(cell_config(HOST, mute.getsockname()[1]))
+        with pytest.raises(ForceError, match="not open after") as caught:
+            source.start()
+        assert caught.value.fault is ForceFault.LINK_LOST

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot's own sensor, from arm states."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +16,18 @@ from tactile_resonance.drivers.rtde_wrench import RtdeWrench
 
 CONFIG = read_force_config(Path("rtde_ur.yaml"))
 PLACE_M, TURNED_RAD, STILL = (0.4, 0.0, 0.3), (np.pi / 2, 0.0, 0.0), (0.0,) * 6
+
+
+class HandClock:
+    """A clock that goes on where the test says so."""
+
+    simulated = True
+
+    def __init__(self):
+        self.ns = 5_000_000_000
+
+    def now_ns(self):
+        return self.ns
 
 
 class States:
@@ -38,7 +49,7 @@ class States:
 def test_the_wrench_is_turned_into_the_frame_of_the_tip():
     # the tip is turned by 90 degrees about x: its y axis is the base's z, its z the base's -y
     states = States()
-    source = RtdeWrench(CONFIG, states)
+    source = RtdeWrench(CONFIG, states, HandClock())
     source.start()
     assert source.read() == []
     states.now = states.at(1.002, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
@@ -72,7 +83,7 @@ def test_it_can_be_made_before_the_arm_is_connected():
 )
 def test_faults_are_named_and_end(state, fault):
     states = States()
-    source = RtdeWrench(CONFIG, states)
+    source = RtdeWrench(CONFIG, states, HandClock())
     source.start()
 
     def read_five():
@@ -91,11 +102,13 @@ def test_faults_are_named_and_end(state, fault):
 
 def test_a_robot_clock_that_stands_still_is_silence():
     states = States()
+    clock = HandClock()
     config = replace(CONFIG, limits=replace(CONFIG.limits, silent_s=0.004))
-    source = RtdeWrench(config, states)
+    source = RtdeWrench(config, states, clock)
     source.start()
+    clock.ns += 3_900_000
     assert source.read() == []
-    time.sleep(0.005)
+    clock.ns += 200_000
     with pytest.raises(ForceError, match="no new state") as caught:
         source.read()
     assert caught.value.fault is ForceFault.SILENT
@@ -105,7 +118,7 @@ def test_an_arm_without_a_sensor_is_refused():
     states = States()
     states.now = states.at(1.0, None)
     with pytest.raises(ForceError, match="no wrench"):
-        RtdeWrench(CONFIG, states).start()
+        RtdeWrench(CONFIG, states, HandClock()).start()
 
 
 def test_1_cn_is_refused_with_the_figures():

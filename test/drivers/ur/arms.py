@@ -1,59 +1,94 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the owner of an arm does: ask for states, wait for faults, connect again."""
+"""What the owner of an arm does in simulated time: lead it, ask for states, wait for faults, connect again."""
 
+import contextlib
 import time
 
 import numpy as np
 
+from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError
+from tactile_resonance.simulation.robot.target import CYCLE_S
 
 DOWN = np.array([0.0, 0.0, -0.005, 0.0, 0.0, 0.0])
+UP = -DOWN
 ACCELERATION_M_S2 = 0.5
 LAG_S = 0.1  # the arm follows its target with dead time and lag
+CYCLE_NS = round(CYCLE_S * 1e9)
+PATIENCE_S = 60.0
+
+
+def tick(arm, cycles=1):
+    """Let time go on by cycles of the robot, and wait for the state at its end."""
+    arm.wait_until(arm.clock.now_ns() + cycles * CYCLE_NS, Demand.FAST)
 
 
 def keep(arm, condition, limit_s=10.0):
     """States while a condition holds, as the owner of a moving arm asks for them."""
     samples = []
-    end = time.monotonic() + limit_s
+    end_ns = arm.clock.now_ns() + round(limit_s * 1e9)
     while condition():
-        assert time.monotonic() < end, "it goes on for too long"
+        assert arm.clock.now_ns() < end_ns, "it goes on for too long"
+        tick(arm)
         samples.append(arm.state())
-        time.sleep(0.004)
     return samples
 
 
 def keep_for(arm, seconds):
-    """States for a time of the robot's clock."""
-    start = arm.state().robot_time_s
-    return keep(arm, lambda: arm.state().robot_time_s < start + seconds)
+    """States of so much time."""
+    end_ns = arm.clock.now_ns() + round(seconds * 1e9)
+    return keep(arm, lambda: arm.clock.now_ns() < end_ns, seconds + 1.0)
 
 
 def wait_for_fault(arm, limit_s=2.0):
-    """Drive the arm until it raises."""
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end:
+    """Drive the arm until it raises; the error, and after how much time [s]."""
+    begun_ns = arm.clock.now_ns()
+    while True:
         try:
             arm.speed(DOWN, ACCELERATION_M_S2)
         except ArmError as error:
-            return error
-        time.sleep(0.004)
-    raise AssertionError(f"no fault within {limit_s} s")
+            return error, (arm.clock.now_ns() - begun_ns) * 1e-9
+        tick(arm)
+        passed_s = (arm.clock.now_ns() - begun_ns) * 1e-9
+        assert passed_s < limit_s, f"no fault within {limit_s} s"
 
 
-def connect_again(arm, limit_s=12.0):
-    """Connect as soon as the fault has ended."""
-    end = time.monotonic() + limit_s
-    while True:
+def pass_time(arm, seconds):
+    """Let time go on whatever becomes of the arm; its owner shows that he lives."""
+    end_ns = arm.clock.now_ns() + round(seconds * 1e9)
+    while arm.clock.now_ns() < end_ns:
+        with contextlib.suppress(ArmError):
+            arm.state()
+        tick(arm)
+
+
+def connect_again(arm, attempts=3):
+    """Connect as soon as the fault has ended, and lead."""
+    for left in range(attempts, 0, -1):
         try:
             arm.connect()
-            return
+            break
         except ArmError:
-            assert time.monotonic() < end
-            time.sleep(0.1)
+            if left == 1:
+                raise
+            time.sleep(0.5)
+    if not hasattr(arm.clock, "wait_told"):  # not led yet
+        arm.lead()
+    tick(arm)  # it is later than when time was told last
 
 
-def standing(robot):
+@contextlib.contextmanager
+def left_alone(arm, robot):
+    """Meanwhile time goes on by itself, and fast: for what is done at the robot."""
+    arm.follow()
+    with contextlib.closing(SimulatedClock(f"{robot.host}:{PORT}", "test")) as clock:
+        clock.free(Demand.FAST)
+        yield
+    if arm.client_pid is not None:
+        arm.lead()
+
+
+def standing(arm, robot):
     """Whether the robot stands after it had the time that a stop takes; its own word."""
-    time.sleep(0.3)
+    pass_time(arm, 0.3)
     return np.linalg.norm(robot.order("state")["tcp_speed"]) < 1e-3

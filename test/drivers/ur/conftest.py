@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated robots as processes of their own, each on an address of its own."""
+"""Simulated robots as processes of their own, each on an address of its own, and arms that a test leads."""
 
 import os
 import select
@@ -8,24 +8,21 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from robot_at_hand import RobotAtHand
 
-from tactile_resonance.contact.samples import Pose
+from tactile_resonance.clock import PORT
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.processes import end_with_parent, may_take_priority
+from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
 
 sys.path.insert(0, str(Path(__file__).parent))
-from arms import LAG_S, connect_again, keep, keep_for
+from arms import ACCELERATION_M_S2, LAG_S, UP, connect_again, keep, keep_for
 
 # Of the three numbers after 127 two say which test run, the last which robot of it.
 RUN = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}"
-
-
-PRIORITY = 2 if may_take_priority(2) else 0
+SIMULATED = ("--simulated-time", "--tissue", "gel12")
 
 
 def need_ur_rtde():
@@ -40,7 +37,7 @@ class Robot(RobotAtHand):
         self.process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
-                *("--priority", str(PRIORITY), *options),
+                *options,
             ],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -80,7 +77,7 @@ def start_robots():
 
 @pytest.fixture
 def robot(module_robot):
-    """A robot without faults, shared by the tests of a module."""
+    """A robot in simulated time without faults, shared by the tests of a module."""
     module_robot.recover()
     return module_robot
 
@@ -88,7 +85,7 @@ def robot(module_robot):
 @pytest.fixture(scope="module")
 def module_robot():
     """One robot for the tests of a module."""
-    robot = Robot(f"{RUN}.200", "--tissue", "gel12")
+    robot = Robot(f"{RUN}.200", *SIMULATED)
     try:
         robot.wait()
         yield robot
@@ -97,45 +94,45 @@ def module_robot():
 
 
 def config(host, **fields):
-    given = {"max_state_age_s": 0.1, "realtime_priority": max(0, PRIORITY - 1), **fields}
-    return UrArmConfig(host, TIP_IN_FLANGE, **given)
+    return UrArmConfig(host, TIP_IN_FLANGE, **fields)
 
 
 @pytest.fixture(scope="module")
 def module_arm(module_robot):
     """One arm for the tests of a module, not yet connected."""
     need_ur_rtde()
-    arm = UrArm(config(module_robot.host))
+    arm = UrArm(config(module_robot.host), f"{module_robot.host}:{PORT}")
     yield arm
     arm.close()
 
 
 @pytest.fixture
 def arm(robot, module_arm):
-    """A connected arm; connecting one that is healthy does nothing."""
+    """A connected arm that the test leads; connecting one that is healthy does nothing."""
     connect_again(module_arm)
-    return module_arm
+    yield module_arm
+    module_arm.follow()
 
 
 @pytest.fixture
 def high(arm):
     """The arm well above the tissue, wherever an earlier test left it."""
-    tip = arm.state().tip
-    place = np.array([*tip.position_m[:2], 0.36])
-    arm.move(Pose(place, tip.rotation_rad), 0.2, 1.0)
-    keep(arm, arm.moving)
-    keep_for(arm, LAG_S)
+    if arm.state().position_m[2] < 0.3:
+        arm.speed(40 * UP, ACCELERATION_M_S2)
+        keep(arm, lambda: arm.state().position_m[2] < 0.35)
+    arm.stop(ACCELERATION_M_S2)
+    keep_for(arm, 0.4 + LAG_S)
     return arm
 
 
 @pytest.fixture
 def start_arm():
-    """Make an arm; all are closed after the test."""
+    """Make an arm, in simulated time where that is not denied; all are closed after the test."""
     need_ur_rtde()
     arms = []
 
-    def start(host, **fields):
-        arms.append(UrArm(config(host, **fields)))
+    def start(host, simulated=True, **fields):
+        arms.append(UrArm(config(host, **fields), f"{host}:{PORT}" if simulated else ""))
         return arms[-1]
 
     yield start

@@ -210,7 +210,6 @@ def test_ends_in_order(start_robots, number):
     ("options", "message"),
     [
         (["--host", "192.168.0.1"], "expected an address 127"),
-        (["--speed", "0"], "speed: 0"),
         (["--tissue", "granite"], "tissue"),
         (["--priority", "100"], "priority: 100"),
         (["--tissue", "gel12", "--can-port", "99999"], "can-port: 99999"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""UrArm on the simulated robot: motion, time stamps, and every fault by its name."""
+"""UrArm on the simulated robot, in simulated time: motion, and every fault by its name and at its time."""
 
 import os
 import re
@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,36 +16,23 @@ from arms import (
     ACCELERATION_M_S2,
     DOWN,
     LAG_S,
+    PATIENCE_S,
     connect_again,
     keep,
     keep_for,
+    left_alone,
+    pass_time,
     standing,
+    tick,
     wait_for_fault,
 )
 
+from tactile_resonance.clock import PORT, SimulatedClock
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.contact.samples import Pose
+from tactile_resonance.drivers import ur_arm
 
-
-def test_moves_in_a_straight_line_to_the_pose(high):
-    start = high.state().tip
-    goal = Pose(start.position_m + [0.01, 0.02, -0.02], start.rotation_rad)
-    high.move(goal, 0.05, ACCELERATION_M_S2)
-    assert high.moving()
-    samples = keep(high, high.moving)
-    keep_for(high, LAG_S)
-    np.testing.assert_allclose(high.state().tip.position_m, goal.position_m, atol=5e-5)
-    way = goal.position_m - start.position_m
-    length = np.linalg.norm(way)
-    for sample in samples:
-        done = sample.tip.position_m - start.position_m
-        aside = done - way * (done @ way) / length**2
-        assert np.linalg.norm(aside) < 2e-5
-        assert np.linalg.norm(sample.velocity[:3]) < 0.052
-    took = samples[-1].robot_time_s - samples[0].robot_time_s
-    # trapezoid: length / speed + speed / acceleration
-    assert took == pytest.approx(length / 0.05 + 0.05 / ACCELERATION_M_S2, abs=0.15)
+WATCHDOG_S = 1 / 25
 
 
 def test_speed_changes_and_stop(high):
@@ -52,7 +40,7 @@ def test_speed_changes_and_stop(high):
     keep_for(high, 0.2)
     samples = keep_for(high, 0.4)
     t = np.array([s.robot_time_s for s in samples])
-    z = np.array([s.tip.position_m[2] for s in samples])
+    z = np.array([s.position_m[2] for s in samples])
     assert np.polyfit(t - t[0], z, 1)[0] == pytest.approx(DOWN[2], rel=5e-3)
     high.speed(-DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
@@ -60,68 +48,32 @@ def test_speed_changes_and_stop(high):
     high.stop(ACCELERATION_M_S2)
     keep_for(high, 0.1)
     assert np.linalg.norm(high.state().velocity) < 1e-4
-    # a move overtaken by a speed, and a speed by a move
-    goal = Pose(high.state().tip.position_m - [0, 0, 0.05], high.state().tip.rotation_rad)
-    high.move(goal, 0.05, 1.0)
-    keep_for(high, 0.2)
-    high.speed(-DOWN, 1.0)
-    keep_for(high, 0.5)
-    assert high.state().velocity[2] == pytest.approx(-DOWN[2], rel=0.02)
-    assert not high.moving()
-    high.move(goal, 0.1, 1.0)
-    keep(high, high.moving)
-    keep_for(high, LAG_S)
-    np.testing.assert_allclose(high.state().tip.position_m, goal.position_m, atol=5e-5)
-
-
-def test_stop_of_a_move(high):
-    start = high.state().tip
-    high.move(Pose(start.position_m - [0, 0, 0.1], start.rotation_rad), 0.1, 1.0)
-    keep_for(high, 0.3)
-    high.stop(2.0)
-    keep(high, high.moving)
-    keep_for(high, LAG_S)
-    assert np.linalg.norm(high.state().velocity[:3]) < 1e-3
-    assert start.position_m[2] - 0.09 < high.state().tip.position_m[2] < start.position_m[2] - 0.005
     assert high.state().moving_allowed
 
 
-def test_time_stamps_are_on_the_local_clock(arm):
-    samples = keep_for(arm, 1.5)
-    robot = np.array([s.robot_time_s for s in samples])
-    local = np.array([s.time_ns for s in samples]) * 1e-9
-    assert np.all(np.diff(robot) >= 0)
-    offset = local - robot
-    # both clocks are of one machine: what the offset varies by is the error of the relation
-    assert np.std(offset) < 5 * arm.clock_uncertainty_s + 1e-3
-    assert 0 < arm.clock_uncertainty_s < 0.01
-    assert -0.005 < time.time() - local[-1] < 0.2
-
-
 def test_tip_is_the_frame_of_the_configuration(robot, arm):
-    told = robot.order("state")["tcp_pose"]
-    np.testing.assert_allclose(arm.state().tip.position_m, told[:3], atol=5e-5)
-    normal = arm.state().tip.rotation.as_matrix()[:, 2]
+    tick(arm)
+    sample, told = arm.state(), robot.order("state")["tcp_pose"]
+    assert (*sample.position_m, *sample.rotation_rad) == tuple(told)
+    normal = sample.tip.rotation.as_matrix()[:, 2]
     np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-3)  # up, away from the table
     # the robot's own sensor: bias, noise and drift within some sigma of the data sheet
-    assert np.linalg.norm(arm.state().tool_wrench[:3]) < 30
+    assert np.linalg.norm(sample.tool_wrench[:3]) < 30
 
 
-def test_wrong_figures_are_refused_and_nothing_is_sent(robot, high):
-    before = high.state().tip.position_m
-    tip = high.state().tip
+def test_wrong_figures_are_refused_and_nothing_is_sent(high):
+    before = high.state().position_m
     for call in (
         lambda: high.speed(DOWN * 100, ACCELERATION_M_S2),
         lambda: high.speed(DOWN * np.nan, ACCELERATION_M_S2),
         lambda: high.speed(DOWN[:3], ACCELERATION_M_S2),
         lambda: high.speed(DOWN, 0.0),
-        lambda: high.move(tip, 5.0, ACCELERATION_M_S2),
         lambda: high.stop(-1.0),
     ):
         with pytest.raises(ValueError, match="expected|allows"):
             call()
     keep_for(high, 0.2)
-    np.testing.assert_allclose(high.state().tip.position_m, before, atol=5e-5)
+    np.testing.assert_allclose(high.state().position_m, before, atol=5e-5)
 
 
 @pytest.mark.parametrize("seconds", [1.0, 4.0])
@@ -130,48 +82,71 @@ def test_network_freezes(robot, high, seconds):
     keep_for(high, 0.1)
     before = robot.order("state")
     robot.order("freeze", seconds=seconds)
-    error = wait_for_fault(high)
+    error, after_s = wait_for_fault(high)
     assert error.fault is ArmFault.STALE
-    time.sleep(0.3)
-    after = robot.order("state")
-    assert np.linalg.norm(after["tcp_speed"]) < 1e-3, "its watchdog stops a robot without commands"
-    # at most: until its watchdog of 1 / 25 s expires, and a stop; before, some states and the order
-    way = before["tcp_pose"][2] - after["tcp_pose"][2]
-    assert way < 0.005 * 0.2
+    assert after_s == pytest.approx(high.config.max_state_age_s, abs=0.005)
+    assert standing(high, robot), "its watchdog stops a robot without commands"
+    # until its watchdog expires, and a stop
+    way = before["tcp_pose"][2] - robot.order("state")["tcp_pose"][2]
+    assert 0.0 < way < 0.005 * (WATCHDOG_S + LAG_S / 2)
+    pass_time(high, seconds)
     connect_again(high)
     assert high.state().moving_allowed
     assert robot.process.poll() is None
 
 
-def test_short_freeze_is_survived(robot, module_arm, start_arm):
-    module_arm.close()  # its registers are its own
-    arm = start_arm(robot.host, max_state_age_s=0.5)
-    arm.connect()
-    robot.order("freeze", seconds=0.02)
-    assert all(s.moving_allowed for s in keep_for(arm, 0.3))
-    arm.speed(DOWN, ACCELERATION_M_S2)
-    assert keep_for(arm, 0.1)[-1].velocity[2] < 0
+def test_link_is_given_up_where_the_network_stays_frozen(robot, high):
+    robot.order("freeze", seconds=2.0)
+    begun_ns = high.clock.now_ns()
+    fault = ArmFault.STALE
+    while fault is ArmFault.STALE:
+        tick(high)
+        try:
+            high.state()
+        except ArmError as error:
+            fault = error.fault
+        after_s = (high.clock.now_ns() - begun_ns) * 1e-9
+    assert fault is ArmFault.LINK_LOST
+    assert after_s == pytest.approx(ur_arm.GIVE_UP_S, abs=0.01)
+    assert high.client_pid is None
 
 
-def test_no_velocity_is_lost_where_packets_come_together(robot, high):
+def test_short_freeze_is_survived(robot, high):
+    high.speed(DOWN, ACCELERATION_M_S2)
+    keep_for(high, 0.1)
+    robot.order("freeze", seconds=0.014)
+    samples = keep_for(high, 0.1)
+    assert all(sample.moving_allowed for sample in samples)
+    # states of the freeze are missing, later ones are not
+    ages_s = np.diff([sample.robot_time_s for sample in samples])
+    assert ages_s.max() == pytest.approx(0.014, abs=0.003)
+    assert samples[-1].velocity[2] == pytest.approx(DOWN[2], rel=0.02)
+
+
+def test_no_velocity_is_lost_where_packets_come_together(robot, arm, start_arm):
     """Held back and let through at once, a velocity and what feeds the watchdog meet in one cycle."""
-    for _ in range(3):
+    arm.close()  # its registers are its own
+    arm = start_arm(robot.host, max_state_age_s=0.1)
+    connect_again(arm)
+    for sign in (1, -1, 1):
         robot.order("freeze", seconds=0.025)
-        high.speed(DOWN, ACCELERATION_M_S2)
-        keep_for(high, 0.025 + LAG_S)
-        assert high.state().velocity[2] == pytest.approx(DOWN[2], rel=0.1)
+        arm.speed(-sign * DOWN, ACCELERATION_M_S2)
+        keep_for(arm, 0.025 + LAG_S)
+        assert arm.state().velocity[2] == pytest.approx(-sign * DOWN[2], rel=0.1)
         robot.order("freeze", seconds=0.025)
-        high.stop(ACCELERATION_M_S2)
-        keep_for(high, 0.025 + LAG_S)
-        assert np.abs(high.state().velocity).max() < 5e-4
+        arm.stop(ACCELERATION_M_S2)
+        keep_for(arm, 0.025 + LAG_S)
+        assert np.abs(arm.state().velocity).max() < 5e-4
 
 
 def test_connection_is_dropped(robot, high):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     assert robot.order("drop")["dropped"] == 2
-    assert wait_for_fault(high).fault is ArmFault.LINK_LOST
-    assert standing(robot)
+    error, after_s = wait_for_fault(high)
+    assert error.fault is ArmFault.LINK_LOST
+    assert after_s <= 0.004
+    assert standing(high, robot)
     connect_again(high)
     keep_for(high, 0.1)
 
@@ -180,16 +155,19 @@ def test_protective_stop(robot, high):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     robot.order("protective_stop")
-    assert wait_for_fault(high).fault is ArmFault.PROTECTIVE_STOP
+    error, after_s = wait_for_fault(high)
+    assert error.fault is ArmFault.PROTECTIVE_STOP
+    assert after_s <= 0.004
     sample = high.state()
     assert not sample.moving_allowed
     assert "protective stop" in sample.message
     high.stop(1.0)  # nothing to stop, no fault
-    assert standing(robot)
+    assert standing(high, robot)
     with pytest.raises(ArmError) as error:
         high.connect()
     assert error.value.fault is ArmFault.PROTECTIVE_STOP
-    robot.unlock()
+    with left_alone(high, robot):
+        robot.unlock()
     connect_again(high)
     high.speed(-DOWN, ACCELERATION_M_S2)
     assert keep_for(high, 0.2)[-1].velocity[2] > 0
@@ -199,43 +177,31 @@ def test_emergency_stop(robot, high):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     robot.order("emergency_stop")
-    assert wait_for_fault(high).fault is ArmFault.EMERGENCY_STOP
-    assert standing(robot)
+    error, after_s = wait_for_fault(high)
+    assert error.fault is ArmFault.EMERGENCY_STOP
+    assert after_s <= 0.004
+    assert standing(high, robot)
     robot.order("release_emergency_stop")
     keep(high, lambda: "emergency" in high.state().message)
     with pytest.raises(ArmError, match="not running") as error:
         high.connect()
     assert error.value.fault is ArmFault.PROGRAM_STOPPED
-    robot.power_up()
+    with left_alone(high, robot):
+        robot.power_up()
     connect_again(high)
     keep_for(high, 0.1)
 
 
-def test_owner_that_falls_silent_is_left_to_the_watchdog(robot, high):
-    high.speed(DOWN, ACCELERATION_M_S2)
-    time.sleep(0.5)
-    error = wait_for_fault(high)
-    assert error.fault is ArmFault.PROGRAM_STOPPED
-    assert standing(robot)
-    assert any("watchdog" in line for line in robot.order("log")["log"][-3:])
-    high.connect()
-    # at rest nothing is asked of the owner
-    time.sleep(0.5)
-    assert high.state().moving_allowed
-
-
-@pytest.mark.parametrize(
-    ("number", "fault"),
-    [(signal.SIGKILL, ArmFault.CLIENT_DIED), (signal.SIGABRT, ArmFault.CLIENT_DIED),
-     (signal.SIGSTOP, ArmFault.STALE)],
-)  # fmt: skip
-def test_client_dies_or_hangs_in_the_middle_of_a_motion(robot, high, number, fault):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT])
+def test_client_dies_in_the_middle_of_a_motion(robot, high, number):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     client = high.client_pid
     os.kill(client, number)
-    assert wait_for_fault(high).fault is fault
-    assert standing(robot)
+    error, _ = wait_for_fault(high)
+    assert error.fault is ArmFault.CLIENT_DIED
+    assert standing(high, robot)
+    assert any("watchdog" in line for line in robot.order("log")["log"][-3:])
     connect_again(high)
     keep_for(high, 0.1)
     assert not alive(client)
@@ -246,7 +212,7 @@ import sys, time
 import numpy as np
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-arm = UrArm(UrArmConfig(sys.argv[1], max_state_age_s=0.5))
+arm = UrArm(UrArmConfig(sys.argv[1], max_state_age_s=1.0), sys.argv[1] + ":30021")
 arm.connect()
 print(arm.client_pid, flush=True)
 while True:
@@ -269,34 +235,53 @@ def test_no_client_outlives_a_killed_owner(robot, module_arm):
         [sys.executable, "-c", OWNER, robot.host], stdout=subprocess.PIPE, text=True
     ) as owner:
         client = int(owner.stdout.readline())
-        time.sleep(0.3)
+        until(lambda: abs(robot.order("state")["tcp_speed"][2]) > 1e-3, "the arm does not move")
         owner.kill()
-    end = time.monotonic() + 5
-    while alive(client):
-        assert time.monotonic() < end, "the client process goes on without its owner"
-        time.sleep(0.05)
-    assert standing(robot)
+    until(lambda: not alive(client), "the client process goes on without its owner")
+    until(lambda: np.linalg.norm(robot.order("state")["tcp_speed"]) < 1e-3, "the arm moves on")
 
 
-def test_python_of_the_page(robot, module_arm, tmp_path, capsys):
+def until(condition, otherwise="never"):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, otherwise
+        time.sleep(0.01)
+
+
+def test_python_of_the_page(robot, module_arm, tmp_path, capsys, monkeypatch):
+    """It moves as far as the page says; its sleeps and its arm are in simulated time."""
     module_arm.close()
     page = Path(__file__).resolve().parents[3] / "docs" / "robot.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     own = tmp_path / "mine.yaml"
     text = share_path("config/devices/ur5e.yaml").read_text(encoding="utf-8")
-    text = text.replace("host: 127.0.1.1", f"host: {robot.host}")
-    # a client without priority, on processors that others need too
-    text = text.replace("watchdog_hz: 25.0", "watchdog_hz: 5.0")
-    own.write_text(text.replace("max_state_age_s: 0.020", "max_state_age_s: 0.2"))
+    own.write_text(text.replace("host: 127.0.1.1", f"host: {robot.host}"))
     shipped = 'share_path("config/devices/ur5e.yaml")'
     assert shipped in code
-    names = {"own": own}
+    clock = SimulatedClock(f"{robot.host}:{PORT}", "page")
+
+    slept_ns = [0]
+
+    def sleep(seconds):
+        slept_ns[0] += round(seconds * 1e9)
+        clock.wait_until(slept_ns[0])
+        time_s = robot.order("state")["time_s"]
+        until(lambda: names["arm"]._read() or names["arm"]._states.newest.robot_time_s == time_s)
+
+    here = SimpleNamespace(sleep=sleep)
+    names, whole = {"own": own}, ur_arm.UrArm
+    monkeypatch.setattr(ur_arm, "UrArm", lambda config: whole(config, f"{robot.host}:{PORT}"))
+    before, after = code.replace(shipped, "own").split("arm.connect()\n")
     try:
-        exec(compile(code.replace(shipped, "own"), page.name, "exec"), names)
+        exec(compile(before + "arm.connect()\n", page.name, "exec"), names)
+        slept_ns[0] = clock.ask_ns()
+        sleep(0.1)  # from here on time stands but for the page's sleeps
+        names["time"] = here
+        exec(compile(after, page.name, "exec"), names)
     finally:
+        clock.close()
         if "arm" in names:
-            names[
-                "arm"
-            ].close()  # a client left behind would hold the registers of every later robot
+            names["arm"].close()  # it would hold the registers of every later robot
     moved_mm = float(re.search(r"moved ([\d.]+) mm", capsys.readouterr().out)[1])
-    assert 2 < moved_mm < 10  # 0.5 s and a little more at 5 mm/s, more where this machine is busy
+    # 0.5 s at 5 mm/s; what the arm starts late by it stops late by
+    assert moved_mm == pytest.approx(2.5, abs=0.1)

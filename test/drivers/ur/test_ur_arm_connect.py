@@ -51,20 +51,20 @@ def test_host_that_takes_connections_and_says_nothing(start_arm):
     with contextlib.ExitStack() as stack:
         for port in (29999, 30003, 30004):
             stack.enter_context(socket.create_server((MUTE, port)))
-        with pytest.raises(ArmError, match="not ready after 1 s") as error:
-            start_arm(MUTE, connect_timeout_s=1.0).connect()
+        with pytest.raises(ArmError, match="port 30004: timed out") as error:
+            start_arm(MUTE, simulated=False).connect()
         assert error.value.fault is ArmFault.LINK_LOST
 
 
 @pytest.mark.parametrize("host", ["..", "no such host"])
 def test_what_no_address_can_be_is_a_lost_link(start_arm, host):
     with pytest.raises(ArmError, match="no robot answers") as error:
-        start_arm(host).connect()
+        start_arm(host, simulated=False).connect()
     assert error.value.fault is ArmFault.LINK_LOST
 
 
 def test_nobody_there_and_not_connected(start_arm):
-    arm = start_arm("127.254.254.1")
+    arm = start_arm("127.254.254.1", simulated=False)
     with pytest.raises(ArmError) as error:
         arm.connect()
     assert error.value.fault is ArmFault.LINK_LOST

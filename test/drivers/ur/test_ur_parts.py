@@ -1,31 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of the arm's driver that need no robot: its page of memory, its configuration, its fault names."""
+"""Parts of the arm's driver that need no robot: page, commands, states, motion, configuration, fault names."""
 
-import dataclasses
-import struct
+import itertools
 import tempfile
-import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmFault
+from tactile_resonance.drivers.rtde_stream import RobotState
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
-from tactile_resonance.drivers.ur_exchange import SIZE, ClientState, Exchange
+from tactile_resonance.drivers.ur_exchange import (
+    NOTHING,
+    SIZE,
+    SPEED,
+    STOP,
+    Command,
+    Exchange,
+    Seen,
+)
+from tactile_resonance.drivers.ur_motion import REST, Motion
 from tactile_resonance.drivers.ur_safety import motion_fault
+from tactile_resonance.drivers.ur_states import StateReader
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
-
-STATE = ClientState(
-    received_ns=123456789012345, robot_time_s=1.5, state_ns=123456789012000,
-    tip_pose=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), tip_speed=(0.1,) * 6, tip_force=(-1.0,) * 6,
-    safety_bits=1 << 10 | 1, runtime_state=2, robot_mode=-1, safety_mode=1, connected=True, moving=False,
-    done=7, refused=6, clock_std_s=1e-3, rate_hz=500.0,
-)  # fmt: skip
 
 
 @pytest.fixture
 def exchanges():
+    """The page as the client has it, and as its owner has it."""
     with tempfile.TemporaryFile() as page:
         page.truncate(SIZE)
         pair = Exchange(page.fileno()), Exchange(page.fileno())
@@ -34,61 +38,211 @@ def exchanges():
             exchange.close()
 
 
-def test_a_state_arrives_as_it_was_written(exchanges):
+@pytest.mark.parametrize(
+    "command",
+    [
+        Command(SPEED, 7, 1 << 61, 2, (0.1, -0.2, 0.3, -1e-300, 5.0, 6.0), 0.5),
+        Command(STOP, 8, acceleration=2.0),
+        Command(NOTHING, until_ns=1_000_000_000, demand=1),
+    ],
+)
+def test_commands_arrive_as_they_were_said(command):
+    data = command.pack()
+    assert Command.unpack(data) == command
+    assert (
+        data[:1] == command.kind
+    )  # by which the client passes over velocities that were overtaken
+
+
+def test_each_side_of_the_page_reads_what_the_other_wrote_and_its_own_stays(exchanges):
     client, owner = exchanges
-    assert owner.read() is None
-    client.write(STATE)
-    assert owner.read() == STATE
+    assert (owner.done, owner.refused, owner.heard_ns, client.seen) == (0, 0, 0, Seen(0))
+    owner.beat(Seen.FRESH | Seen.REVIVED)
+    client.hear(1 << 61)
+    client.report(5, True)
+    assert (owner.done, owner.refused, owner.heard_ns) == (5, 0, 1 << 61)
+    assert client.seen == Seen.FRESH | Seen.REVIVED
+    client.report(6, False)
+    assert (owner.done, owner.refused) == (6, 6)
+    client.report(4, True)  # a stop that could only be done now: later commands stay answered
+    assert (owner.done, owner.refused) == (6, 6)
+    owner.beat()
+    assert client.seen == Seen.FRESH | Seen.REVIVED
 
 
-def test_sign_of_life_ages(exchanges):
+def test_sign_of_life_ages_until_the_next(exchanges):
     client, owner = exchanges
     owner.beat()
     first = client.silence_s()
     assert 0 <= first <= client.silence_s()
+    owner._write(0, 0)  # as if given when this machine began
+    assert client.silence_s() > 0.01
+    owner.beat(Seen.FRESH)
+    assert client.silence_s() < first + 60.0
 
 
-def test_a_client_killed_while_it_writes_leaves_the_state_before(exchanges):
-    client, owner = exchanges
-    states = [dataclasses.replace(STATE, received_ns=n, done=n) for n in (1, 2, 3)]
-    for state in states:
-        client.write(state)
-    page = client._page
-    at = page.find(struct.pack("<qd", 3, STATE.robot_time_s))
-    page[at + 40 : at + 48] = b"unfinish"
-    assert owner.read() == states[1]
-    client.write(states[2])  # elsewhere: nothing newer is whole, but this is
-    assert owner.read() == states[2]
+def state(time_s, runtime=2, safety=1, mode=7, z_m=0.3):
+    return RobotState(
+        time_s, (0.1, 0.2, z_m, 0.0, 0.0, 0.0), (0.01,) * 6, (-1.0,) * 6, safety, runtime, mode, 1
+    )
 
 
-def test_no_state_is_ever_read_half_written(exchanges):
-    client, owner = exchanges
-    ended = threading.Event()
+class States:
+    """A `StateReader` on states that the test sends, on a clock of the test's."""
 
-    def write():
-        number = 0
-        while not ended.is_set():
-            number += 1
-            value = float(number)
-            client.write(
-                dataclasses.replace(
-                    STATE, robot_time_s=value, tip_pose=(value,) * 6, tip_force=(value,) * 6
-                )
-            )
+    def __init__(self, round_trip_s=2e-4):
+        self.sent = []
+        self.now = 10**12
+        stream = SimpleNamespace(read=self._take)
+        self.reader = StateReader(stream, lambda: self.now, round_trip_s)
 
-    writer = threading.Thread(target=write)
-    client.write(STATE)
-    writer.start()
-    try:
-        seen = set()
-        while len(seen) < 50:
-            state = owner.read()
-            if state.robot_time_s != STATE.robot_time_s:
-                assert {*state.tip_pose, *state.tip_force} == {state.robot_time_s}
-                seen.add(state.robot_time_s)
-    finally:
-        ended.set()
-        writer.join()
+    def _take(self):
+        sent, self.sent = self.sent, []
+        return sent
+
+    def read(self, *states):
+        self.sent += states
+        return self.reader.read()
+
+
+def test_the_newest_of_the_states_that_have_come_counts():
+    states = States()
+    assert not states.read()
+    assert states.reader.sample is None
+    assert states.read(state(1.0, z_m=0.3), state(1.002, z_m=0.4))
+    sample = states.reader.sample
+    assert states.reader.newest.robot_time_s == sample.robot_time_s == 1.002
+    assert sample.position_m == (0.1, 0.2, 0.4)
+    assert sample.velocity == (0.01,) * 6
+    assert sample.tool_wrench == (-1.0,) * 6
+    assert sample.moving_allowed
+    assert states.reader.rate_hz == 2.0
+
+
+def test_a_state_that_is_said_again_is_heard_and_changes_nothing():
+    """So does a robot whose time stands."""
+    states = States()
+    states.read(state(1.0))
+    first = states.reader.sample
+    states.now += 10**9
+    assert states.read(state(1.0), state(1.0))
+    assert states.reader.sample is first
+    assert states.reader.rate_hz == 1.0
+
+
+def test_states_of_the_last_second_are_counted():
+    states = States()
+    for n in range(2000):
+        states.now += 2_000_000
+        states.read(state(0.002 * n))
+    assert states.reader.rate_hz == pytest.approx(500, abs=1)
+
+
+def test_times_are_those_of_the_quickest_states_however_late_others_come():
+    """Random delays on a network of 0.2 ms there and back; now and then nothing is read for 50 ms."""
+    rng = np.random.default_rng(3)
+    states, taken_ns, told_ns = States(round_trip_s=2e-4), [], []
+    start_ns = 10**12
+    waiting, free_ns = [], 0
+    for n in range(6000):
+        sent_ns = start_ns + 2_000_000 * n
+        waiting.append(state(5.0 + 0.002 * n))
+        states.now = max(states.now, sent_ns + round(1e9 * (1e-4 + rng.exponential(1e-3))))
+        if rng.random() < 0.005:
+            free_ns = sent_ns + 50_000_000
+        if states.now < free_ns:
+            continue
+        states.read(*waiting)
+        waiting = []
+        taken_ns.append(sent_ns)
+        told_ns.append(states.reader.sample.time_ns)
+    error_s = 1e-9 * (np.array(told_ns) - np.array(taken_ns))[1500:]
+    std_s = states.reader.clock_std_s
+    # of a quarter of a second the quickest is late by some 1 ms / 125
+    assert np.abs(error_s).max() < 1e-4
+    # half of the round trip, and how long a state waits for its cycle, cannot be seen
+    assert 0.002 / 12**0.5 < std_s < 1e-3
+
+
+def test_where_the_time_is_not_known_states_are_dated_by_those_before():
+    states = States(round_trip_s=0.0)
+    states.sent = [state(1.0)]
+    states.reader.read()
+    begun_ns = states.reader.sample.time_ns
+    states.sent = [state(1.002)]  # come, while this clock still shows the time before
+    states.reader.read(now_known=False)
+    assert states.reader.sample.time_ns == begun_ns + 2_000_000
+    states.now += 4_000_000
+    states.read(state(1.004))
+    assert states.reader.sample.time_ns == states.now
+    states.now += 1_000_000_000
+    states.read(state(1.006))
+    states.reader.date_anew()
+    assert states.reader.sample.time_ns == states.now
+
+
+@pytest.mark.parametrize(
+    ("states_of_program", "fault", "revived"),
+    [
+        ((2, 2, 2), None, False),
+        ((2, 1), ArmFault.PROGRAM_STOPPED, False),
+        ((2, 1, 2), ArmFault.PROGRAM_STOPPED, True),
+        ((2, 4, 2), ArmFault.PROGRAM_STOPPED, True),  # paused, and let go on at the pendant
+    ],
+)
+def test_only_the_program_that_was_guarded_is_ours(states_of_program, fault, revived):
+    times = itertools.count(1)
+    for at_once in (False, True):
+        states = States()
+        states.read(state(0.5))
+        states.reader.guard(True)
+        told = [state(0.002 * next(times) + 1, runtime=runtime) for runtime in states_of_program]
+        for batch in [told] if at_once else [[one] for one in told]:
+            states.read(*batch)
+        found = states.reader.fault
+        assert (None if found is None else found[0]) is fault
+        assert states.reader.sample.moving_allowed is (fault is None)
+        assert states.reader.revived is revived
+        states.reader.guard(True)  # the next program was started by us
+        states.read(state(100.0))
+        assert states.reader.fault is None
+
+
+class Control:
+    """What `Motion` says to ur_rtde."""
+
+    def __init__(self):
+        self.said = []
+
+    def kickWatchdog(self):
+        self.said.append("kick")
+        return True
+
+    def speedL(self, twist, acceleration, time_s):
+        self.said.append((twist, acceleration))
+        return True
+
+
+def test_the_watchdog_is_fed_with_the_newest_velocity_and_never_with_an_older_one():
+    control = Control()
+    motion = Motion(control)
+    twist = (0.0, 0.0, -0.005, 0.0, 0.0, 0.0)
+    assert motion.feed()
+    assert not motion.commanded
+    motion.speed(twist, 0.5)
+    motion.feed()
+    assert motion.commanded
+    motion.rest(1.5)  # nothing is sent, but from now on zero
+    assert not motion.commanded
+    motion.feed()
+    motion.speed(twist, 0.5)
+    motion.stop(2.0)
+    motion.feed()
+    assert not motion.commanded
+    assert control.said == [
+        "kick", (twist, 0.5), (twist, 0.5), (REST, 1.5), (twist, 0.5), (REST, 2.0), (REST, 2.0)
+    ]  # fmt: skip
+    assert motion.packets == len(control.said)
 
 
 def test_shipped_configuration_is_that_of_the_simulated_robot():

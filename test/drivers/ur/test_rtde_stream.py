@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reader of RTDE outputs on byte streams that are written out here, as the protocol's guide has them.
+
+Universal Robots, "Real-Time Data Exchange (RTDE) Guide": a packet is its length (u16, itself included), a type
+(one character) and a payload, big-endian.
+"""
+
+import contextlib
+import fcntl
+import os
+import socket
+import struct
+import termios
+import threading
+import time
+from array import array
+
+import numpy as np
+import pytest
+
+from tactile_resonance.drivers import rtde_stream
+from tactile_resonance.drivers.rtde_stream import PORT, RobotState, RtdeStream
+
+HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.231"
+PATIENCE_S = 30.0
+VERSION = b"\x00\x05V\x00\x02"
+NAMES = (
+    b"timestamp,actual_TCP_pose,actual_TCP_speed,actual_TCP_force,safety_status_bits,runtime_state,"
+    b"robot_mode,safety_mode"
+)
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32,INT32"
+
+
+def packet(kind, payload=b""):
+    return struct.pack(">H", 3 + len(payload)) + kind + payload
+
+
+REQUESTS = (VERSION, packet(b"O", struct.pack(">d", 125.0) + NAMES), packet(b"S"))
+GOOD = (packet(b"V", b"\x01"), packet(b"O", b"\x01" + TYPES), packet(b"S", b"\x01"))
+
+
+class Robot:
+    """A robot's RTDE port: hears three requests, answers as it is told; then `channel` is the test's."""
+
+    def __init__(self, answers=GOOD):
+        self.heard = []
+        self.channel = None
+        self._listener = socket.create_server((HOST, PORT))
+        self._answers = answers
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self):
+        for _ in range(2):  # only to see how long a connection takes
+            self._listener.accept()[0].close()
+        self.channel, _ = self._listener.accept()
+        self.channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with contextlib.suppress(OSError):
+            for request, answer in zip(REQUESTS, self._answers, strict=False):
+                got = b""
+                while len(got) < len(request):
+                    part = self.channel.recv(len(request) - len(got))
+                    if not part:
+                        return
+                    got += part
+                self.heard.append(got)
+                for at in range(0, len(answer), 7):
+                    self.channel.sendall(answer[at : at + 7])
+
+    def join(self):
+        self._thread.join(PATIENCE_S)
+
+    def close(self):
+        self.join()
+        self._listener.close()
+        if self.channel is not None:
+            self.channel.close()
+
+
+@pytest.fixture
+def serve():
+    """Make a robot that answers in some way; it is gone after the test."""
+    with contextlib.ExitStack() as stack:
+
+        def make(answers=GOOD):
+            robot = Robot(answers)
+            stack.callback(robot.close)
+            return robot
+
+        yield make
+
+
+@pytest.fixture
+def connected(serve):
+    robot = serve()
+    stream = RtdeStream(HOST, 125.0)
+    robot.join()
+    yield robot, stream
+    stream.close()
+
+
+def state(number):
+    """A state of which every figure tells where it belongs."""
+    vectors = 1e-3 * (number + np.arange(18.0)).reshape(3, 6)
+    return RobotState(0.002 * number, *map(tuple, vectors.tolist()), 1 << 11 | 1, 2, -1, 7)
+
+
+def data(it):
+    """A data package of recipe 1, field by field."""
+    payload = b"\x01" + struct.pack(">d", it.robot_time_s)
+    for vector in (it.pose, it.speed, it.force):
+        payload += struct.pack(">6d", *vector)
+    payload += struct.pack(">II", it.safety_bits, it.runtime_state)
+    return packet(b"U", payload + struct.pack(">ii", it.robot_mode, it.safety_mode))
+
+
+def read(stream, count):
+    """So many states as they come; no more may come."""
+    states, end_s = [], time.monotonic() + PATIENCE_S
+    while len(states) < count:
+        assert time.monotonic() < end_s, f"{len(states)} of {count}"
+        states += stream.read()
+        time.sleep(0.0005)
+    assert stream.read() == []
+    return states
+
+
+def arrived(stream, size):
+    """Wait until so many bytes are there to be read."""
+    there, end_s = array("i", [0]), time.monotonic() + PATIENCE_S
+    while there[0] < size:
+        assert time.monotonic() < end_s, f"{there[0]} bytes of {size}"
+        fcntl.ioctl(stream.fileno(), termios.FIONREAD, there)
+
+
+def test_it_asks_for_version_2_and_its_variables_at_its_rate(connected):
+    robot, stream = connected
+    assert tuple(robot.heard) == REQUESTS
+    assert stream.local_port == robot.channel.getpeername()[1]
+    assert 0 < stream.round_trip_s < PATIENCE_S
+
+
+# texts of the robot, answers to others, data of another recipe, short and long; one looks like a state inside
+OTHERS = (
+    packet(b"M", b"\x05hello\x03robot\x01"),
+    packet(b"U", b"\x02" + bytes(10)),
+    packet(b"M", data(state(77)) + b"x"),
+    packet(b"S", b"\x01"),
+    packet(b"P"),
+    packet(b"M", bytes(3000)),
+)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_states_come_whole_and_in_order_however_the_stream_is_cut(connected, seed):
+    robot, stream = connected
+    rng = np.random.default_rng(seed)
+    states = [state(n) for n in range(100)]
+    text = b""
+    for n, one in enumerate(states):
+        if n % 3 == 0:
+            text += OTHERS[n // 3 % len(OTHERS)]
+        text += data(one)
+    got, at = [], 0
+    while at < len(text):
+        size = int(rng.choice([1, 3, 50, len(data(states[0])), 500, 4000]))
+        robot.channel.sendall(text[at : at + size])
+        at += size
+        if rng.random() < 0.7:
+            got += stream.read()
+    got += read(stream, len(states) - len(got))
+    assert got == states
+
+
+def test_a_state_is_there_as_soon_as_its_last_byte_is(connected):
+    robot, stream = connected
+    text = data(state(1))
+    robot.channel.sendall(text[:-1])
+    assert stream.read() == []
+    robot.channel.sendall(text[-1:])
+    assert read(stream, 1) == [state(1)]
+
+
+@pytest.mark.parametrize("at_once", [100, len(data(state(0))), 5 * len(data(state(0))), 1 << 16])
+def test_one_look_brings_all_that_has_come(connected, monkeypatch, at_once):
+    """However long nobody has looked: the newest state is among them."""
+    robot, stream = connected
+    monkeypatch.setattr(rtde_stream, "_AT_ONCE", at_once)
+    states = [state(n) for n in range(50)]
+    text = b"".join(map(data, states))
+    robot.channel.sendall(text)
+    arrived(stream, len(text))
+    assert stream.read() == states
+
+
+def test_nothing_to_read_is_nothing_and_a_closed_connection_an_error(connected):
+    robot, stream = connected
+    assert stream.read() == []
+    robot.channel.sendall(data(state(1)))
+    robot.channel.close()
+    arrived(stream, len(data(state(1))))
+    assert stream.read() == [state(1)]
+    with pytest.raises(ConnectionError, match="the robot has closed the connection"):
+        read(stream, 1)
+
+
+def test_a_length_that_is_none_ends_it(connected):
+    robot, stream = connected
+    robot.channel.sendall(data(state(1)) + b"\x00\x02U" + bytes(300))
+    with pytest.raises(ConnectionError, match="a packet of 2 bytes"):
+        read(stream, 2)
+
+
+def test_what_comes_between_question_and_answer_is_passed_over(serve):
+    serve((OTHERS[0] + GOOD[0], OTHERS[5] + GOOD[1], OTHERS[2] + GOOD[2] + data(state(5))))
+    stream = RtdeStream(HOST, 125.0)
+    assert read(stream, 1) == [state(5)]
+    stream.close()
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ((packet(b"V", b"\x00"),), "does not take version 2"),
+        ((GOOD[0], packet(b"O", b"\x00" + TYPES.replace(b"UINT32", b"NOT_FOUND"))), "NOT_FOUND"),
+        ((GOOD[0], packet(b"O", b"\x01" + TYPES[:-6])), "does not send timestamp,.* but"),
+        ((*GOOD[:2], packet(b"S", b"\x00")), "does not start to send"),
+        ((b"\x00\x00V",), "a packet of 0 bytes"),
+        ((), "timed out"),
+    ],
+)
+def test_a_robot_that_does_not_agree_is_refused_by_name(serve, answers, message):
+    robot = serve(answers)
+    with pytest.raises(ConnectionError, match=f"{HOST}, port 30004: .*{message}"):
+        RtdeStream(HOST, 125.0, timeout_s=0.5)
+    robot.join()
+
+
+def test_nobody_there_is_said():
+    with pytest.raises(ConnectionError, match="no robot answers at .*, port 30004: .*refused"):
+        RtdeStream(HOST, 500.0)
