@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from tactile_resonance.clock import Demand
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -77,8 +78,8 @@ class VirtualBench:
         """Virtual time since the start [ns]."""
         return self.time_ns
 
-    def wait_until(self, time_ns: int) -> None:
-        """Let whole periods pass until a time is reached."""
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Let whole periods pass until a time is reached, whatever the demand."""
         while self.time_ns < time_ns:
             self.motion.step()
             self.plant.step(transform_from_pose(self.motion.pose.vector), self.motion.period_s)

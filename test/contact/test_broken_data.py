@@ -12,7 +12,6 @@ import pytest
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmFault
 from tactile_resonance.contact.law import Aim
-from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.transducer import CellParameters
@@ -20,8 +19,6 @@ from tactile_resonance.simulation.transducer import CellParameters
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, SOFT, contact, lower, started, stiffer
 from disturbed import broken_promises, disturbed
-
-HOUR_NS = 3_600 * 10**9
 
 
 def brought_to(state, **options):
@@ -177,27 +174,3 @@ def test_two_thirds_of_the_abort_force_may_be_asked_for():
     made = contact(aim=Aim(0.02))
     made.loop.start(made.goal)
     assert made.controller.state is State.TRAVEL
-
-
-def test_loop_stands_by_a_clock_that_is_set_back():
-    made = contact()
-    waits = []
-
-    class Clock:
-        time_ns = 10**12
-
-        def now_ns(self):
-            return self.time_ns
-
-        def wait_until(self, time_ns):
-            waits.append(time_ns - self.time_ns)
-            self.time_ns = max(self.time_ns, time_ns)
-
-    clock = Clock()
-    loop = ContactLoop(made.bench.arm, made.bench.force, clock, made.controller)
-    loop.cycle()
-    clock.time_ns -= HOUR_NS
-    for _ in range(3):
-        loop.cycle()
-    assert max(waits) <= 2_000_000
-    assert loop.overruns == 0

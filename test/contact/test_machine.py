@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.loop import ContactLoop, WallClock
+from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
