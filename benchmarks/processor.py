@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-LOOP_ADDITIONS, FFT_SAMPLES = 5_000_000, 160_000
+LOOP_ADDITIONS, FFT_SAMPLES, FFTS = 5_000_000, 160_000, 20
 
 
 def cpu_s(pid: int) -> float:
@@ -30,28 +30,22 @@ def children(pid: int) -> dict[int, list[str]]:
     return found
 
 
-def loop_s(repetitions: int = 5) -> float:
-    """Least time of a Python loop of 5 million additions [s]."""
-
-    def once() -> float:
-        begun_s, total = time.perf_counter(), 0
-        for k in range(LOOP_ADDITIONS):
-            total += k
-        return time.perf_counter() - begun_s
-
-    return min(once() for _ in range(repetitions))
+def loop_s() -> float:
+    """Processor time of a Python loop of 5 million additions [s]."""
+    begun_s, total = time.process_time(), 0
+    for k in range(LOOP_ADDITIONS):
+        total += k
+    return time.process_time() - begun_s
 
 
-def fft_s(repetitions: int = 50) -> float:
-    """Least time of numpy's real FFT of two channels of 160000 samples in double precision [s]."""
+def fft_s() -> float:
+    """Processor time of numpy's real FFT of two channels of 160000 samples in double precision [s]."""
     channels = np.random.default_rng(0).standard_normal((2, FFT_SAMPLES))
-
-    def once() -> float:
-        begun_s = time.perf_counter()
+    np.fft.rfft(channels)  # makes its tables
+    begun_s = time.process_time()
+    for _ in range(FFTS):
         np.fft.rfft(channels)
-        return time.perf_counter() - begun_s
-
-    return min(once() for _ in range(repetitions))
+    return (time.process_time() - begun_s) / FFTS
 
 
 def _stat(pid: int) -> list[str]:
