@@ -58,6 +58,13 @@ class Kill:
     phase: str
 
 
+def without_robot(parameters: dict[str, dict[str, object]]) -> None:
+    """Make parameters of `node_parameters` those of ideal contact: the tip is where the scan says."""
+    parameters["fake_hardware_node"]["robot_host"] = "''"
+    del parameters["scan_node"]["table_in_base"]  # places are in the frame of the scene
+    parameters["scan_node"]["contact"] = "none"
+
+
 class KilledScan:
     """Scans of one scene, one after the other, whose nodes are killed; a context that ends them.
 
@@ -82,10 +89,7 @@ class KilledScan:
         self._parameters = node_parameters(Job(scene, folder, robot_host or HOST), False, folder)
         self._parameters[MANAGER] = {"nodes": f"[{','.join(self.nodes)}]"}
         if not robot_host:
-            self._parameters["fake_hardware_node"]["robot_host"] = "''"
-            # its tip is where the scan says, in the frame of the scene
-            del self._parameters["scan_node"]["table_in_base"]
-            self._parameters["scan_node"]["contact"] = "none"
+            without_robot(self._parameters)
         self._known: dict[str, Finished] = {}
         self._run = folder / "run-0"
         self._runs = 0

@@ -49,7 +49,7 @@ class LinkResult:
     gaps_s : (m - 1,) array
         Between the robot's time stamps of states seen one after the other.
     rate_hz : float
-        States that the client process received in the last second, as it counts them.
+        States received in the last second of the robot's time.
     cpu : dict
         Share of one core by process.
     clock_uncertainty_s : float
@@ -230,7 +230,7 @@ def _report(results: dict[str, LinkResult], failures: dict[str, str], seconds: f
         "age of a state at first sight: median / 99 % / max [ms]",
         [spread(r.arrivals_s) for r in each],
     )
-    row("states a second, received by the client", [f"{r.rate_hz:.0f}" for r in each])
+    row("states a second, received", [f"{r.rate_hz:.0f}" for r in each])
     row("states a second, seen by the owner", [f"{1 / r.gaps_s.mean():.0f}" for r in each])
     row("longest gap between states seen [ms]", [f"{r.gaps_s.max() * 1e3:.0f}" for r in each])
     row(
