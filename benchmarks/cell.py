@@ -8,7 +8,6 @@ is installed, on a socketcand bus over loopback, and is read as a control loop o
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.processor import cpu_s
 from tactile_resonance.contact.interfaces import ForceError
 from tactile_resonance.drivers.can_wrench import CanWrench
 from tactile_resonance.drivers.force_config import ForceConfig, read_force_config
@@ -53,11 +53,6 @@ class Cell:
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
-    def cpu_s(self) -> float:
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii")
-        user, system = fields.rsplit(")", 1)[1].split()[11:13]
-        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
     def end(self) -> None:
         self.process.terminate()
         self.process.wait(5.0)
@@ -83,7 +78,7 @@ def _stream(config: ForceConfig, cell: Cell, seconds: float) -> str:
     # a stalled machine is measured here, not called a fault
     source = CanWrench(replace(config, limits=replace(config.limits, silent_s=1.0)))
     source.start()
-    own, its = _cpu_s(), cell.cpu_s()
+    own, its = cpu_s(os.getpid()), cpu_s(cell.process.pid)
     begin_s = due_s = time.monotonic()
     stamps: list[int] = []
     ages_s: list[float] = []
@@ -91,12 +86,12 @@ def _stream(config: ForceConfig, cell: Cell, seconds: float) -> str:
     while (now_s := time.monotonic()) < begin_s + seconds:
         samples = source.read()
         if samples:
-            ages_s.append((time.time_ns() - samples[-1].time_ns) * 1e-9)
+            ages_s.append((time.monotonic_ns() - samples[-1].time_ns) * 1e-9)
             stamps += [sample.time_ns for sample in samples]
         due_s = max(due_s + LOOP_S, now_s)
         time.sleep(max(0.0, due_s - time.monotonic()))
     elapsed_s = time.monotonic() - begin_s
-    own, its = _cpu_s() - own, cell.cpu_s() - its
+    own, its = cpu_s(os.getpid()) - own, cpu_s(cell.process.pid) - its
     count, lost = source.received - first, source.lost
     clock_s = source.info.clock_uncertainty_s
     source.close()
@@ -166,8 +161,3 @@ def _read_for(source: CanWrench, seconds: float) -> None:
     while time.monotonic() < deadline_s:
         source.read()
         time.sleep(LOOP_S)
-
-
-def _cpu_s() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime

@@ -7,6 +7,7 @@ stood still for more than 10 ms says nothing and is repeated once.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -19,14 +20,16 @@ import numpy as np
 
 from benchmarks.contact_case import DEEPEST_M, FORCE_N, Outcome
 from benchmarks.simulated_robot import simulated_robot
+from tactile_resonance.clock import WallClock
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.law import Aim
-from tactile_resonance.contact.loop import ContactLoop, WallClock
+from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
@@ -39,6 +42,7 @@ HOST = "127.0.13.77"
 PRIORITY = 20
 RADIUS_M = 2.5e-3
 CLEAR_M = 0.02
+LIFT_M_S, LIFT_M_S2, LIFT_WITHIN_S = 0.05, 0.5, 10.0
 STEP_M = 0.006  # between cases: fresh tissue
 PLACES = ((1e-3, 0.0), (-1e-3, 10.0))
 """Height of the surface above where it is expected [m], and its tilt [degrees]."""
@@ -117,12 +121,21 @@ def _connected() -> Iterator[ContactLoop]:
 
 def _lift(arm: UrArm) -> None:
     """Off the tissue, where a case that failed may have left the tip."""
-    tip = arm.state().tip
-    if tip.position_m[2] < TABLE_IN_BASE[2] + CLEAR_M:
-        x, y, _ = tip.position_m
-        arm.move(Pose(np.array([x, y, TABLE_IN_BASE[2] + CLEAR_M]), tip.rotation_rad), 0.05, 0.5)
-        while arm.moving():
-            time.sleep(0.004)
+    end_s = time.monotonic() + LIFT_WITHIN_S
+    while time.monotonic() < end_s:
+        try:
+            sample = arm.state()
+            if sample.position_m[2] < TABLE_IN_BASE[2] + CLEAR_M:
+                arm.speed((0.0, 0.0, LIFT_M_S, 0.0, 0.0, 0.0), LIFT_M_S2)
+            elif math.hypot(*sample.velocity[:3]) > STILL_M_S:
+                arm.stop(LIFT_M_S2)
+            else:
+                return
+        except ArmError as error:
+            if error.fault is not ArmFault.STALE:  # a stall of the machine, not judged here
+                raise
+        time.sleep(0.004)
+    raise RuntimeError(f"the tip is not lifted within {LIFT_WITHIN_S:g} s")
 
 
 def _contact(

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.kills_reader import Finished, finished_points
+from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.processes import NodeProcesses
-from tactile_resonance.simulation.plant_defaults import PATIENT, TABLE_IN_BASE
 
 STREAM = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 OTHERS = ("pole_map_node", "scan_node")
 MANAGER = "manager_node"
+HOST = "127.0.80.1"  # of the bench's time where no robot is
 ALL = "all at once"
 UP_WITHIN_S = 240.0  # of a machine that may have other work
 SCAN_WITHIN_S = 300.0
@@ -57,6 +58,13 @@ class Kill:
     phase: str
 
 
+def without_robot(parameters: dict[str, dict[str, object]]) -> None:
+    """Make parameters of `node_parameters` those of ideal contact: the tip is where the scan says."""
+    parameters["fake_hardware_node"]["robot_host"] = "''"
+    del parameters["scan_node"]["table_in_base"]  # places are in the frame of the scene
+    parameters["scan_node"]["contact"] = "none"
+
+
 class KilledScan:
     """Scans of one scene, one after the other, whose nodes are killed; a context that ends them.
 
@@ -67,7 +75,7 @@ class KilledScan:
     points : (columns, rows)
         Of the grid that is scanned.
     robot_host : str
-        127.x.y.z of a simulated robot with load cell; empty: ideal contact, as fast as the bench computes.
+        127.x.y.z of a simulated robot with load cell; empty: ideal contact. Either in simulated time.
     """
 
     def __init__(self, folder: Path, points: tuple[int, int], robot_host: str = "") -> None:
@@ -78,25 +86,10 @@ class KilledScan:
         scene.write_text(SCENE.format(size_x=size[0], size_y=size[1], blocks=BLOCKS))
         self._scene = scene
         self.nodes = (*STREAM, *(["contact_node"] if robot_host else []), *OTHERS)
-        self._parameters: dict[str, dict[str, object]] = {
-            "fake_hardware_node": {"scene": scene, "speed": 0.0},
-            "excitation_node": {"record_folder": folder / "records"},
-            "scan_node": {"contact": "none"},
-            MANAGER: {"nodes": f"[{','.join(self.nodes)}]"},
-        }
-        if robot_host:
-            table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
-            self._parameters["fake_hardware_node"] = {
-                "scene": scene,
-                "robot_host": robot_host,
-                "table_in_base": table,
-            }
-            self._parameters["contact_node"] = {
-                "robot_host": robot_host,
-                "force_host": robot_host,
-                **PATIENT,
-            }
-            self._parameters["scan_node"] = {"table_in_base": table}
+        self._parameters = node_parameters(Job(scene, folder, robot_host or HOST), False, folder)
+        self._parameters[MANAGER] = {"nodes": f"[{','.join(self.nodes)}]"}
+        if not robot_host:
+            without_robot(self._parameters)
         self._known: dict[str, Finished] = {}
         self._run = folder / "run-0"
         self._runs = 0

@@ -43,7 +43,7 @@ def main() -> None:
         "--robot-host",
         default="",
         metavar="127.X.Y.Z",
-        help="with a simulated robot and load cell, in real time (default: ideal contact, fast)",
+        help="with a simulated robot and load cell (default: ideal contact)",
     )
     parser.add_argument("--folder", type=Path, help="receives runs and logs (default: a new one)")
     parser.add_argument("--output", type=Path, help="file that receives the table")
@@ -81,7 +81,7 @@ def _report(kills: Sequence[Kill], scans: Sequence[Mapping], robot: str, took_s:
         *textwrap.wrap(" ".join(how), 112),
         "",
         *(
-            [f"With `--robot-host {robot} --kills {len(kills)}`, in real time:", ""]
+            [f"With `--robot-host {robot} --kills {len(kills)}`, in simulated time:", ""]
             if robot
             else []
         ),

@@ -72,6 +72,7 @@ def _record() -> bytes:
         "actuator_counts": np.zeros(0, np.int32),
         "sensor_counts": np.zeros(0, np.int32),
         "anti_alias_filter": "",
+        "contact_reason": "",
         "label": "",
     }
     names = [name for name, _ in store.fielddefs[TYPE][1]]

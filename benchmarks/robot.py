@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.processor import cpu_s
 from benchmarks.simulated_robot import simulated_robot
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
@@ -48,7 +49,7 @@ class LinkResult:
     gaps_s : (m - 1,) array
         Between the robot's time stamps of states seen one after the other.
     rate_hz : float
-        States that the client process received in the last second, as it counts them.
+        States received in the last second of the robot's time.
     cpu : dict
         Share of one core by process.
     clock_uncertainty_s : float
@@ -123,11 +124,11 @@ def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
             pairs = [_respond(arm, (-1) ** k) for k in range(repetitions)]
             assert arm.client_pid is not None
             pids = {"simulated robot": robot.pid, "client": arm.client_pid, "owner": os.getpid()}
-            before = {name: _cpu_s(pid) for name, pid in pids.items()}
+            before = {name: cpu_s(pid) for name, pid in pids.items()}
             start_s = time.monotonic()
             arrivals, stamps = _watch(arm, seconds)
             took_s = time.monotonic() - start_s
-            cpu = {name: (_cpu_s(pid) - before[name]) / took_s for name, pid in pids.items()}
+            cpu = {name: (cpu_s(pid) - before[name]) / took_s for name, pid in pids.items()}
             return LinkResult(
                 commands_s=np.array([seen for seen, _ in pairs]),
                 motions_s=np.array([stamped for _, stamped in pairs]),
@@ -144,14 +145,14 @@ def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
 
 def _respond(arm: UrArm, sign: int) -> tuple[float, float]:
     """Seconds from a command to motion: seen, and by the state's own time."""
-    commanded_ns = time.time_ns()
+    commanded_ns = arm.clock.now_ns()
     arm.speed(np.array([0, 0, sign * SPEED_M_S, 0, 0, 0]), ACCELERATION_M_S2)
     end_s = time.monotonic() + LOST_S
     while abs((sample := arm.state()).velocity[2]) <= MOVED_M_S:
         if time.monotonic() > end_s:
             raise ValueError(f"benchmark robot: no motion within {LOST_S:g} s of a command")
         time.sleep(0.0001)
-    seen_ns = time.time_ns()
+    seen_ns = arm.clock.now_ns()
     _rest(arm, 0.05)
     arm.stop(ACCELERATION_M_S2)
     _rest(arm, 0.15 + 0.02 * np.random.default_rng(seen_ns).random())
@@ -180,17 +181,11 @@ def _watch(arm: UrArm, seconds: float) -> tuple[FloatArray, FloatArray]:
             next_s = now_s + PERIOD_S
         sample = arm.state()
         if not stamps or sample.robot_time_s > stamps[-1]:
-            ages.append((time.time_ns() - sample.time_ns) * 1e-9)
+            ages.append((arm.clock.now_ns() - sample.time_ns) * 1e-9)
             stamps.append(sample.robot_time_s)
         time.sleep(0.0003)
     arm.stop(ACCELERATION_M_S2)
     return np.array(ages), np.array(stamps)
-
-
-def _cpu_s(pid: int) -> float:
-    """Processor time of a process so far [s] (proc(5), fields 14 and 15 of stat)."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _may_take(priority: int) -> bool:
@@ -235,7 +230,7 @@ def _report(results: dict[str, LinkResult], failures: dict[str, str], seconds: f
         "age of a state at first sight: median / 99 % / max [ms]",
         [spread(r.arrivals_s) for r in each],
     )
-    row("states a second, received by the client", [f"{r.rate_hz:.0f}" for r in each])
+    row("states a second, received", [f"{r.rate_hz:.0f}" for r in each])
     row("states a second, seen by the owner", [f"{1 / r.gaps_s.mean():.0f}" for r in each])
     row("longest gap between states seen [ms]", [f"{r.gaps_s.max() * 1e3:.0f}" for r in each])
     row(

@@ -17,6 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.killed_scan import HOST, without_robot
+from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.processes import NodeProcesses, end_with_parent
 
 NEAR_NODES = ("fake_hardware_node", "excitation_node")
@@ -169,30 +171,18 @@ def on_two_machines(
     order: list[str],
     *,
     robot_host: str = "",
-    speed: float = 0.0,
+    real_time: bool = False,
     environment: dict[str, str] | None = None,
 ) -> dict:
     """Start the nodes of both sides, run an order of the client near, return what it tells."""
     scene = folder / "scene.yaml"
     scene.write_text(SCENE)
     near = [*NEAR_NODES, *(["contact_node"] if robot_host else []), "scan_node"]
-    parameters: dict[str, dict[str, object]] = {
-        "fake_hardware_node": {"scene": scene, "speed": speed},
-        "excitation_node": {"record_folder": folder / "records"},
-        "scan_node": {"contact": "none"},
-        "manager_node": {"nodes": f"[{','.join([*near[:2], *FAR_NODES, *near[2:]])}]"},
-    }
-    if robot_host:
-        from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-
-        table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
-        parameters["fake_hardware_node"] = {
-            "scene": scene,
-            "robot_host": robot_host,
-            "table_in_base": table,
-        }
-        parameters["contact_node"] = {"robot_host": robot_host, "force_host": robot_host}
-        parameters["scan_node"] = {"table_in_base": table}
+    job = Job(scene, folder, robot_host or HOST, real_time=real_time)
+    parameters = node_parameters(job, False, folder)
+    parameters["manager_node"] = {"nodes": f"[{','.join([*near[:2], *FAR_NODES, *near[2:]])}]"}
+    if not robot_host:
+        without_robot(parameters)
     given = {
         "ROS_DOMAIN_ID": DOMAIN,
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
@@ -206,7 +196,7 @@ def on_two_machines(
             NodeProcesses(folder / "far", machines.prefix(FAR)) as there,
         ):
             for node in FAR_NODES:
-                there.start(node)
+                there.start(node, parameters.get(node))
             for node in (*near, "manager_node"):
                 here.start(node, parameters.get(node))
             return _near(machines, folder, order)
@@ -244,9 +234,7 @@ def main() -> None:
     parser.add_argument(
         "order", nargs="*", default=["measure", "50"], help="scan, or measure BLOCKS"
     )
-    parser.add_argument(
-        "--speed", type=float, default=0.0, help="of the bench; 0: as fast as it computes"
-    )
+    parser.add_argument("--real-time", action="store_true", help="default: simulated time")
     parser.add_argument("--robot-host", default="", metavar="127.X.Y.Z")
     parser.add_argument(
         "--cable", default="", help="for tc qdisc add dev ... root: netem delay 1ms"
@@ -262,7 +250,7 @@ def main() -> None:
             Path(folder),
             options.order,
             robot_host=options.robot_host,
-            speed=options.speed,
+            real_time=options.real_time,
             environment=given,
         )
     print(json.dumps(told, indent=1))

@@ -76,6 +76,11 @@ class NodeProcesses:
         for node in (*nodes, "manager_node"):
             self.start(node, given.get(node), (niceness or {}).get(node, 0))
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process id of each node."""
+        return {node: process.pid for node, process in self._processes.items()}
+
     def kill(self, *nodes: str) -> None:
         """End nodes as a crash would, with SIGKILL, all before the first is waited for."""
         killed = [self._processes.pop(node) for node in nodes]

@@ -74,7 +74,7 @@ class Contact:
     time_ns : int
         When the pose was taken (ROS time) [ns].
     coverage : float
-        Fraction of that time in which forces were measured.
+        Fraction of that time in which forces were measured; NaN where unknown.
     reason : str
         Why the force is unknown; empty where it is known.
     """
@@ -85,7 +85,7 @@ class Contact:
     orientation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     frame_id: str = ""
     time_ns: int = 0
-    coverage: float = 0.0
+    coverage: float = float("nan")
     reason: str = ""
 
 

@@ -139,7 +139,7 @@ def run_job(job: Job) -> int:
     if job.real_time and not priority:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
-    parameters = _parameters(job, bool(content.tissue_classes), work)
+    parameters = node_parameters(job, bool(content.tissue_classes), work)
     computing = () if priority or not job.real_time else COMPUTING
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
@@ -182,7 +182,7 @@ class _Ended:
             os._exit(INTERRUPTED)
 
 
-def _parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
+def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
     """Of each node, beside their defaults."""
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
     simulated = not job.real_time

@@ -106,7 +106,7 @@ def watch(config: UrArmConfig, seconds: float) -> LinkReport:
                 stale += 1
                 time.sleep(POLL_S)
                 continue
-            ages.append((time.time_ns() - sample.time_ns) * 1e-9)
+            ages.append((arm.clock.now_ns() - sample.time_ns) * 1e-9)
             if not stamps or sample.robot_time_s != stamps[-1]:
                 stamps.append(sample.robot_time_s)
             time.sleep(POLL_S)

@@ -168,8 +168,8 @@ def origin_from_message(message: Any) -> Origin:
             contact_from_message(
                 message.tip_pose, message.contact_force_n, message.contact_force_std_n
             ),
-            # of records alone, and not of those of earlier versions
-            coverage=getattr(message, "contact_coverage", 0.0),
+            # of records alone
+            coverage=getattr(message, "contact_coverage", float("nan")),
             reason=getattr(message, "contact_reason", ""),
         ),
     )

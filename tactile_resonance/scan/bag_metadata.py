@@ -12,7 +12,6 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
-from tactile_resonance.scan.messages import definition_and_hash
 from tactile_resonance.scan.point_file import BAG_VERSION, LATCHED, FileContent, TopicContent
 
 # the compiled one, where there is one: a run of a thousand points has ten thousand lines
@@ -26,8 +25,8 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
     ----------
     folder : Path
     files : sequence of FileContent
-        In any order; listed by the time of their first message. A topic must have one type in all of
-        them.
+        In any order; listed by the time of their first message. A topic must have one type, of one
+        definition, in all of them.
     """
     content = {"rosbag2_bagfile_information": bag_metadata(files)}
     text = yaml.dump(content, Dumper=_DUMPER, sort_keys=False, allow_unicode=True)
@@ -66,10 +65,10 @@ def bag_metadata(files: Sequence[FileContent]) -> dict[str, Any]:
 
 def _topics(files: Sequence[FileContent]) -> list[TopicContent]:
     """Topics of all files together, by name."""
-    merged: dict[tuple[str, str, bool], int] = {}
+    merged: dict[tuple[str, str, str, bool], int] = {}
     for file in files:
         for topic in file.topics:
-            key = (topic.name, topic.type_name, topic.latched)
+            key = (topic.name, topic.type_name, topic.type_hash, topic.latched)
             merged[key] = merged.get(key, 0) + topic.count
     return [TopicContent(*key, count) for key, count in sorted(merged.items())]
 
@@ -81,7 +80,7 @@ def _topic(topic: TopicContent) -> dict[str, Any]:
             "type": topic.type_name,
             "serialization_format": "cdr",
             "offered_qos_profiles": dump_qos_v9([LATCHED] if topic.latched else []),
-            "type_description_hash": definition_and_hash(topic.type_name)[1],
+            "type_description_hash": topic.type_hash,
         },
         "message_count": topic.count,
     }

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.recording.from_messages import poles_from_message
-from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.recorded import file_of
@@ -70,9 +69,9 @@ def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
 
 def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
     """What the bench told of the blocks that the last poles rest on, its mode next to the estimate."""
-    told, middle_ns, store = [], 0, message_types()
-    for _, _, cdr in read_messages_of_type(file_of(run.path, result), POLES):
-        poles, origin = poles_from_message(store.deserialize_cdr(cdr, POLES))
+    told, middle_ns = [], 0
+    for _, _, message in read_messages_of_type(file_of(run.path, result), POLES):
+        poles, origin = poles_from_message(message)
         if origin.measurement_id != result.measurement_id:
             continue
         if poles.status is PolesStatus.TRUTH:

@@ -3,12 +3,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
+import numpy as np
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from tactile_resonance.configuration import PACKAGE_NAME, share_path
+
+
+class OtherVersionError(ValueError):
+    """Messages of another version that cannot be read as those of today."""
 
 
 @cache
@@ -27,6 +35,80 @@ def message_types() -> Typestore:
         types.update(get_types_from_msg(path.read_text(encoding="utf-8"), name))
     store.register(types)
     return store
+
+
+@cache
+def reader_of(type_name: str, definition: MessageDefinition) -> Callable[[bytes], Any]:
+    """Function that makes a message of CDR bytes as the definition in their file says.
+
+    Fields of today's definition that the file's does not have are NaN, an empty text or an empty array.
+
+    Parameters
+    ----------
+    type_name : str
+        Of this package or common in ROS 2.
+    definition : MessageDefinition
+        As rosbags finds it in the file.
+
+    Raises
+    ------
+    OtherVersionError
+        If the file holds no definition, or one in which a field has another type than today or lacks
+        though no value would say that it is unknown.
+    """
+    store = _types_of(type_name, definition)
+    today, own = message_types().fielddefs[type_name][1], dict(store.fielddefs[type_name][1])
+    absent: dict[str, Any] = {}
+    for field, kind in today:
+        if field not in own:
+            absent[field] = _unknown(type_name, field, kind)
+        elif own[field] != kind:
+            raise OtherVersionError(
+                f"{type_name}: recorded by a version whose field {field} has another type"
+            )
+
+    def read(cdr: bytes) -> Any:
+        message: Any = store.deserialize_cdr(cdr, type_name)
+        for field, value in absent.items():
+            setattr(message, field, value)
+        return message
+
+    return read
+
+
+@cache
+def hash_of(type_name: str, definition: MessageDefinition) -> str:
+    """Hash (REP-2011) of a type as a file defines it.
+
+    Raises
+    ------
+    OtherVersionError
+        If the file holds no definition.
+    """
+    return _types_of(type_name, definition).hash_rihs01(type_name)
+
+
+def _types_of(type_name: str, definition: MessageDefinition) -> Typestore:
+    """A type, and all that it needs, as a file defines them."""
+    if definition.format is not MessageDefinitionFormat.MSG:
+        raise OtherVersionError(
+            f"{type_name}: definition of format {definition.format.name}, accepted is MSG"
+        )
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition.data, type_name))
+    return store
+
+
+def _unknown(type_name: str, field: str, kind: Any) -> Any:
+    """What stands for a field that was not recorded."""
+    node, detail = kind
+    if node is Nodetype.SEQUENCE:
+        return np.zeros(0)
+    if node is Nodetype.BASE and detail[0] in ("float32", "float64"):
+        return float("nan")
+    if node is Nodetype.BASE and detail[0] == "string":
+        return ""
+    raise OtherVersionError(f"{type_name}: recorded by a version without the field {field}")
 
 
 @cache

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rosbags.interfaces import (
     Connection,
@@ -21,9 +21,16 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
 
 from tactile_resonance.recording.stored_file import sync_folder
-from tactile_resonance.scan.messages import definition_and_hash
+from tactile_resonance.scan.messages import (
+    OtherVersionError,
+    definition_and_hash,
+    hash_of,
+    reader_of,
+)
 
 BAG_VERSION: Literal[9] = 9
 _FOREVER = QosTime(9223372036, 854775807)
@@ -39,10 +46,11 @@ LATCHED = Qos(
 
 @dataclass(frozen=True)
 class TopicContent:
-    """One topic of a file."""
+    """One topic of a file; `type_hash` (REP-2011) is that of the definition in the file."""
 
     name: str
     type_name: str
+    type_hash: str
     latched: bool
     count: int
 
@@ -172,7 +180,10 @@ class PointFileWriter:
         sync_folder(self._target.parent)
         shutil.rmtree(self._folder, ignore_errors=True)
         topics = tuple(
-            TopicContent(topic, connection.msgtype, topic in self._latched, self._counts[topic])
+            TopicContent(
+                *(topic, connection.msgtype, connection.digest),
+                *(topic in self._latched, self._counts[topic]),
+            )
             for topic, connection in self._connections.items()
         )
         return FileContent(self._target.name, self._start_ns, self._end_ns, topics)
@@ -201,49 +212,52 @@ def read_content(path: Path) -> FileContent:
                 assert isinstance(extension, ConnectionExtRosbag2)
                 latched = LATCHED in extension.offered_qos_profiles
                 topics.append(
-                    TopicContent(connection.topic, connection.msgtype, latched, connection.msgcount)
+                    TopicContent(
+                        *(connection.topic, connection.msgtype),
+                        hash_of(connection.msgtype, connection.msgdef),
+                        *(latched, connection.msgcount),
+                    )
                 )
             return FileContent(path.name, reader.start_time, reader.end_time - 1, tuple(topics))
     except _DAMAGE as error:
         raise _damaged(path, error) from error
 
 
-def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
-    """(time [ns], topic, CDR) of each message of a topic of one file or of a whole bag, in order.
+def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, Any]]:
+    """(time [ns], topic, message) of each message of a topic of one file, in order.
+
+    Messages are read with the definitions in the file, see `scan.messages.reader_of`.
 
     Raises
     ------
     ValueError
-        If the file is damaged.
+        If the file is damaged, or of a version whose messages cannot be read any more.
     """
     return _read(path, lambda connection: connection.topic == topic)
 
 
-def read_messages_of_type(path: Path, type_name: str) -> Iterator[tuple[int, str, bytes]]:
-    """(time [ns], topic, CDR) of each message of a type, under whatever namespace, in order.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged.
-    """
+def read_messages_of_type(path: Path, type_name: str) -> Iterator[tuple[int, str, Any]]:
+    """As `read_messages`, of all messages of a type, under whatever namespace."""
     return _read(path, lambda connection: connection.msgtype == type_name)
 
 
-def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[int, str, bytes]]:
+def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[int, str, Any]]:
     try:
         with Reader(path) as reader:
             connections = [connection for connection in reader.connections if wanted(connection)]
+            read = {c.id: reader_of(c.msgtype, c.msgdef) for c in connections}
             if connections:
                 for connection, time_ns, cdr in reader.messages(connections=connections):
-                    yield time_ns, connection.topic, bytes(cdr)
+                    yield time_ns, connection.topic, read[connection.id](cdr)
+    except OtherVersionError as error:
+        raise ValueError(f"{path.name}: {error}") from error
     except _DAMAGE as error:
         raise _damaged(path, error) from error
 
 
 # What reading a cut or overwritten file has been seen to raise.
-_DAMAGE = (ReaderError, OSError, ValueError, TypeError, KeyError, IndexError, AssertionError,
-           EOFError, MemoryError, OverflowError)  # fmt: skip
+_DAMAGE = (ReaderError, SerdeError, TypesysError, OSError, ValueError, TypeError, KeyError,
+           IndexError, AssertionError, EOFError, MemoryError, OverflowError)  # fmt: skip
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

@@ -6,13 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.from_messages import excitation_from_message, record_from_message
 from tactile_resonance.recording.store import StoredMeasurement, gaps_of
-from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import RECORDING, read_run
@@ -109,15 +107,13 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
     ValueError
         If the file is damaged.
     """
-    store = message_types()
     excitations: dict[int, dict[int, Excitation]] = {}
     records: dict[int, dict[tuple[int, int], Record]] = {}
     problems: dict[int, list[str]] = {}
-    for _, _, cdr in read_messages_of_type(path, EXCITATION):
-        excitation = excitation_from_message(store.deserialize_cdr(cdr, EXCITATION))
+    for _, _, message in read_messages_of_type(path, EXCITATION):
+        excitation = excitation_from_message(message)
         excitations.setdefault(excitation.measurement_id, {})[excitation.realisation] = excitation
-    for _, _, cdr in read_messages_of_type(path, RECORD):
-        message: Any = store.deserialize_cdr(cdr, RECORD)
+    for _, _, message in read_messages_of_type(path, RECORD):
         key = int(message.measurement_id)
         try:
             record = record_from_message(message)
@@ -140,10 +136,8 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
 
 def _ids_of(path: Path) -> list[int]:
     """Measurements of a file, by its excitations."""
-    store = message_types()
     messages = read_messages_of_type(path, EXCITATION)
-    excitations: list[Any] = [store.deserialize_cdr(cdr, EXCITATION) for _, _, cdr in messages]
-    return list(dict.fromkeys(int(excitation.measurement_id) for excitation in excitations))
+    return list(dict.fromkeys(int(excitation.measurement_id) for _, _, excitation in messages))
 
 
 def file_of(run: Path, result: PointResult) -> Path:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.recording.from_messages import poles_from_message
 from tactile_resonance.scan.main_mode import main_mode
-from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.run_content import RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits
@@ -151,9 +150,9 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
     for file in run.files:
         if not file.name.endswith(f"-{name}.mcap"):
             continue
-        for _, topic, cdr in read_messages_of_type(run.path / RECORDING / file.name, POLES):
+        for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES):
             if topic.rsplit("/", 1)[-1] == "poles":
-                poles, _ = poles_from_message(message_types().deserialize_cdr(cdr, POLES))
+                poles, _ = poles_from_message(message)
                 found = reference_of(poles)
     return found
 

@@ -11,9 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
-from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, from_message
+from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
 from tactile_resonance.scan.scan_point import ScanPoint
 
 FORMAT = "tactile_resonance run 1"
@@ -107,10 +106,7 @@ def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None
             raise ValueError(f"{path.name}: neither of a point nor a reference")
         return read_content(path), None
     content = read_content(path)
-    found = [
-        from_message(message_types().deserialize_cdr(cdr, TYPE))
-        for _, _, cdr in read_messages(path, f"/{TOPIC}")
-    ]
+    found = [from_message(message) for _, _, message in read_messages(path, f"/{TOPIC}")]
     if len(found) != 1:
         raise ValueError(f"{path.name}: {len(found)} results, expected one")
     named = (int(match[1]), int(match[2]))

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.bag_metadata import write_bag_metadata
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import FileContent, PointFileWriter
 from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, as_csv, to_message
 from tactile_resonance.scan.run_content import FORMAT, RECORDING, RunContent, read_run
@@ -138,12 +138,19 @@ class RunDirectory:
         Raises
         ------
         ValueError
-            If it is no run, or another process is recording it.
+            If it is no run, another process is recording it, or its messages are of another version: no
+            reader takes two definitions of one type in one bag.
         """
         path = Path(path)
         lock = _lock(path)
         try:
             run = cls(path, lock, read_run(path))
+            other = _other_definitions(run.content)
+            if other:
+                raise ValueError(
+                    f"run: {path} was recorded by a version with other definitions of {', '.join(other)}; "
+                    "accepted is that version (report and analyze take the run as it is)"
+                )
             shutil.rmtree(path / HIDDEN, ignore_errors=True)
             for part in [*path.glob("*.part"), *(path / RECORDING).glob("*.part")]:
                 part.unlink()
@@ -263,6 +270,12 @@ def expected_bytes(points: int, blocks: int, samples_per_block: int, lines: int)
     """
     block = 2 * 8 * samples_per_block + 16 * 8 * lines + 10_000
     return points * (blocks * block + 1_000_000)
+
+
+def _other_definitions(content: RunContent) -> list[str]:
+    """Types of a run whose messages are defined in another way today."""
+    hashes = {(topic.type_name, topic.type_hash) for file in content.files for topic in file.topics}
+    return sorted(name for name, of_run in hashes if definition_and_hash(name)[1] != of_run)
 
 
 def _lock(path: Path) -> int:

@@ -19,7 +19,6 @@ from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.from_messages import poles_from_message
-from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import file_of
@@ -88,6 +87,5 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
         messages = read_messages_of_type(file_of(run.path, result), POLES)
-        store = message_types()
-        told = [poles_from_message(store.deserialize_cdr(cdr, POLES))[1] for _, _, cdr in messages]
+        told = [poles_from_message(message)[1] for _, _, message in messages]
     assert [origin.time_ns for origin in told] == [1000 + k for k in range(TRUTHS)]
