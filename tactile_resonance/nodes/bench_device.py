@@ -20,7 +20,6 @@ from tactile_resonance.nodes.conversions import (
     time_from_message,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.node_watch import SIMULATED_SILENT_S
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.record import BetweenSamples, InputKind
 from tactile_resonance.srv import Play
@@ -46,7 +45,7 @@ class BenchDevice:
         self._next_index = 0
         self._clock: SimulatedClock | None = None
         self._start_ns = 0
-        self._answer_s = SIMULATED_SILENT_S if node.time_server else ANSWER_TIMEOUT_S
+        self._answer_s = node.hung_after_s if node.time_server else ANSWER_TIMEOUT_S
         node.create_subscription(msg.Record, "bench/block", self._blocks.put, RESULTS)
 
     def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:

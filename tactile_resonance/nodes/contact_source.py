@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.conversions import contact_from_message, time_message
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.node_watch import SIMULATED_SILENT_S
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.record import Contact
@@ -51,7 +50,7 @@ class MeasuredContact:
     def __init__(self, node: ManagedNode) -> None:
         self._client = node.create_client(ForceOver, "force_over")
         node.resources.callback(node.destroy_client, self._client)
-        self._within_s = SIMULATED_SILENT_S if node.time_server else ANSWER_WITHIN_S
+        self._within_s = node.hung_after_s if node.time_server else ANSWER_WITHIN_S
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
         """See `ContactSource`."""

@@ -17,7 +17,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
 from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
 from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
 from tactile_resonance.record import Contact, Origin, Record
@@ -28,6 +28,7 @@ PARAMETERS = (
     *devices.PARAMETERS,
     contact_source.PARAMETER,
     TIME_SERVER,
+    HUNG_AFTER,
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
 

@@ -39,6 +39,16 @@ TIME_SERVER = Parameter(
     read_only=True,
 )
 
+HUNG_AFTER = Parameter(
+    "hung_after_s",
+    60.0,
+    "In simulated time: what has not answered for so long hangs, by this machine's clock; a scan ends then, and "
+    "can be resumed.",
+    5.0,
+    86400.0,
+    read_only=True,
+)
+
 
 class ManagedNode(LifecycleNode):
     """A lifecycle node whose subclasses say only what they set up and what they do.
@@ -144,6 +154,11 @@ class ManagedNode(LifecycleNode):
     def time_server(self) -> str:
         """Address of the simulated time in which the node lives; empty: none."""
         return str(values(self, TIME_SERVER.name)[0])
+
+    @property
+    def hung_after_s(self) -> float:
+        """In simulated time, which stands meanwhile: so long an answer is waited for."""
+        return float(values(self, HUNG_AFTER.name)[0])
 
     def fail(self, reason: str) -> None:
         """Give up for a reason: back to unconfigured, from where the manager starts it anew."""

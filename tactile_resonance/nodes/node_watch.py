@@ -15,8 +15,6 @@ from tactile_resonance.nodes.running import BEATS
 
 SILENT_S = 1.5
 """A node that was silent for longer hangs, or has ended [s of this machine's clock]."""
-SIMULATED_SILENT_S = 60.0
-"""In simulated time nothing is lost meanwhile: a node on a slow machine is waited for."""
 SAID_AFTER_S = 5.0
 """Who is waited for is said after this."""
 
@@ -55,6 +53,7 @@ class NodeWatch:
         self._node, self._topics, self._silent_s = node, tuple(topics), silent_s
         self._lock = threading.Lock()
         self._signs: dict[str, _Sign] = {}
+        self._behind: dict[str, set[str]] = {}  # who published a topic when somebody did last
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
     def missing(self) -> str | None:
@@ -67,6 +66,18 @@ class NodeWatch:
             if all(problems):
                 return f"{topic}: {' and '.join(filter(None, problems))}"
         return None
+
+    def hung(self) -> str:
+        """Who is at work behind a topic, and silent for too long, as a sentence; empty: nobody.
+
+        One whose lease in the graph is over by now, because it was silent, is among them.
+        """
+        for topic in self._topics:
+            self._publishers(topic)
+        for node in sorted(set().union(*self._behind.values())):
+            if problem := self._silence(node):
+                return problem
+        return ""
 
     def instances(self, topics: Sequence[str]) -> Instances:
         """Which starts of the nodes behind topics are at work now."""
@@ -114,6 +125,14 @@ class NodeWatch:
         """Why a node is not at work; empty where it is."""
         with self._lock:
             sign = self._signs.get(node)
+        if sign is None or sign.state == "active":
+            return self._silence(node)
+        return self._silence(node) or f"{node} is {sign.state}, not active"
+
+    def _silence(self, node: str) -> str:
+        """That a node, or what it waits for, is silent for too long; empty where neither is."""
+        with self._lock:
+            sign = self._signs.get(node)
         if sign is None:
             return ""
         now_s = time.monotonic()
@@ -122,13 +141,16 @@ class NodeWatch:
             return f"{node} is silent for {silent_s:.1f} s"
         if sign.waiting_for and waiting_s > self._silent_s:
             return f"{node} waits for {sign.waiting_for}, which is silent for {waiting_s:.1f} s"
-        return "" if sign.state == "active" else f"{node} is {sign.state}, not active"
+        return ""
 
     def _publishers(self, topic: str) -> set[str]:
         """Names of the nodes that publish a topic."""
         name = self._node.resolve_topic_name(topic)
         infos = self._node.get_publishers_info_by_topic(name)
-        return {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+        found = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+        if found:
+            self._behind[topic] = found
+        return found
 
     def _on_beat(self, message: msg.Heartbeat) -> None:
         now_s, since_s = time.monotonic(), 0.0

@@ -94,7 +94,7 @@ class NodeHands:
         self._measure = Goals(client, "measure")
         self._tip: TipContact | None = None
         if with_robot:
-            self._tip = TipContact(node, scan_time)
+            self._tip = TipContact(node, scan_time, self._end_if_hung)
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
 
@@ -113,6 +113,7 @@ class NodeHands:
 
     def missing(self) -> str | None:
         """A node that points need and that is not at work."""
+        self._end_if_hung()
         return self._nodes.missing()
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
@@ -254,14 +255,17 @@ class NodeHands:
 
         def poll() -> None:
             self._waited_for = self._nodes.waited_for(instances)
+            self._end_if_hung()
             problem = self._nodes.changed(instances)
-            if problem is None:
-                return
-            if self._time.simulated and "silent" in problem:
-                raise ScanEnded(f"{problem}; the run can be resumed")
-            raise NodeAway(problem, "node away")
+            if problem is not None:
+                raise NodeAway(problem, "node away")
 
         return poll
+
+    def _end_if_hung(self) -> None:
+        """In simulated time a node that hangs holds everything, and is waited for that long only."""
+        if self._time.simulated and (problem := self._nodes.hung()):
+            raise ScanEnded(f"{problem}; the run can be resumed")
 
     def _new_poles(self) -> list[msg.Poles]:
         messages = []

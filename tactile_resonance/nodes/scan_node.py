@@ -21,7 +21,7 @@ from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.vectors import rotated, turn_from_quaternion
 from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
@@ -68,6 +68,7 @@ PARAMETERS = (
     ),
     Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
     TIME_SERVER,
+    HUNG_AFTER,
 )
 
 RESULT_TIMEOUT_S = 900
@@ -85,7 +86,7 @@ class ScanNode(ManagedNode):
         """Listen to everything that a run records."""
         contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
         self._recorder = ScanRecorder(self)
-        self._time = ScanTime(self.time_server)
+        self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
         self._hands = NodeHands(self, self._recorder, table_in_base, base_frame, robot, self._time)
         self._controls: Controls | None = None

@@ -7,7 +7,7 @@ import contextlib
 import time
 
 from tactile_resonance.clock import ClockLostError, SimulatedClock
-from tactile_resonance.nodes.node_watch import SILENT_S, SIMULATED_SILENT_S
+from tactile_resonance.nodes.node_watch import SILENT_S
 
 
 class ScanTime:
@@ -20,6 +20,8 @@ class ScanTime:
     ----------
     server : str
         Address of the simulated time; empty: the machine's clock.
+    hung_after_s : float
+        In simulated time a node that was silent for so long is given up [s of the machine's clock].
 
     Attributes
     ----------
@@ -28,10 +30,10 @@ class ScanTime:
         After so long without a sign of life a node is given up [s of the machine's clock].
     """
 
-    def __init__(self, server: str) -> None:
+    def __init__(self, server: str, hung_after_s: float) -> None:
         self._server = server
         self.simulated = bool(server)
-        self.silent_s = SIMULATED_SILENT_S if server else SILENT_S
+        self.silent_s = hung_after_s if server else SILENT_S
         self._clock: SimulatedClock | None = None
         self._offset_ns = self._last_ns = 0  # a bench that is started anew begins anew
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
@@ -46,6 +47,8 @@ class TipContact:
     ----------
     node : ManagedNode
     scan_time : ScanTime
+    end_if_hung : callable
+        Raises `ScanEnded` where waiting for a node has become pointless.
 
     Attributes
     ----------
@@ -53,8 +56,10 @@ class TipContact:
         The tip is on the tissue, or may be.
     """
 
-    def __init__(self, node: ManagedNode, scan_time: ScanTime) -> None:
-        self._time = scan_time
+    def __init__(
+        self, node: ManagedNode, scan_time: ScanTime, end_if_hung: Callable[[], None]
+    ) -> None:
+        self._time, self._end_if_hung = scan_time, end_if_hung
         self.touching = True  # a scan that was killed may have left it there
         self._state: msg.ContactState | None = None
         # the newest only: the recorder's may have to wait behind what else is recorded
@@ -98,6 +103,7 @@ class TipContact:
             return
         deadline = time.monotonic() + RETRACT_WITHIN_S
         while time.monotonic() < deadline:
+            self._end_if_hung()
             self._time.go()
             if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
                 self.touching = False

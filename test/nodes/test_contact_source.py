@@ -22,8 +22,7 @@ from tactile_resonance.srv import ForceOver
 from tactile_resonance.nodes import contact_source
 from tactile_resonance.nodes.contact_source import ANSWER_WITHIN_S
 from tactile_resonance.nodes.conversions import time_from_message, time_message
-from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
-from tactile_resonance.nodes.node_watch import SIMULATED_SILENT_S
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.running import PLACES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact
@@ -34,7 +33,7 @@ WITHIN_S = 60.0
 
 class Asker(ManagedNode):
     def __init__(self):
-        super().__init__("excitation_node", (contact_source.PARAMETER, TIME_SERVER))
+        super().__init__("excitation_node", (contact_source.PARAMETER, TIME_SERVER, HUNG_AFTER))
 
     def configure(self):
         self.source = contact_source.make_contact_source(self)
@@ -130,7 +129,7 @@ def test_without_a_service_the_reason_says_so():
 
 @pytest.mark.parametrize(
     ("parameters", "within_s"),
-    [({}, ANSWER_WITHIN_S), ({"time_server": "127.0.6.8:1"}, SIMULATED_SILENT_S)],
+    [({}, ANSWER_WITHIN_S), ({"time_server": "127.0.6.8:1", "hung_after_s": 90.0}, 90.0)],
 )
 def test_a_record_does_not_wait_for_an_answer_that_does_not_come(monkeypatch, parameters, within_s):
     told = SimpleNamespace(now_s=1000.0)
