@@ -28,7 +28,6 @@ def shared_data() -> Path:
 # fails them, as it would fail a real robot. Such a run says nothing and is repeated; one that fails while the
 # machine kept its pace is a failure at once.
 WALL_CLOCK = (
-    *("drivers/ur/", "drivers/test_can_wrench.py", "drivers/test_force_sources.py"),
     *("nodes/test_topic_wrench.py", "simulation/test_tcp_bus.py", "integration/test_scan.py"),
     *("integration/test_contact_faults.py", "integration/test_contact_requests.py"),
     *("integration/test_demo.py", "integration/test_touch.py", "integration/test_kills.py"),
