@@ -121,9 +121,7 @@ def _interrupted(folder: Path, scene: Path, moments_s: np.ndarray) -> list[str]:
     for k, after_s in enumerate(moments_s):
         number = (signal.SIGINT, signal.SIGTERM)[k % 2]
         name = f"{number.name} after {after_s:.1f} s"
-        shown = demonstrate(
-            folder, scene, HOST, Load(name), interrupt=(float(after_s), number)
-        )
+        shown = demonstrate(folder, scene, HOST, Load(name), interrupt=(float(after_s), number))
         said = shown.errors.strip().split("\n")
         ended = shown.status == 0 and not shown.errors.strip()  # it was faster
         if not ended and (shown.status != INTERRUPTED or len(said) != 1):
@@ -134,9 +132,7 @@ def _interrupted(folder: Path, scene: Path, moments_s: np.ndarray) -> list[str]:
     return wrong
 
 
-def _page(
-    rows: Sequence[Sequence[str]], wrong: Sequence[str], scene: Path, moments: int
-) -> str:
+def _page(rows: Sequence[Sequence[str]], wrong: Sequence[str], scene: Path, moments: int) -> str:
     summary, text = (__doc__ or "").split("\n\n")
     lines = [
         "# Load",
@@ -146,8 +142,8 @@ def _page(
         *textwrap.wrap(text, 112),
         "",
         *textwrap.wrap(
-            f"Scene `{scene.name}`; {len(os.sched_getaffinity(0))} cores on which a Python loop of 5 million "
-            f"additions takes {loop_s():.2f} s and a float64 rfft of 2 x 160000 samples {1e3 * fft_s():.1f} ms. "
+            f"Scene `{scene.name}`; {len(os.sched_getaffinity(0))} cores , a Python loop of 5 million additions "
+            f"takes {loop_s():.2f} s, a float64 rfft of 2 x 160000 samples {1e3 * fft_s():.1f} ms. "
             "Deviations are the largest of all points, in standard deviations.",
             112,
         ),
@@ -158,7 +154,9 @@ def _page(
         "",
         *textwrap.wrap(
             f"Ctrl-C and SIGTERM at {moments} moments between start and end: each ends it with one line and "
-            "leaves no process behind." if not wrong else "Wrong: " + "; ".join(wrong) + ".",
+            "leaves no process behind."
+            if not wrong
+            else "Wrong: " + "; ".join(wrong) + ".",
             112,
         ),
     ]

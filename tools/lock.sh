@@ -29,5 +29,7 @@ for distro in kilted jazzy; do
     sed "s/DISTRO/$distro/" requirements-ros.in |
         compile - --constraint "$shared" $in_shared --output-file "$scratch/requirements-$distro.lock"
 done
+# which folder this is, is nobody's business
+sed -i "s|-r $root/|-r |" "$scratch"/requirements*.lock
 mv "$scratch"/requirements*.lock .
 grep -c '^[a-z]' requirements*.lock

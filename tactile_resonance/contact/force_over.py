@@ -233,7 +233,9 @@ class _Spans:
             values[0] += first
             values[-1] += last
         known = np.isfinite(values[:, 0])
-        self._reference = values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
+        self._reference = (
+            values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
+        )
         values -= self._reference
         lengths, middles = np.diff(corners), (values[:-1] + values[1:]) / 2  # (n - 1,), (n - 1, k)
         unknown = ~(known[:-1] & known[1:] & (steps <= longest_ns))

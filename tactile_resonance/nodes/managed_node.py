@@ -42,7 +42,7 @@ TIME_SERVER = Parameter(
 HUNG_AFTER = Parameter(
     "hung_after_s",
     60.0,
-    "In simulated time: what has not answered for so long hangs, by this machine's clock; a scan ends then, and "
+    "In simulated time: what has not answered for so long hangs, by this machine's clock: a scan ends, and "
     "can be resumed.",
     5.0,
     86400.0,

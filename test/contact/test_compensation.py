@@ -74,9 +74,7 @@ def test_a_tool_that_turns_ever_faster_is_dragged_along():
 
 @settings(max_examples=50, deadline=None)
 @given(vectors, vectors, vectors, vectors, vectors, vectors)
-def test_the_tool_mounted_cell_gives_back_the_contact(
-    force, torque, place, frame, at, attitude
-):
+def test_the_tool_mounted_cell_gives_back_the_contact(force, torque, place, frame, at, attitude):
     mounting = Mounting(Mount.TOOL, pose(place, frame), Payload(0.08, (0.01, 0.0, 0.04)))
     own = Rotation.from_rotvec(frame).as_matrix()
     # balance of moments about the cell: the contact acts at the tip, the weight at its centre

@@ -146,8 +146,7 @@ def test_touch_is_told_by_the_mean_of_a_window():
     for n in range(3000):
         forces.append(rng.normal(3e-3 * math.sin(n / 40), NOISE_N))
         want = any(
-            len(forces) >= k
-            and np.mean(forces[-k:]) > 5.0 * math.sqrt(NOISE_N**2 / k + 7e-5**2)
+            len(forces) >= k and np.mean(forces[-k:]) > 5.0 * math.sqrt(NOISE_N**2 / k + 7e-5**2)
             for k in (4, 12, 36)
         )
         assert detector.add(forces[-1]) == want

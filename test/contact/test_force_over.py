@@ -79,7 +79,9 @@ def test_mean_of_a_ramp_is_its_value_at_the_middle_wherever_the_interval_lies(le
         over = record.over(t0, t0 + length_ns)
         assert over.reason == ""
         assert over.coverage == pytest.approx(1.0, abs=1e-12)
-        assert over.force_n == pytest.approx(0.01 + 0.3 * (begin_ns + length_ns / 2) * 1e-9, rel=1e-12)
+        assert over.force_n == pytest.approx(
+            0.01 + 0.3 * (begin_ns + length_ns / 2) * 1e-9, rel=1e-12
+        )
 
 
 def test_mean_of_a_sine_is_that_of_its_integral():
@@ -101,7 +103,10 @@ def test_any_force_is_averaged_as_a_line_through_all_wrenches_is():
     record = filled(times, forces)
     for _ in range(20):
         begin = rng.uniform(0.05, 0.9)
-        t0, t1 = BEGAN_NS + round(1e9 * begin), BEGAN_NS + round(1e9 * rng.uniform(begin + 0.004, 0.99))
+        t0, t1 = (
+            BEGAN_NS + round(1e9 * begin),
+            BEGAN_NS + round(1e9 * rng.uniform(begin + 0.004, 0.99)),
+        )
         # the line at a thousand places in each nanosecond-exact interval between wrenches and ends
         corners = np.unique([t0, *times[(times > t0) & (times < t1)], t1])
         at_corners = np.interp((corners - BEGAN_NS).astype(float), times - BEGAN_NS, forces)
@@ -117,7 +122,9 @@ def test_tare_is_taken_off_and_an_offset_of_1_n_costs_no_digits_over_30_s():
     for begin_ns, length_ns in ((MS, 29_900 * MS), (29_950 * MS + 1, 20 * MS), (7 * MS, 20 * MS)):
         interval = BEGAN_NS + begin_ns, BEGAN_NS + begin_ns + length_ns
         # no worse than the single forces: 1.01 less 1 has lost 1e-16
-        assert record.over(*interval).force_n == pytest.approx(plain.over(*interval).force_n, abs=3e-16)
+        assert record.over(*interval).force_n == pytest.approx(
+            plain.over(*interval).force_n, abs=3e-16
+        )
     interval = BEGAN_NS + MS, BEGAN_NS + 29_900 * MS
     high, over = filled(times, 1.0 + small).over(*interval), filled(times, small).over(*interval)
     assert high.force_n - 1.0 == pytest.approx(over.force_n, abs=5e-16)
@@ -165,7 +172,9 @@ def test_wrenches_that_are_no_forces_are_not_heard(why):
     assert over.coverage == pytest.approx(0.89)  # from the last good one to the next
     # one that is wrong breaks the line too
     one = filled(times, np.where(times == BEGAN_NS + 150 * MS, 1.0, 0.01), bad={150})
-    assert one.over(BEGAN_NS + 149 * MS, BEGAN_NS + 159 * MS).force_n == pytest.approx(0.01, rel=1e-12)
+    assert one.over(BEGAN_NS + 149 * MS, BEGAN_NS + 159 * MS).force_n == pytest.approx(
+        0.01, rel=1e-12
+    )
 
 
 def test_forces_before_a_tare_are_none():
@@ -189,7 +198,9 @@ def test_what_is_not_kept_any_more_or_not_there_yet_is_said():
     for back_ns in (5_100 * MS, 11_000 * MS):
         early = record.over(now_ns - back_ns, now_ns - back_ns + 20 * MS)
         assert math.isnan(early.force_n)
-        assert early.reason == f"the block begins {back_ns * 1e-9:.1f} s ago, forces are kept for 5 s"
+        assert (
+            early.reason == f"the block begins {back_ns * 1e-9:.1f} s ago, forces are kept for 5 s"
+        )
     late = record.over(now_ns - 20 * MS, now_ns + 3 * MS)
     assert math.isnan(late.force_n)
     assert late.reason == "the block ends 3.0 ms in the future"
@@ -241,7 +252,9 @@ def test_stated_uncertainty_is_that_of_the_mean_of_correlated_noise(pole):
 
 def test_slow_change_counts_as_uncertainty():
     times = BEGAN_NS + MS * np.arange(1000)
-    over = filled(times, 0.02 - 0.01 * seconds(times)).over(BEGAN_NS + 100 * MS, BEGAN_NS + 900 * MS)
+    over = filled(times, 0.02 - 0.01 * seconds(times)).over(
+        BEGAN_NS + 100 * MS, BEGAN_NS + 900 * MS
+    )
     # batch means at 0.1 s: 0 to 7 mN; their standard deviation is sqrt(6) mN
     assert over.force_std_n == pytest.approx(1e-3 * math.sqrt(6 / 8), rel=1e-9)
 
@@ -250,7 +263,9 @@ def test_few_wrenches_have_no_stated_uncertainty():
     times = BEGAN_NS + MS * np.arange(200)
     record = filled(times, np.full(200, 0.01))
     assert math.isnan(record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 80 * MS).force_std_n)
-    assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 81 * MS).force_std_n == pytest.approx(0.0, abs=1e-17)
+    assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 81 * MS).force_std_n == pytest.approx(
+        0.0, abs=1e-17
+    )
     assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 80 * MS).force_n == pytest.approx(0.01)
 
 
@@ -338,6 +353,8 @@ def test_nothing_is_added_while_another_thread_asks():
         return around(t0_ns, t1_ns)
 
     record._forces.around = asked
-    assert record.over(BEGAN_NS + 100 * MS, int(times[-1])).force_n == pytest.approx(0.01, rel=1e-12)
+    assert record.over(BEGAN_NS + 100 * MS, int(times[-1])).force_n == pytest.approx(
+        0.01, rel=1e-12
+    )
     adding.join()
     assert record.newest_ns == sample.time_ns

@@ -12,7 +12,9 @@ ZERO = (0.0, 0.0, 0.0)
 
 def jittered(rng, count, period_ns):
     """Times [ns] that ascend, half a period off either way."""
-    return (period_ns * (np.arange(count) + rng.uniform(-0.5, 0.5, count))).astype(np.int64).tolist()
+    return (
+        (period_ns * (np.arange(count) + rng.uniform(-0.5, 0.5, count))).astype(np.int64).tolist()
+    )
 
 
 def rate_from_all(times, forces):

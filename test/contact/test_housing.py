@@ -48,7 +48,9 @@ def test_height_of_the_housing_is_that_of_its_lowest_point_drawn_in_the_plane(an
     # in the tip's x-z plane: ball at the origin, clamp at -L cos, L sin, housing straight below it
     x, z = -0.064 * np.cos(0.17), 0.064 * np.sin(0.17) - 6e-3
     lowered = np.cos(angle) * z - np.sin(angle) * x
-    assert tip.housing_height(rows(turn), UP, -1e-3) == pytest.approx(2.5e-3 - 1e-3 + lowered, abs=1e-12)
+    assert tip.housing_height(rows(turn), UP, -1e-3) == pytest.approx(
+        2.5e-3 - 1e-3 + lowered, abs=1e-12
+    )
     # tip and plane turned together see the same
     both = Rotation.from_rotvec([0.3, -0.2, 0.5])
     same = tip.housing_height(rows(both * turn), vector(both.apply(UP)), -1e-3)

@@ -67,7 +67,9 @@ def test_travel_goes_straight_to_the_standoff_or_higher_where_much_is_to_be_turn
     arm = at((0.01, 0.02, 0.03), (0.0, turn, 0.0))
     twist = np.array(TipPath(GOAL).travel(arm, P, LIMITS))
     way = TOUCH.position_m + height_m * NORMAL - arm.position_m
-    np.testing.assert_allclose(twist[:3], P.travel_speed_m_s * way / np.linalg.norm(way), rtol=1e-12)
+    np.testing.assert_allclose(
+        twist[:3], P.travel_speed_m_s * way / np.linalg.norm(way), rtol=1e-12
+    )
     np.testing.assert_allclose(twist[3:], [0, turn / RIGHTING_S, 0], atol=1e-13)
 
 

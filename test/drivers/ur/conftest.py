@@ -151,7 +151,7 @@ def run_calls():
             [sys.executable, script, name, *hosts],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=240,
             check=False,
         )
         assert done.returncode == 0, f"status {done.returncode}\n{done.stdout}\n{done.stderr}"

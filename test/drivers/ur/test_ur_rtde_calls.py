@@ -14,10 +14,11 @@ def test_calls(robot, run_calls, name):
 
 
 def test_force_and_contact(start_robots, run_calls):
-    (robot,) = start_robots("--tissue", "gel12", "--rigid-tip")
+    (robot,) = start_robots("--simulated-time", "--tissue", "gel12", "--rigid-tip")
     run_calls("force", robot.host)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_robots_side_by_side(start_robots, run_calls, count):
-    run_calls("side_by_side", *(robot.host for robot in start_robots(count=count)))
+    robots = start_robots("--simulated-time", count=count)
+    run_calls("side_by_side", *(robot.host for robot in robots))
