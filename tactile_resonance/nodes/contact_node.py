@@ -94,10 +94,11 @@ class ContactNode(ManagedNode):
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings, self._limits = self._read_parameters()
         self.resources.callback(self._arm.close)
-        self._force = contact_devices.make_force_source(self, self._arm)
-        self.resources.callback(self._force.close)
         self._tip = contact_devices.tip_geometry(self)
         self._arm.connect()
+        # not before: the arm has no clock but the machine's until it is connected
+        self._force = contact_devices.make_force_source(self, self._arm)
+        self.resources.callback(self._force.close)
         self._force.start()
         self._forces = ForceService(
             self,

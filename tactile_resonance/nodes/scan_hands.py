@@ -171,7 +171,10 @@ class NodeHands:
             reason = self._recorder.force_reason or "no record says why"
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
-            raise PointFailed("measurement: nobody told where the tip is (tcp_pose)")
+            text = "measurement: nobody told where the tip is (tcp_pose)"
+            if self._tip is None:  # said here, to a bench that was just started and had not heard of us
+                raise PointDisturbed(text, "place unheard")
+            raise PointFailed(text)
         return Measured(poles, origin)
 
     def retract(self) -> None:

@@ -132,23 +132,26 @@ class _Service:
 
         `known` holds packets of this cycle by their variables and is added to.
         """
-        recipe = self._outputs
-        if not self._started or recipe is None or cycle % self._period:
-            return
+        if self._started and not cycle % self._period:
+            self._send_outputs(known)
+
+    def repeat(self) -> None:
+        """Send the newest outputs again, to whom none were sent yet those of now."""
+        if self._started and self._newest:
+            self.connection.send(self._newest, droppable=True)
+        elif self._started:
+            self._send_outputs({})
+
+    def _send_outputs(self, known: dict[tuple[str, ...], bytes]) -> None:
+        recipe, controller = self._outputs, self._server.controller
+        assert recipe is not None
         data = known.get(recipe.names)
         if data is None:
-            now = self._server.controller.now
-            values = [read(now) for read in recipe.readers]
+            values = [read(controller.now) for read in recipe.readers]
             data = known[recipe.names] = recipe.layout.pack(1, values)
         self._newest = data
         if self.connection.send(data, droppable=True):
-            controller = self._server.controller
             self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
-
-    def repeat(self) -> None:
-        """Send the newest outputs again."""
-        if self._started and self._newest:
-            self.connection.send(self._newest, droppable=True)
 
     def _protocol_version(self, payload: bytes) -> bytes:
         return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
@@ -169,6 +172,7 @@ class _Service:
         if "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
         self._outputs = _Recipe(names, Layout(types), tuple(READERS[name] for name in names))
+        self._newest = b""
         return b"\x01" + ",".join(types).encode()
 
     def _set_up_inputs(self, payload: bytes) -> bytes:
