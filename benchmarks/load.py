@@ -142,7 +142,7 @@ def _page(rows: Sequence[Sequence[str]], wrong: Sequence[str], scene: Path, mome
         *textwrap.wrap(text, 112),
         "",
         *textwrap.wrap(
-            f"Scene `{scene.name}`; {len(os.sched_getaffinity(0))} cores , a Python loop of 5 million additions "
+            f"Scene `{scene.name}`; {len(os.sched_getaffinity(0))} cores, a Python loop of 5 million additions "
             f"takes {loop_s():.2f} s, a float64 rfft of 2 x 160000 samples {1e3 * fft_s():.1f} ms. "
             "Deviations are the largest of all points, in standard deviations.",
             112,

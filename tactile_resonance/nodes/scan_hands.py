@@ -172,7 +172,9 @@ class NodeHands:
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
             text = "measurement: nobody told where the tip is (tcp_pose)"
-            if self._tip is None:  # said here, to a bench that was just started and had not heard of us
+            if (
+                self._tip is None
+            ):  # said here, to a bench that was just started and had not heard of us
                 raise PointDisturbed(text, "place unheard")
             raise PointFailed(text)
         return Measured(poles, origin)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.frf.estimate import estimate_frf
-from tactile_resonance.frf.measurement import MeasurementFrf
+from tactile_resonance.frf.measurement import MeasurementFrf, mean_force
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Channel, Contact, Origin, Record
@@ -163,3 +163,17 @@ def test_bins_of_all_realisations_come_along_where_they_are_alike(channels, peri
             whole = np.fft.rfft(channel[m].ravel()) / channel[m].size
             here = slice(bins.first_bin, bins.first_bin + bins.count)
             np.testing.assert_allclose(found[m], whole[here], atol=1e-12)
+
+
+def test_the_zero_that_blocks_share_is_not_averaged_away():
+    """Blocks of a contact: noise of their own 3e-5 N, one zero known to 4e-5 N; sqrt(3^2 + 4^2) = 5 each."""
+    random = np.random.default_rng(3)
+    zero, noise = 4e-5 * random.standard_normal((4000, 1)), 3e-5 * random.standard_normal((4000, 6))
+    means = np.array(
+        [mean_force([(f, 5e-5, 0.4) for f in row])[0] for row in (0.01 + zero + noise).tolist()]
+    )
+    _, stated_n = mean_force([(0.01, 5e-5, 0.4)] * 6)
+    # never less than what it is, and no more than one block's; 4000 means tell it to 1.1 %
+    assert stated_n >= np.std(means) * (1 - 3 * 0.011)
+    assert stated_n == pytest.approx(5e-5)
+    assert np.isnan(mean_force([(0.01, np.nan, 0.4), (0.01, 5e-5, 0.4)])[1])

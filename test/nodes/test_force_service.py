@@ -29,7 +29,7 @@ from tactile_resonance.processes import free_domain_id
 MS = 1_000_000
 BEGAN_NS = 3_600_000 * MS  # of a loop's clock that has run for an hour
 AHEAD_NS = 1_700_000_000 * 10**9  # ROS time less the loop's
-BIAS_N, SLOPE_N_S = 0.3, 0.02
+BIAS_N, ZERO_STD_N, SLOPE_N_S = 0.3, 4e-5, 0.02
 WITHIN_S = 60.0
 
 
@@ -62,7 +62,8 @@ class Contact(ManagedNode):
             ]
             time_ns = BEGAN_NS + (tick + 2) * MS
             arm = ArmSample(time_ns, 0.0, (0.1, 0.2, 1e-4 * tick), (0.0, 0.0, 0.5), (0.0,) * 6)
-            self.forces.take(Cycle(time_ns, arm, wrenches, state, 0.0, (0.0, 0.0, BIAS_N), fault))
+            zero = (0.0, 0.0, BIAS_N), ZERO_STD_N
+            self.forces.take(Cycle(time_ns, arm, wrenches, state, 0.0, *zero, fault))
 
 
 @pytest.fixture
@@ -104,10 +105,10 @@ def test_mean_over_a_block_is_exact_and_its_place_that_of_the_middle(served):
     assert told.reason == ""
     assert told.coverage == 1.0
     assert told.force_n == pytest.approx(SLOPE_N_S * 0.26, rel=1e-12)
-    # eight batches of a ramp: their means are a straight line of 8 values over 0.28 s
+    # eight batches of a ramp, whose means are a straight line of 8 values over 0.28 s; and the zero
     batches = [SLOPE_N_S * 0.04 * n for n in range(8)]
     variance = sum((b - sum(batches) / 8) ** 2 for b in batches) / 7 / 8
-    assert told.force_std_n == pytest.approx(math.sqrt(variance), rel=1e-9)
+    assert told.force_std_n == pytest.approx(math.sqrt(variance + ZERO_STD_N**2), rel=1e-9)
     pose = told.tip_pose
     assert pose.header.frame_id == "base"
     assert time_from_message(pose.header.stamp) == BEGAN_NS + AHEAD_NS + 260 * MS

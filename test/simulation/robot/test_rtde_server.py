@@ -65,8 +65,6 @@ def test_what_was_sent_is_sent_again(server):
 
 def test_nothing_is_sent_to_a_client_that_has_not_started(server):
     connection = Connection()
-    server.serve(connection).received(
-        packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + b"timestamp")
-    )
+    server.serve(connection).received(packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + b"timestamp"))
     server.repeat()
     assert connection.stamps_s == []
