@@ -3,7 +3,7 @@
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test jazzy lint setup lock clean
+.PHONY: help demo test load jazzy lint setup lock clean
 
 help: ## Show this list
 	@echo "make TARGET [ARGS='...'] [PYTHON=python3.x]"
@@ -14,6 +14,9 @@ demo: setup ## Run the demonstration on the simulated bench; ARGS go to `tactile
 
 test: setup ## Run all tests with coverage; ARGS go to pytest
 	@tools/run.sh python -m pytest --cov --cov-report=term:skip-covered $(ARGS)
+
+load: setup ## Run the demonstration beside other work and on the wall clock; refuse where a result differs
+	@tools/run.sh tactile_resonance benchmark load $(ARGS)
 
 jazzy: export TACTILE_ROS = jazzy
 jazzy: ## Set up ROS 2 Jazzy beside it; run the nodes' tests and a scan of two points on it

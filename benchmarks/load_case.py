@@ -186,7 +186,9 @@ def demonstrate(
 
 
 def findings(run_folder: Path) -> Findings:
-    """What a run holds, against the truth of the simulated bench."""
+    """What a run holds, against the truth of the simulated bench; nothing where there is none."""
+    if not (run_folder / "run.json").exists():
+        return Findings(0, 0, (), np.nan, np.nan)
     run = read_run(run_folder)
     truths = truths_of(run)
     done = [result for result in run.latest if result.outcome is Outcome.DONE]
@@ -227,7 +229,7 @@ class _Watch:
 
     def __init__(self, demo: subprocess.Popen) -> None:
         self._demo = demo
-        self.seen: dict[int, str] = {}  # process and when it was started
+        self.seen: set[int] = set()
         self.stopped: list[str] = []
         self.printed = self.errors = ""
         self._readers = [
@@ -247,7 +249,7 @@ class _Watch:
         """Until it has ended."""
         end_s = time.monotonic() + longest_s
         while self._demo.poll() is None and time.monotonic() < end_s:
-            self.seen.update(dict.fromkeys(descendants(self._demo.pid), ""))
+            self.seen.update(descendants(self._demo.pid))
             time.sleep(0.2)
         if self._demo.poll() is None:
             return

@@ -10,7 +10,7 @@ from pathlib import Path
 
 NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot", "cell"),
-    *("recording", "pipeline", "live"),
+    *("recording", "pipeline", "live", "load"),
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo on a machine that has other things to do, against the same on one that has not, and the truth.
+
+`make load` does it at length: more loads, all sixteen points, and the wall clock.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+pytest.importorskip("rtde_control", reason="ur-rtde is not here")
+
+from robot_at_hand import own_host
+
+from benchmarks.load_case import BRIEFLY, Load, demonstrate, faults, findings
+
+SCENE = Path(__file__).resolve().parents[2] / ".ci" / "two_points.yaml"
+HOST = own_host(18)
+# nodes that hold the time, that compute, and that are not needed; the robot's client, and the robot
+STOPPED = ("contact_node", "frf_node", "pole_map_node", "scan_node", *BRIEFLY)
+
+
+@pytest.fixture(scope="module")
+def idle(module_domain, tmp_path_factory):
+    """Two points of a demo that nothing disturbs."""
+    shown = demonstrate(tmp_path_factory.mktemp("idle"), SCENE, HOST, Load("nothing else"))
+    assert shown.status == 0, shown.errors
+    found = findings(shown.run_folder)
+    assert faults(shown, found, found) == []
+    assert found.points == 2
+    return found
+
+
+@pytest.mark.parametrize(
+    "load",
+    [
+        Load("one core and two busy loops", busy_loops=2, pinned=True, without_priority=True),
+        Load("processes stopped for 5 s each, the robot for 1 s", stopped=STOPPED),
+    ],
+    ids=lambda load: load.name,
+)
+def test_a_load_costs_time_and_nothing_else(idle, domain, tmp_path, load):
+    shown = demonstrate(tmp_path, SCENE, HOST, load)
+    assert faults(shown, findings(shown.run_folder), idle) == []
+    if load.stopped:
+        assert len(shown.stopped) >= 3, "it was over before they were stopped"
+
+
+def test_what_a_load_may_change_is_found(idle):
+    """A point begun again, another tissue, a force or pole that is wrong: each is a fault."""
+    from benchmarks.load_case import Demonstration
+
+    well = Demonstration(1.0, 0, "", "", (), Path(), ())
+    for wrong in (
+        replace(idle, begun_again=1),
+        replace(idle, calls=idle.calls[:1]),
+        replace(idle, poles=4.5),
+        replace(idle, forces=float("nan")),
+    ):
+        assert len(faults(well, wrong, idle)) == 1
+    assert len(faults(replace(well, left=(1,)), idle, idle)) == 1
+    assert len(faults(replace(well, status=1), idle, idle)) == 1
