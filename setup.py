@@ -75,7 +75,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            f"{NAME} = {NAME}.cli:main",
+            f"{NAME} = {NAME}.cli:command",
             *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES if BUILT_FOR_ROS),
         ]
     },

@@ -35,6 +35,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+def command() -> NoReturn:
+    """Run one command, and end this process with its status.
+
+    Without the interpreter's own end, in which an interrupt kills it without a word, and which makes of one
+    that was heeded within an import a death by SIGINT.
+    """
+    status = 130
+    with contextlib.suppress(KeyboardInterrupt):  # as it ended
+        status = main()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody reads it any more
+            stream.flush()
+    os._exit(status)
+
+
 def _parser() -> OneLineParser:
     """Parser of all commands; loads them here, so that an interrupt meanwhile ends in order."""
     # One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they
@@ -73,4 +90,4 @@ def _one_line(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()
