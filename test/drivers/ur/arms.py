@@ -92,3 +92,24 @@ def standing(arm, robot):
     """Whether the robot stands after it had the time that a stop takes; its own word."""
     pass_time(arm, 0.3)
     return np.linalg.norm(robot.order("state")["tcp_speed"]) < 1e-3
+
+
+class LateSocket:
+    """A socket whose data can be read only some time after they have come."""
+
+    def __init__(self, channel, late_s):
+        self._channel, self._late_s = channel, late_s
+        self._come = []
+
+    def __getattr__(self, name):
+        return getattr(self._channel, name)
+
+    def recv(self, size):
+        with contextlib.suppress(BlockingIOError):
+            self._come.append((time.monotonic() + self._late_s, self._channel.recv(1 << 16)))
+        if not self._come or self._come[0][0] > time.monotonic():
+            raise BlockingIOError
+        due_s, data = self._come.pop(0)
+        if len(data) > size:
+            self._come.insert(0, (due_s, data[size:]))
+        return data[:size]

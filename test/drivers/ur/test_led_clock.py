@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arms import ACCELERATION_M_S2, CYCLE_NS, PATIENCE_S, UP
+from arms import ACCELERATION_M_S2, CYCLE_NS, PATIENCE_S, UP, LateSocket
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
@@ -57,7 +57,7 @@ def lead(arm):
         yield make
 
 
-@pytest.mark.parametrize("held_up", [False, True])
+@pytest.mark.parametrize("held_up", ["nobody", "the loop", "frames"])
 def test_each_period_brings_the_state_at_its_end_and_all_its_wrenches(arm, cell, lead, held_up):
     cell.clock = arm.clock  # simulated, and not led yet
     cell.start()
@@ -67,16 +67,18 @@ def test_each_period_brings_the_state_at_its_end_and_all_its_wrenches(arm, cell,
     cell.read()
     arm.speed(UP, ACCELERATION_M_S2)
     stamps, ends = [], []
-    for n in range(200):
-        if n == 100:  # by another connection
+    for n in range(60):
+        if n == 30:  # by another connection
             cell.start()
             clock.wait_until(clock.now_ns() + CYCLE_NS)
             cell.read()
+        if held_up == "frames" and n in (0, 30):
+            cell._bus._socket = LateSocket(cell._bus._socket, 0.01)
         cycles = int(rng.choice([1, 1, 2, 5]))
         until_ns, frames = clock.now_ns() + cycles * CYCLE_NS, arm.frames
         clock.wait_until(until_ns)
         assert arm.frames - frames == 4 * cycles  # two a wrench, 1 kHz
-        if held_up and rng.random() < 0.1:
+        if held_up == "the loop" and rng.random() < 0.1:
             time.sleep(rng.uniform(0, 0.05))
         assert clock.now_ns() == until_ns
         assert arm.state().time_ns == pytest.approx(until_ns, abs=1000)

@@ -4,8 +4,11 @@
 import contextlib
 import os
 import signal
+import socket
+import tempfile
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from arms import (
     DOWN,
     PATIENCE_S,
     UP,
+    LateSocket,
     connect_again,
     keep_for,
     left_alone,
@@ -23,6 +27,9 @@ from arms import (
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.drivers.ur_config import UrArmConfig
+from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Command, Exchange
+from tactile_resonance.drivers.ur_motion import Motion
 from tactile_resonance.simulation.tracking import TrackingParameters
 
 
@@ -42,6 +49,52 @@ def test_each_tick_sees_exactly_the_state_of_its_time(robot, high):
         robot_ns = round(sample.robot_time_s * 1e9)
         ahead_ns = ahead_ns or high.clock.now_ns() - robot_ns
         assert high.clock.now_ns() - robot_ns == ahead_ns
+
+
+def test_a_state_that_is_handed_over_late_is_waited_for(high, monkeypatch):
+    monkeypatch.setattr(high._stream, "_socket", LateSocket(high._stream._socket, 0.01))
+    high.speed(UP, ACCELERATION_M_S2)
+    first = high.state().robot_time_s
+    for n in range(1, 30):
+        tick(high)
+        assert high.state().robot_time_s == pytest.approx(first + n * CYCLE_NS * 1e-9, abs=1e-9)
+        assert high.state().time_ns == pytest.approx(high.clock.now_ns(), abs=1000)
+
+
+def test_a_time_that_is_told_after_its_state_has_come_dates_it(high, monkeypatch):
+    """The loop looks at the robot while it waits, and finds a state of a time that it does not know yet."""
+    told = high.clock.wait_told
+
+    def late(while_waiting):
+        time.sleep(0.01)
+        while_waiting()
+        told(while_waiting)
+
+    monkeypatch.setattr(high.clock, "wait_told", late)
+    for _ in range(30):
+        tick(high, 10)
+        assert high.state().time_ns == pytest.approx(high.clock.now_ns(), abs=1000)
+
+
+def test_the_bench_is_told_how_many_packets_are_on_their_way():
+    """So it waits for a velocity that was sent before the time was let go on."""
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+    from tactile_resonance.drivers.ur_client import Client
+
+    held, control = [], SimpleNamespace(speedL=lambda *_: True, kickWatchdog=lambda: True)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with tempfile.TemporaryFile() as page, ours, theirs:
+        page.truncate(SIZE)
+        client = Client(theirs, Exchange(page.fileno()))
+        client._clock = SimpleNamespace(hold=lambda *said: held.append(said))
+        client._session = SimpleNamespace(motion=Motion(control), config=UrArmConfig("127.0.0.1"))
+        ends_ns = [CYCLE_NS * n for n in range(1, 4)]
+        client._obey(Command(SPEED, 1, ends_ns[0], Demand.FAST, tuple(UP), 0.5))
+        client._obey(Command(NOTHING, 0, ends_ns[1], Demand.NONE))
+        client._obey(Command(SPEED, 2, ends_ns[2], Demand.FAST, tuple(DOWN), 0.5))
+    assert held == [
+        (ends_ns[0], Demand.FAST, 1), (ends_ns[1], Demand.NONE, 1), (ends_ns[2], Demand.FAST, 2)
+    ]  # fmt: skip
 
 
 def test_time_stands_between_two_words_of_the_loop(robot, high):
