@@ -130,10 +130,11 @@ def _report(
     lines = [
         "# What a scan takes of the processors",
         "",
-        "`tools/run.sh tactile_resonance benchmark live`. " + how[0],
+        "`tools/run.sh tactile_resonance benchmark live`.",
+        how[0],
         "",
-        f"{os.cpu_count()} cores; a Python loop of 5 million additions takes {loop:.3f} s ({fastest:.3f} to "
-        f"{slowest:.3f} s),",
+        f"{os.cpu_count()} cores; a Python loop of 5 million additions on globals takes {loop:.3f} s",
+        f"({fastest:.3f} to {slowest:.3f} s),",
         f"numpy's real FFT of 2 x 160000 samples in double precision {1e3 * fft:.1f} ms: medians of processor",
         "time, measured before, between and after. Real-time priority is "
         f"{'' if priority else 'not '}permitted. Idle and",
@@ -147,11 +148,11 @@ def _report(
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     sums = (f"**{100 * sum(column.values()):.0f}**" for column in shares.values())
     lines += ["| **all** | " + " | ".join(sums) + " |", ""]
-    lines.append(f"Contacts lost before one was held for {seconds:g} s: {lost}.")
+    lines.append(f"- Contacts lost before one was held for {seconds:g} s: {lost}.")
     for name, scan in zip(("One scan", "Of two, the first", "the second"), scans, strict=True):
         lines.append(
-            f"{name}: {scan.done} of {scan.points} points with poles in {scan.duration_s:.0f} s, "
-            f"{scan.repeats} begun again; the simulation stood still for more than 10 ms {scan.stalls} times.  "
+            f"- {name}: {scan.done} of {scan.points} points with poles in {scan.duration_s:.0f} s, "
+            f"{scan.repeats} begun again; the simulation stood still for more than 10 ms {scan.stalls} times."
         )
     ratio = GOAL_LOOP_S / loop
     lines += [
