@@ -7,15 +7,18 @@ import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tactile_resonance.drivers.acquisition import AcquisitionDevice
 from tactile_resonance.drivers.nidaq import NiDaqDevice
 from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.replay import MeasurementSource, ReplayDevice
 from tactile_resonance.nodes.bench_device import BenchDevice
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.recording.store import RecordStore
+
+if TYPE_CHECKING:
+    from tactile_resonance.drivers.replay import MeasurementSource
 
 PARAMETERS = (
     Parameter(
@@ -71,6 +74,9 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         raise ValueError(f"device_config: empty, expected a path for the device {device}")
     path = Path(config).expanduser().absolute()
     if device == "replay":
+        # only here: it takes a node a tenth of a second more to start
+        from tactile_resonance.drivers.replay import ReplayDevice
+
         return ReplayDevice(path, speed, _source_of(path))
     if device == "nidaqmx":
         return NiDaqDevice(read_nidaq_config(path))
