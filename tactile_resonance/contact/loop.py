@@ -112,6 +112,10 @@ class ContactLoop:
         """Wait for the next period; requests may be made meanwhile."""
         self._clock.wait_until(self._next_ns, self.demand)
 
+    def skip(self) -> None:
+        """Leave out the period that is due; the next one begins a period from now."""
+        self._next_ns = self._clock.now_ns() + self._period_ns()
+
     def run_period(self) -> None:
         """Read both devices, decide, command."""
         period_ns = self._period_ns()

@@ -51,6 +51,10 @@ class LedClock:
         if self._cell is not None:
             self._cell.catch_up(self._arm.frames)
 
+    def ask_ns(self) -> int:
+        """Time now [ns], also where it has gone on without this clock."""
+        return self._arm.ask_ns()
+
     def hurry(self) -> None:
         """End a wait in which nothing needed time: something does now. From any thread."""
         self._arm.hurry()

@@ -272,6 +272,11 @@ class UrArm:
             time.sleep(AWAY_S)
             led.ask_ns()
 
+    def ask_ns(self) -> int:
+        """Simulated time now [ns], also where it has gone on without whoever leads it."""
+        assert self._led is not None
+        return self._led.ask_ns()
+
     def hurry(self) -> None:
         """Let a wait that stands still end: something is under way now. From any thread."""
         client = self._client

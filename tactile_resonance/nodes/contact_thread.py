@@ -64,6 +64,7 @@ class ContactThread:
         self._arm = arm
         self._lock = threading.Lock()
         self._running = True
+        self._time_passed = False  # simulated time, while the loop stood at the lock
         self._alive_s = time.monotonic()
         self._led = LedClock(arm, force.cell, self._stay) if simulated else None
         self.clock: Clock = self._led or arm.clock
@@ -108,6 +109,7 @@ class ContactThread:
         """Start the program of an arm again that was stopped; ``ArmError`` where it is not released."""
         with self._lock:
             if self.controller.state is State.FAULT:
+                self._time_passed = True
                 self._arm.connect()
 
     def close(self) -> None:
@@ -136,6 +138,12 @@ class ContactThread:
             while self._running:
                 self.loop.wait()
                 with self._lock:
+                    if self._led is not None and self._time_passed:
+                        # what came meanwhile was not waited for: it would seem old
+                        self._time_passed = False
+                        self._led.ask_ns()
+                        self.loop.skip()
+                        continue
                     self.loop.run_period()
                 self._alive_s = time.monotonic()
         except _EndedError:

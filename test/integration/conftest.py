@@ -56,4 +56,6 @@ def client(bench):
         if bench.order("state")["runtime_state"] != "PLAYING":  # a stop while nothing was under way
             made.wait(lambda: made.retract().success, 60.0, "the arm's program to be started again")
             made.idle()
+        bench.let_pass(1.5)  # a device that is still dead then is connected anew
+        made.back()
         yield made
