@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from rclpy.action.client import ClientGoalHandle
 
 from tactile_resonance.action import Scan
 from tactile_resonance.nodes.client import NoAnswer, NodeClient
-from tactile_resonance.nodes.goals import Goals
+from tactile_resonance.nodes.goals import TAKEN_WITHIN_S, Goals
 from tactile_resonance.scan.hands import NodeAway, ScanEnded
 
 
@@ -59,13 +60,27 @@ class ScanClient(NodeClient):
         self.wait(up, timeout_s, "the nodes to come up")
 
     def start(self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None]) -> ClientGoalHandle:
-        """Ask for a scan until the node takes it; one that was killed stays in the graph for seconds."""
-        try:
-            return self._goals.send(
-                goal, self._check, lambda: None, lambda message: feedback(message.feedback)
-            )
-        except (NodeAway, ScanEnded) as error:
-            raise NoAnswer(str(error)) from error
+        """Ask for a scan until a node takes it.
+
+        A node that was killed stays in the graph for seconds: a goal that went to it is asked for again
+        when it has left, under a new id.
+
+        Raises
+        ------
+        NoAnswer
+            If no node takes it within `TAKEN_WITHIN_S`.
+        """
+        deadline = time.monotonic() + TAKEN_WITHIN_S
+        while True:
+            try:
+                return self._goals.send(
+                    goal, self._check, lambda: None, lambda message: feedback(message.feedback)
+                )
+            except NodeAway as error:
+                if time.monotonic() > deadline:
+                    raise NoAnswer(str(error)) from error
+            except ScanEnded as error:
+                raise NoAnswer(str(error)) from error
 
     def result(self, handle: ClientGoalHandle, timeout_s: float) -> Scan.Result:
         """Result of a scan."""

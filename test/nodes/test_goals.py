@@ -15,6 +15,7 @@ from rclpy.task import Future
 
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, TAKEN_WITHIN_S, Goals
+from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
 
 REFUSED = "refused"
@@ -201,6 +202,23 @@ def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was
         goals.send("goal", nothing, poll)
     node.pause(10.0)
     assert node.running == []
+
+
+def test_a_scan_asked_of_a_node_that_was_killed_is_taken_by_the_one_that_follows(taken):
+    # a killed node stays in the graph until its lease ends: the first goal goes to it
+    node, _ = taken({0: LOST})
+    client = ScanClient(lambda: None)
+
+    def follow():
+        node.up = not 1.0 < node.now_s < 5.0
+
+    pause, node.pause = node.pause, lambda seconds: (pause(seconds), follow())
+    client._goals = Goals(node, "scan", node.pause)
+    handle = client.start("goal", nothing)
+    assert handle.accepted
+    assert node.now_s > 5.0
+    assert node.running == [bytes(handle.goal_id.uuid)]
+    assert node.asked[0] != node.asked[-1]
 
 
 def test_a_goal_that_nobody_takes_ends_the_scan(taken):
