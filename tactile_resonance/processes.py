@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -14,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 GRACE_S = 5.0
+ORPHAN_POLL_S = 0.05
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -100,17 +102,26 @@ class NodeProcesses:
                 )
 
     def stop(self) -> None:
-        """Interrupt, and kill what has not ended within the grace period."""
+        """Interrupt, and kill what has not ended within the grace period.
+
+        What a killed node had started ends by itself soon after; that is waited for, too.
+        """
         for process in self._processes.values():
             _signal(process, signal.SIGINT)
         deadline = time.monotonic() + GRACE_S
+        orphans: list[Path] = []
         for process in self._processes.values():
+            orphans += _children(process.pid)
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
+                orphans += _children(process.pid)
                 _signal(process, signal.SIGKILL)
                 process.wait()
         self._processes.clear()
+        deadline = time.monotonic() + GRACE_S
+        while any(map(_runs, orphans)) and time.monotonic() < deadline:
+            time.sleep(ORPHAN_POLL_S)
 
 
 def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
@@ -167,6 +178,23 @@ def take_priority(priority: int) -> None:
 def end_with_parent() -> None:
     """Let this process, about to be executed, be told to end should its parent die (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _children(pid: int) -> list[Path]:
+    """What a process has started and has not ended, as folders of /proc (Linux)."""
+    started: list[Path] = []
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            started += [Path("/proc") / child for child in children.read_text().split()]
+    return started
+
+
+def _runs(process: Path) -> bool:
+    """Whether a process of /proc has not ended; one of which nobody took the status has."""
+    try:
+        return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def _signal(process: subprocess.Popen, number: int) -> None:
