@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from operator import gt
 
 import numpy as np
 
@@ -93,7 +92,7 @@ class CellChecks:
 
     def __init__(self, info: ForceInfo, range_nm: float, limits: CellLimits) -> None:
         self._limits = limits
-        self._range = (*[info.range_n] * 3, *[range_nm] * 3)
+        self._range_n, self._range_nm = info.range_n, range_nm
         self._stuck_at = limits.stuck_samples or samples_until_stuck(info)
         self.restart()
 
@@ -127,18 +126,28 @@ class CellChecks:
             Invalid, overload, stuck or jump.
         """
         self._recent.append(False)
-        if not all(map(math.isfinite, wrench)):
+        x, y, z, about_x, about_y, about_z = wrench
+        if not math.isfinite(x + y + z + about_x + about_y + about_z):
             axis = next(k for k, value in enumerate(wrench) if not math.isfinite(value))
             raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is not finite: {wrench[axis]}")
-        over = overload or any(map(gt, map(abs, wrench), self._range))
+        most_n, most_nm = self._range_n, self._range_nm
+        over = overload or not (
+            -most_n <= x <= most_n
+            and -most_n <= y <= most_n
+            and -most_n <= z <= most_n
+            and -most_nm <= about_x <= most_nm
+            and -most_nm <= about_y <= most_nm
+            and -most_nm <= about_z <= most_nm
+        )
         self._over = self._over + 1 if over else 0
         if self._over >= self._limits.overload_samples:
-            shares = [abs(value) / most for value, most in zip(wrench, self._range, strict=True)]
+            ranges = (*[most_n] * 3, *[most_nm] * 3)
+            shares = [abs(value) / most for value, most in zip(wrench, ranges, strict=True)]
             axis = shares.index(max(shares))
             raise ForceError(
                 ForceFault.OVERLOAD,
                 f"{self._over} samples beyond the range; {_AXES[axis]} is {wrench[axis]:.4g}, "
-                f"range {self._range[axis]:.4g}",
+                f"range {ranges[axis]:.4g}",
             )
         last, self._last = self._last, wrench
         if last is None:
@@ -146,7 +155,7 @@ class CellChecks:
         self._equal = self._equal + 1 if wrench == last else 0
         if self._stuck_at is not None and self._equal + 1 >= self._stuck_at:
             raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
-        largest = max(abs(wrench[0] - last[0]), abs(wrench[1] - last[1]), abs(wrench[2] - last[2]))
+        largest = max(abs(x - last[0]), abs(y - last[1]), abs(z - last[2]))
         if largest > self._limits.jump_n and not over:
             raise ForceError(
                 ForceFault.JUMP,

@@ -101,6 +101,7 @@ class ClockTracker:
         """
         if not math.isfinite(remote_s):
             raise ValueError(f"remote_s: {remote_s!r}, expected a finite time")
+        x = y = 0.0
         if self._origin is not None:
             x, y = self._point(remote_s, local_ns)
             early = self._line[0] + self._line[1] * x - y
@@ -110,8 +111,8 @@ class ClockTracker:
         if self._origin is None:
             self._origin = (remote_s, local_ns)
             self._block_end_s = BLOCK_S
+            x = y = 0.0
         self._last_s = remote_s
-        x, y = self._point(remote_s, local_ns)
         if x >= self._block_end_s and self._block is not None:
             self._blocks.append(self._block)
             self._block = None
@@ -131,17 +132,29 @@ class ClockTracker:
         ValueError
             If no message has come yet.
         """
-        if self._origin is None:
-            raise ValueError("clock relation: no message has come yet")
-        remote_s, local_ns = self._origin
-        x = self._last_s - remote_s
-        offset_s = self._line[0] + self._line[1] * x - self._delay_s
         return ClockRelation(
-            local_ns=local_ns + round((x + offset_s) * 1e9),
+            local_ns=self.to_local_ns(self._last_s),
             remote_s=self._last_s,
             drift=self._line[1],
             uncertainty_s=math.hypot(self._scatter_s, self._delay_std_s),
         )
+
+    def to_local_ns(self, remote_s: float) -> int:
+        """Local time [ns] of a remote time [s] near the newest message, by the relation as of now.
+
+        Raises
+        ------
+        ValueError
+            If no message has come yet.
+        """
+        if self._origin is None:
+            raise ValueError("clock relation: no message has come yet")
+        origin_s, origin_ns = self._origin
+        x, (offset_s, drift) = self._last_s - origin_s, self._line
+        newest_ns = origin_ns + round((x + (offset_s + drift * x - self._delay_s)) * 1e9)
+        if remote_s == self._last_s:
+            return newest_ns
+        return newest_ns + round((remote_s - self._last_s) * (1 + drift) * 1e9)
 
     def _point(self, remote_s: float, local_ns: int) -> tuple[float, float]:
         """Remote time and local minus remote time, both since the first message [s]."""

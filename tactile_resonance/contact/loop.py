@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S
@@ -24,8 +24,7 @@ IDLE_PERIODS = 10
 """While nothing is under way, only every so many periods are run."""
 
 
-@dataclass(frozen=True)
-class Cycle:
+class Cycle(NamedTuple):
     """What one cycle saw, for those who record or publish it."""
 
     time_ns: int
@@ -50,6 +49,8 @@ class ContactLoop:
     ----------
     cycles, overruns : int
         Cycles run, and those that began more than one period late.
+    fault : ArmError, ForceError or None
+        What a device raised in the newest cycle.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class ContactLoop:
     ) -> None:
         self.controller = controller
         self.cycles = self.overruns = 0
+        self.fault: ArmError | ForceError | None = None
         self._arm, self._force, self._clock = arm, force, clock
         self._listener = listener
         self._next_ns = clock.now_ns()
@@ -136,7 +138,7 @@ class ContactLoop:
             wrenches = self._force.read()
         except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
-        self._seen = arm
+        self._seen, self.fault = arm, fault
         # the arm keeps a velocity, so a stop is told until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed
         try:

@@ -134,17 +134,24 @@ class SocketcandBus:
         frames = []
         for message in messages:
             words = message.split()
-            if len(words) < 4 or words[1] not in (b"frame", b"error"):
+            if len(words) < 4:
                 continue
+            _, kind, number, stamp, *data = words
+            if kind not in (b"frame", b"error"):
+                continue
+            is_error = kind == b"error"
             try:
+                values = b"" if is_error else unhexlify(b"".join(data))
+                extended = len(number) > 3
                 frames.append(
                     Frame(
-                        int(words[2], 16),
-                        unhexlify(b"".join(words[4:])) if words[1] == b"frame" else b"",
-                        float(words[3]),
+                        int(number, 16),
+                        values,
+                        float(stamp),
                         arrival_ns,
-                        extended=len(words[2]) > 3,
-                        error=words[1] == b"error",
+                        extended,
+                        False,
+                        is_error,
                     )
                 )
             except (ValueError, HexError) as error:

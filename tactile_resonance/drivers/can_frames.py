@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -109,21 +111,24 @@ class CanDescription:
         for at, wanted in self._constants:
             if values[at] != wanted:
                 return None
-        counts = [float(values[at]) for at in self._channels]
+        counts = self._counts_of(values)
         over = self._overload_at is not None and bool(
             values[self._overload_at] & self.overload[1]  # type: ignore[index]
         )
-        if self.full_scale_counts is not None or self.invalid_counts:
-            for axis, count in enumerate(counts):
-                if count in self.invalid_counts:
-                    counts[axis] = math.nan
-                elif self.full_scale_counts is not None and abs(count) >= self.full_scale_counts:
-                    over = True
-        return tuple(counts), over
+        full_scale, invalid = self.full_scale_counts, self.invalid_counts
+        if full_scale is not None and (max(counts) >= full_scale or min(counts) <= -full_scale):
+            over |= any(abs(count) >= full_scale and count not in invalid for count in counts)
+        if invalid and not self._invalid.isdisjoint(counts):
+            counts = tuple([math.nan if count in invalid else count for count in counts])
+        return counts, over
 
     @cached_property
-    def _channels(self) -> tuple[int, ...]:
-        return tuple(self.fields.index(name) for name in CHANNELS)
+    def _counts_of(self) -> Callable[[tuple[float, ...]], tuple[float, ...]]:
+        return itemgetter(*map(self.fields.index, CHANNELS))
+
+    @cached_property
+    def _invalid(self) -> frozenset[int]:
+        return frozenset(self.invalid_counts)
 
     @cached_property
     def _constants(self) -> tuple[tuple[int, int], ...]:
@@ -165,18 +170,20 @@ class Assembler:
         """
         if can_id not in self._ids:
             return None
-        late = bool(self._parts) and not abs(time_s - self._first_s) <= self._within_s
-        if can_id != self._ids[len(self._parts)] or late:
+        parts, ids = self._parts, self._ids
+        late = bool(parts) and not abs(time_s - self._first_s) <= self._within_s
+        if can_id != ids[len(parts)] or late:
             self.lost += 1
-            self._parts = []
-            if can_id != self._ids[0]:
+            parts.clear()
+            if can_id != ids[0]:
                 return None
-        if not self._parts:
+        if not parts:
             self._first_s = time_s
-        self._parts.append(bytes(data))
-        if len(self._parts) < len(self._ids):
+        parts.append(data)
+        if len(parts) < len(ids):
             return None
-        whole, self._parts = b"".join(self._parts), []
+        whole = b"".join(parts)
+        parts.clear()
         return whole
 
 

@@ -7,6 +7,7 @@ import contextlib
 import math
 import time
 from dataclasses import replace
+from operator import mul
 
 import can
 
@@ -29,7 +30,8 @@ class CanWrench:
     """Wrenches of a cell on CAN, in its own frame (a `contact.interfaces.Cell`).
 
     `read` takes the frames that have come, joins them, stamps and checks each wrench. Silence is only
-    declared where nothing waited, so that a reader that was held up does not blame the cell.
+    declared where nothing waited. A reader that was held up itself, perhaps with what brings the frames,
+    waits once more for as long as a cell may be silent.
 
     Parameters
     ----------
@@ -53,6 +55,9 @@ class CanWrench:
         self._bus: Bus | None = None
         self._fault: ForceError | None = None
         self._scale = [tuple(map(float, row)) for row in config.can.scale]
+        diagonal = [row[k] for k, row in enumerate(self._scale)]
+        crosstalk = sum(map(abs, sum(self._scale, ()))) > sum(map(abs, diagonal))
+        self._diagonal = None if crosstalk else diagonal
         self._begin()
 
     @property
@@ -81,6 +86,14 @@ class CanWrench:
         """
         self.close()
         self._fault = None
+        try:
+            self._open()
+        except ForceError as error:
+            self.close()
+            self._fault = error
+            raise
+
+    def _open(self) -> None:
         self._checks.restart()
         self._begin()
         info, description = self._config.info, self._can.description
@@ -94,14 +107,12 @@ class CanWrench:
         self._bus = open_bus(self._can.bus, self._where, request, look_s)
         try:
             self._set_up(self._bus)
-        except ForceError:
-            self.close()
-            raise
         except (can.CanError, OSError) as error:
-            self.close()
             raise ForceError(ForceFault.LINK_LOST, f"{self._where}: {one_line(error)}") from error
         now_s = self.clock.now_ns() * 1e-9
-        self._last_s, self._flow = now_s, Flow(info.rate_hz, now_s)
+        self._last_s = self._looked_s = now_s
+        self._excused = False
+        self._flow = Flow(info.rate_hz, now_s)
 
     def read(self) -> list[CellSample]:
         """Wrenches since the last call, oldest first, without waiting.
@@ -238,18 +249,26 @@ class CanWrench:
         for frame in frames:
             if frame.error:
                 raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
-            if self._take(frame, samples):
-                self._last_stamp_s = frame.stamp_s
+            stamp_s = frame.stamp_s
+            if self._is_of_the_cell(frame):
+                sample = self._take(frame)
+                if sample is not None:
+                    samples.append(sample)
+                    self._last_stamp_s = stamp_s
             elif stamped:
-                # the bus is never empty, but its frames are already those of later
-                self._last_stamp_s = min(self._last_stamp_s, frame.stamp_s)
-                if frame.stamp_s - self._last_stamp_s > silent_s:
-                    raise self._silence(bus, frame.stamp_s - self._last_stamp_s)
+                # the bus is never empty, but the frames of others are already those of later
+                self._last_stamp_s = min(self._last_stamp_s, stamp_s)
+                if stamp_s - self._last_stamp_s > silent_s:
+                    raise self._silence(bus, stamp_s - self._last_stamp_s)
         now_s = self.clock.now_ns() * 1e-9
+        held_up = now_s - self._looked_s > silent_s / 2
+        self._looked_s = now_s
         if samples:
-            self._last_s = now_s
+            self._last_s, self._excused = now_s, False
         elif bus.drained and now_s - self._last_s > silent_s:
-            raise self._silence(bus, now_s - self._last_s)
+            if not held_up or self._excused:
+                raise self._silence(bus, now_s - self._last_s)
+            self._last_s, self._excused = now_s, True
         if self._can.description.request is None and self._flow.short(
             now_s, self.received + self.lost
         ):
@@ -272,26 +291,26 @@ class CanWrench:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
-    def _take(self, frame: Frame, samples: list[CellSample]) -> bool:
-        """Whether this frame completed a wrench, which is added. Raises `ForceError`."""
-        if not self._is_of_the_cell(frame):
-            return False
+    def _take(self, frame: Frame) -> CellSample | None:
+        """The wrench that this frame of the cell completes, or None. Raises `ForceError`."""
         lost = self._assembler.lost
         whole = self._assembler.add(frame.can_id, frame.data, frame.stamp_s)
         if self._assembler.lost > lost:
             self._checks.lost()
         decoded = None if whole is None else self._can.description.decode(whole)
         if decoded is None:
-            return False
+            return None
         counts, full_scale = decoded
         if math.isnan(sum(counts)):
             name = next(n for n, c in zip(CHANNELS, counts, strict=True) if math.isnan(c))
             raise ForceError(ForceFault.INVALID, f"{self._where}: {name} is not finite")
-        wrench = tuple([sum(map(float.__mul__, row, counts)) for row in self._scale])
+        if self._diagonal is not None:
+            wrench = tuple(map(mul, self._diagonal, counts))
+        else:
+            wrench = tuple([sum(map(mul, row, counts)) for row in self._scale])
         overload = self._checks.check(wrench, full_scale)
-        samples.append(CellSample(self._stamp_ns(frame), wrench, overload))
         self.received += 1
-        return True
+        return CellSample(self._stamp_ns(frame), wrench, overload)
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
         """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
@@ -312,7 +331,7 @@ class CanWrench:
             self._stamp_before_ns = stamp_ns
             return stamp_ns
         self._tracker.add(frame.stamp_s, arrival_ns)
-        stamp_ns = self._tracker.relation().to_local_ns(frame.stamp_s)
+        stamp_ns = self._tracker.to_local_ns(frame.stamp_s)
         # a relation that has become better may be earlier by more than a period, but the order in which
         # the wrenches were taken is certain; a step is none of the relation's, and left to be seen
         if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:

@@ -123,16 +123,15 @@ class RtdeStream:
         buffer = self._buffer + data if self._buffer else data
         states, at, size = [], 0, _STATE.size
         while len(buffer) - at >= size:
-            length, kind, _, *values = _STATE.unpack_from(buffer, at)
-            if length != size or kind != _DATA:
+            v = _STATE.unpack_from(buffer, at)
+            if v[0] != size or v[1] != _DATA:
                 begin = self._skip(buffer, at)
                 if begin is None:
                     break
                 at = begin
                 continue
             at += size
-            v = values
-            states.append(RobotState(v[0], tuple(v[1:7]), tuple(v[7:13]), tuple(v[13:19]), *v[19:]))
+            states.append(RobotState(v[3], v[4:10], v[10:16], v[16:22], *v[22:]))
         self._buffer = buffer[at:]
         return states
 
@@ -142,15 +141,16 @@ class RtdeStream:
 
     def _received(self) -> bytes:
         """All that has come: who has not looked for long wants the newest state too."""
-        parts: list[bytes] = []
-        while not parts or len(parts[-1]) == _AT_ONCE:
+        received = b""
+        while len(received) % _AT_ONCE == 0:
             try:
-                parts.append(self._socket.recv(_AT_ONCE))
+                data = self._socket.recv(_AT_ONCE)
             except BlockingIOError:
                 break
-        if parts == [b""]:
-            raise ConnectionError("the robot has closed the connection")
-        return b"".join(parts)
+            if not data:
+                raise ConnectionError("the robot has closed the connection")
+            received += data
+        return received
 
     def _skip(self, buffer: bytes, at: int) -> int | None:
         """Where the packet after one that is no state begins; None where it is not whole yet."""

@@ -14,10 +14,12 @@ from collections.abc import Callable, Sequence
 from tactile_resonance.clock import Clock, Demand, SimulatedClock, WallClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.rtde_stream import RtdeStream
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Command, Seen
+from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, stop_fault
 from tactile_resonance.drivers.ur_states import StateReader
 
@@ -31,6 +33,8 @@ BEGIN_S = 2.0
 AWAY_S = 0.002
 # What does not answer for so long is named.
 SILENT_S = 1.0
+# Who is called after `state` in the same period takes the state that was seen then.
+SAME_PERIOD_NS = 1_000_000
 
 
 class UrArm:
@@ -68,6 +72,7 @@ class UrArm:
             int, tuple[bytes, float]
         ] = {}  # kind and time [s] of what has no answer yet
         self._refused = 0
+        self._looked_ns = 0
         self._reading, self._speaking = threading.Lock(), threading.Lock()
 
     # what is known of it
@@ -150,6 +155,14 @@ class UrArm:
         self._check_commands()
         return sample
 
+    def recent(self) -> ArmSample:
+        """As `state`, which it calls where that was not called within the last millisecond."""
+        states = self._states
+        if states is None or time.monotonic_ns() - self._looked_ns > SAME_PERIOD_NS:
+            return self.state()
+        assert states.sample is not None
+        return states.sample
+
     def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
         """Move the tip with a twist (6,) in the base [m/s, rad/s] until the next command.
 
@@ -164,19 +177,19 @@ class UrArm:
         if len(values) != 6 or not all(map(math.isfinite, values)):
             raise ValueError(f"twist: {values}, expected 6 finite numbers")
         config, (x, y, z, a, b, c) = self.config, values
-        for name, value, most in (
-            ("speed", math.sqrt(x * x + y * y + z * z), config.max_speed_m_s),
-            ("turn", math.sqrt(a * a + b * b + c * c), config.max_turn_rad_s),
-        ):
-            if value > most:
-                raise ValueError(f"{name}: {value:g}, the configuration allows {most:g}")
+        speed_m_s, turn_rad_s = math.hypot(x, y, z), math.hypot(a, b, c)
+        if speed_m_s > config.max_speed_m_s:
+            allowed = f"the configuration allows {config.max_speed_m_s:g}"
+            raise ValueError(f"speed: {speed_m_s:g}, {allowed}")
+        if turn_rad_s > config.max_turn_rad_s:
+            allowed = f"the configuration allows {config.max_turn_rad_s:g}"
+            raise ValueError(f"turn: {turn_rad_s:g}, {allowed}")
         self._check_acceleration(acceleration_m_s2)
-        self._fresh()
-        self._check_commands()
+        self.recent()
         assert self._states is not None
         if self._states.fault is not None:
             raise ArmError(*self._states.fault)
-        self._send(Command(SPEED, twist=values, acceleration=float(acceleration_m_s2)))
+        self._send(SPEED, values, float(acceleration_m_s2))
 
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop; works at any time and raises only where the link is dead, or for a wrong figure.
@@ -189,7 +202,7 @@ class UrArm:
         except ArmError as error:
             if error.fault is not ArmFault.STALE:
                 raise
-        self._send(Command(STOP, acceleration=float(deceleration_m_s2)))
+        self._send(STOP, REST, float(deceleration_m_s2))
 
     def close(self) -> None:
         """Stop the arm and its program and end the client; never raises."""
@@ -264,6 +277,7 @@ class UrArm:
                 led.wait_told(check)
             if not self._dated:
                 led.ask_ns()  # what was told while it connected lies behind
+            self._looked_ns = 0
             self._catch_up(led.robot_ns)
             if not self._dated and self._states is not None:
                 self._states.date_anew()
@@ -394,11 +408,11 @@ class UrArm:
                 ) from error
             raise
 
-    def _send(self, command: Command) -> None:
+    def _send(self, kind: bytes, twist: Six, acceleration_m_s2: float) -> None:
         assert self._client is not None
         self._number += 1
-        command = command._replace(number=self._number)
-        self._sent[self._number] = (command.kind, time.monotonic())
+        command = Command(kind, self._number, 0, 0, twist, acceleration_m_s2)
+        self._sent[self._number] = (kind, time.monotonic())
         if self._led is not None:
             self._pending = command  # with the next word on the time
         else:
@@ -431,6 +445,7 @@ class UrArm:
 
     def _fresh(self) -> ArmSample:
         """Return the newest state, and show the client that its owner lives."""
+        self._looked_ns = 0
         if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
         self._client.look()
@@ -453,6 +468,7 @@ class UrArm:
                 f"the newest state of {config.host} is {age_s * 1e3:.0f} ms old, accepted are "
                 f"{config.max_state_age_s * 1e3:.0f} ms",
             )
+        self._looked_ns = time.monotonic_ns()
         return sample
 
     def _check_commands(self) -> None:

@@ -77,15 +77,19 @@ class StateReader:
         states = self._stream.read()
         last_s = -math.inf if self.newest is None else self.newest.robot_time_s
         # a robot that stands still in simulated time says the same again
-        fresh = [state for state in states if state.robot_time_s != last_s]
-        if not fresh:
+        newest, stamps = None, self._stamps
+        for state in states:
+            if state.robot_time_s == last_s:
+                continue
+            newest = state
+            if self._guarded and state.runtime_state != PROGRAM_PLAYING:
+                self._ended = True
+            stamps.append(state.robot_time_s)
+        if newest is None:
             return bool(states)
-        for state in fresh:
-            self._ended |= self._guarded and state.runtime_state != PROGRAM_PLAYING
-            self._stamps.append(state.robot_time_s)
-        newest = self.newest = fresh[-1]
-        while self._stamps[0] < newest.robot_time_s - 1.0 or self._stamps[0] > newest.robot_time_s:
-            self._stamps.popleft()
+        self.newest, now_s = newest, newest.robot_time_s
+        while not now_s - 1.0 <= stamps[0] <= now_s:
+            stamps.popleft()
         self._date(newest, now_known)
         return True
 
@@ -104,14 +108,14 @@ class StateReader:
         if now_known or self.sample is None:
             self._tracker.add(newest.robot_time_s, self._now_ns())
         runtime = PROGRAM_STOPPED if self.revived else newest.runtime_state
-        self.fault = motion_fault(newest.safety_bits, newest.robot_mode, runtime)
+        self.fault = fault = motion_fault(newest.safety_bits, newest.robot_mode, runtime)
         self.sample = ArmSample(
-            time_ns=self._tracker.relation().to_local_ns(newest.robot_time_s),
-            robot_time_s=newest.robot_time_s,
-            position_m=newest.pose[:3],
-            rotation_rad=newest.pose[3:],
-            velocity=newest.speed,
-            moving_allowed=self.fault is None,
-            message="" if self.fault is None else self.fault[1],
-            tool_wrench=newest.force,
+            self._tracker.to_local_ns(newest.robot_time_s),
+            newest.robot_time_s,
+            newest.pose[:3],
+            newest.pose[3:],
+            newest.speed,
+            fault is None,
+            "" if fault is None else fault[1],
+            newest.force,
         )

@@ -146,7 +146,7 @@ def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
         )
     return force_source(
         config,
-        arm.state,
+        arm.recent,
         clock=arm.clock,
         arm_clock_std_s=lambda: arm.clock_uncertainty_s,
         topic=lambda asked: TopicWrench(node, asked, arm.clock),

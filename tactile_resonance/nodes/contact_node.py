@@ -37,7 +37,7 @@ PARAMETERS = (
     TIME_SERVER,
     Parameter(
         "publish_rate_hz",
-        50.0,
+        25.0,
         "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench "
         "is the mean since the last one.",
         1.0,
@@ -66,8 +66,7 @@ PARAMETERS = (
     *contact_parameters(),
 )
 
-POLL_S = 0.02
-FEEDBACK_EVERY = 5  # polls
+FEEDBACK_EVERY_S = 0.1
 # How long the devices may be dead before the node gives up and is brought up anew.
 DEAD_NS = 1_000_000_000
 
@@ -112,7 +111,9 @@ class ContactNode(ManagedNode):
         self._fault: ArmError | ForceError | None = None
         self._sound_ns: int | None = None  # of the last cycle without a fault
         self._dead = False
-        self._polls = 0
+        self._news = self.create_guard_condition(self._look)
+        self.resources.callback(self.destroy_guard_condition, self._news)
+        self._told: tuple[State, bool] | None = None
         from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
         clock = self._arm.clock
         began_ns = clock.ros_ns(clock.now_ns())
@@ -122,14 +123,14 @@ class ContactNode(ManagedNode):
         if from_poles:
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
-        self.every(POLL_S, self._poll)
+        self.every(FEEDBACK_EVERY_S, self._tell)
         server = ActionServer(
             self,
             MakeContact,
             "make_contact",
             self._on_goal,
             goal_callback=self._on_request,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            cancel_callback=self._on_cancel,
         )
         self.resources.callback(server.destroy)
 
@@ -204,6 +205,10 @@ class ContactNode(ManagedNode):
         ready = self.active and self._goal is None and self._fault is None
         return GoalResponse.ACCEPT if ready else GoalResponse.REJECT
 
+    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
+        self._news.trigger()
+        return CancelResponse.ACCEPT
+
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = MakeContact.Result(cause="refused")
         try:
@@ -256,12 +261,24 @@ class ContactNode(ManagedNode):
 
     # what the loop has done, in the executor's thread
 
-    def _poll(self) -> None:
+    def _tell(self) -> None:
+        """Look, and tell what was not told by itself."""
+        self._look()
         thread = self._thread
         if thread is None:
             return
         self._topics.say_again()
         self._forces.look()
+        if self._goal is not None:
+            controller = thread.controller
+            feedback = feedback_message(controller.state.value, controller.estimate)
+            self._goal.publish_feedback(feedback)
+
+    def _look(self) -> None:
+        """Whether a goal has ended, or the loop."""
+        thread = self._thread
+        if thread is None:
+            return
         if thread.error is not None:
             self._finish(None)
             self.fail(f"control loop ended: {thread.error!r}")
@@ -280,10 +297,6 @@ class ContactNode(ManagedNode):
         over = controller.state in (State.IDLE, State.FAULT) if goal.is_cancel_requested else True
         if result is not None and over:
             self._finish(result)
-            return
-        self._polls += 1
-        if self._polls % FEEDBACK_EVERY == 0:
-            goal.publish_feedback(feedback_message(controller.state.value, controller.estimate))
 
     def _tell_touch(self) -> bool:
         return self._thread is not None and self._thread.tell_touch()
@@ -306,10 +319,15 @@ class ContactNode(ManagedNode):
     # each cycle, in the loop's thread
 
     def _on_cycle(self, cycle: Cycle) -> None:
-        if cycle.fault is None or self._sound_ns is None:
+        # a force source is started again once the tip has been drawn back: not before is it given up
+        waits = isinstance(cycle.fault, ForceError) and cycle.state is not State.IDLE
+        if cycle.fault is None or waits or self._sound_ns is None:
             self._sound_ns = cycle.time_ns
         self._dead = cycle.time_ns - self._sound_ns > DEAD_NS
         self._fault = cycle.fault
+        if self._told != (cycle.state, self._dead):
+            self._told = cycle.state, self._dead
+            self._news.trigger()
         thread = self._thread
         if thread is None:  # it is being made
             return

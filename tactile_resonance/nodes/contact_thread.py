@@ -11,6 +11,7 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.interfaces import ForceError
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -23,6 +24,8 @@ RETRACT_WITHIN_S = 12.0
 POLL_S = 0.01
 # A loop of which nothing was seen for so long hangs.
 HUNG_S = 1.0
+# Between two attempts to start a force source that has failed.
+SOURCE_AGAIN_S = 0.25
 
 
 class _EndedError(Exception):
@@ -61,10 +64,11 @@ class ContactThread:
     ) -> None:
         self.controller = ContactController(parameters, limits, tip)
         self.error: Exception | None = None
-        self._arm = arm
+        self._arm, self._force = arm, force
         self._lock = threading.Lock()
         self._running = True
         self._time_passed = False  # simulated time, while the loop stood at the lock
+        self._source_tried_s = 0.0
         self._alive_s = time.monotonic()
         self._led = LedClock(arm, force.cell, self._stay) if simulated else None
         self.clock: Clock = self._led or arm.clock
@@ -133,6 +137,14 @@ class ContactThread:
         if not self._running:
             raise _EndedError
 
+    def _start_source_again(self) -> None:
+        """Start a force source that has failed, once nothing is under way that would wait for the loop."""
+        now_s = time.monotonic()
+        if self.controller.state is State.IDLE and now_s - self._source_tried_s > SOURCE_AGAIN_S:
+            self._source_tried_s = now_s
+            with contextlib.suppress(ForceError):  # told by its next `read`
+                self._force.start()
+
     def _run(self) -> None:
         try:
             while self._running:
@@ -146,6 +158,8 @@ class ContactThread:
                         continue
                     self.loop.run_period()
                 self._alive_s = time.monotonic()
+                if isinstance(self.loop.fault, ForceError):
+                    self._start_source_again()
         except _EndedError:
             pass
         except Exception as error:

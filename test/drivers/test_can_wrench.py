@@ -132,6 +132,31 @@ def test_every_fault_is_named_in_time_and_its_end_brings_the_source_back(
     assert len(bench.go(source, 200)) == 200
 
 
+def test_a_reader_that_was_held_up_waits_once_more_for_a_cell_that_sends_nothing(bench, make_source):
+    source = make_source()
+    source.start()
+    bench.go(source, 50)
+    bench.cell.faults.inject("silent", 1)
+    bench.go(source, 1, steps=30)  # ms; perhaps what brings the frames was held up with it
+    bench.cell.faults.inject("silent", 0)
+    assert len(bench.go(source, 50)) == 50
+    bench.cell.faults.inject("silent", 1)
+    bench.go(source, 1, steps=30)
+    error, ticks = fault_of(bench, source)
+    assert error.fault is ForceFault.SILENT
+    assert ticks in (10, 11)  # limits.silent_s is 10 ms
+
+
+def test_a_reader_that_looks_seldom_names_a_silent_cell_at_the_second_look(bench, make_source):
+    source = make_source()
+    source.start()
+    bench.go(source, 50)
+    bench.cell.faults.inject("silent", 1)
+    bench.go(source, 1, steps=20)  # ms
+    with pytest.raises(ForceError, match="silent for 20 ms"):
+        bench.go(source, 1, steps=20)
+
+
 def test_a_cell_that_is_silent_from_the_start_is_named(bench, make_source, monkeypatch):
     source = make_source()
     bench.cell.faults.inject("silent", 1)

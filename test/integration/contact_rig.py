@@ -69,16 +69,14 @@ class ContactClient(NodeClient):
     def why(self):
         return "" if self.state is None else f"{self.state.state}: {self.state.message}"
 
-    def idle(self, anew=False, timeout_s=HANGS_S):
-        """Wait until the node is active and nothing is under way; `anew`: its loop begun again."""
-        cycles = self.state.cycles if anew else None
+    def idle(self, timeout_s=HANGS_S):
+        """Wait until the node is active and nothing is under way."""
         self.state = None
-
-        def there():
-            new = self.state is not None and (cycles is None or self.state.cycles < cycles)
-            return new and self.state.state == "idle"
-
-        self.wait(there, timeout_s, "contact_node to be idle")
+        self.wait(
+            lambda: self.state is not None and self.state.state == "idle",
+            timeout_s,
+            "contact_node to be idle",
+        )
 
     def back(self, timeout_s=HANGS_S):
         """Ask for a retraction while a fault stands, until nothing is under way."""

@@ -94,7 +94,13 @@ def test_fault_of_the_cell_stops_the_tip_and_draws_it_back(bench, client, name):
     assert result.cause in causes, result.message
     assert result.message
     client.wait(lambda: height_m(bench) > STANDOFF_M - 2e-4, HANGS_S, "the tip to be drawn back")
-    client.idle(anew=True)  # the source is started anew
+    client.idle()
+    # the loop goes on, and has started the source again
+    cycles, result = client.state.cycles, client.result(client.start())
+    assert result.reached, result.message
+    client.retract()
+    client.idle()
+    assert client.state.cycles > cycles
 
 
 @pytest.mark.parametrize("name", ARM_FAULTS)
