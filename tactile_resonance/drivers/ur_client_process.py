@@ -20,8 +20,6 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, Command, Exchange
 
 GRACE_S = 1.5
-# So often it is looked whether the process runs: to send to one that does not fails anyhow.
-LOOKS = 4
 # Of what ur_rtde 1.6.5 writes when it finds its connection lost.
 LIBRARY_LOST = "Robot is disconnected"
 
@@ -51,7 +49,7 @@ class ClientProcess:
             )
         self._host, self._connect_timeout_s = config.host, config.connect_timeout_s
         self._using = threading.Lock()  # one thread may end it while another waits for it
-        self._ended, self._looks = False, 0
+        self._ended = False
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with tempfile.TemporaryFile() as page, theirs:
             page.truncate(SIZE)
@@ -82,9 +80,7 @@ class ClientProcess:
     def look(self) -> None:
         """Tell the client that its owner lives; raise `ArmError` where it is gone."""
         with self._using:
-            self._looks += 1
-            gone = self._looks % LOOKS == 0 and self._process.poll() is not None
-            if not (self._ended or gone):
+            if not self._ended and self._process.poll() is None:
                 self.exchange.beat()
                 return
         raise self._death()
