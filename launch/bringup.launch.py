@@ -12,7 +12,8 @@ from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.simulation.plant_defaults import HOST, TABLE_IN_BASE
+from tactile_resonance.processes import may_take_priority
+from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, STALLS_S, TABLE_IN_BASE
 
 PACKAGE = "tactile_resonance"
 STREAM = ("excitation_node", "frf_node", "poles_node")
@@ -121,6 +122,7 @@ def _nodes(context):
     host = given("robot_ip") or (HOST if mock else "")
     simulated_cell = host if mock and given("force_config") == "can_simulated.yaml" else ""
     time_server = {"time_server": f"{host}:{TIME_PORT}" if simulated_time else ""}
+    stalls = mock and not (simulated_time or may_take_priority(PRIORITY))
     own = {
         "fake_hardware_node": {
             "scene": given("scene"),
@@ -140,6 +142,7 @@ def _nodes(context):
             "base_frame": given("base_frame"),
             "force_config": given("force_config"),
             "force_host": simulated_cell,
+            "simulated_stalls_s": STALLS_S if stalls else 0.0,
             **time_server,
         },
         "scan_node": {

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, STALLS_S, TABLE_IN_BASE
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
@@ -184,6 +184,7 @@ class _Ended:
 
 def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
     """Of each node, beside their defaults."""
+    waits_s = STALLS_S if job.real_time and not may_take_priority(PRIORITY) else 0.0
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
     simulated = not job.real_time
     time_server = {"time_server": f"{job.host}:{TIME_PORT}" if simulated else "''"}
@@ -196,7 +197,12 @@ def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, 
             "seed": job.seed,
         },
         "excitation_node": {"record_folder": work / "records", **time_server},
-        "contact_node": {"robot_host": job.host, "force_host": job.host, **time_server},
+        "contact_node": {
+            "robot_host": job.host,
+            "force_host": job.host,
+            "simulated_stalls_s": waits_s,
+            **time_server,
+        },
         "pole_map_node": {"classes_file": job.scene if classes else "''"},
         "scan_node": {"table_in_base": table, **time_server},
     }

@@ -82,7 +82,7 @@ class UrArmConfig:
             raise ValueError(f"host: {self.host!r}, expected a name or an address")
         for name, low, high in (
             ("rate_hz", 25.0, 500.0),
-            ("watchdog_hz", 5.0 if _is_loopback(self.host) else 25.0, 125.0),
+            ("watchdog_hz", 5.0 if self.simulated else 25.0, 125.0),
             ("max_state_age_s", 0.004, 1.0),
             ("owner_timeout_s", 0.005, 1.0),
             ("connect_timeout_s", 1.0, 120.0),
@@ -103,6 +103,11 @@ class UrArmConfig:
             raise ValueError(f"check_dashboard: {self.check_dashboard!r}, expected true or false")
         if type(self.realtime_priority) is not int or not 0 <= self.realtime_priority <= 99:
             raise ValueError(f"realtime_priority: {self.realtime_priority!r}, expected 0 to 99")
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the robot is at an address (127.x.y.z) where no real one is."""
+        return _is_loopback(self.host)
 
     def to_dict(self) -> dict[str, Any]:
         """Fields as plain numbers and lists."""

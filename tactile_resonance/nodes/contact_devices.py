@@ -56,6 +56,15 @@ PARAMETERS = (
         read_only=True,
     ),
     Parameter(
+        "simulated_stalls_s",
+        0.0,
+        "Of a simulated robot (127.x.y.z) that has no real-time priority: so much longer than hardware robot "
+        "and cell may be silent [s].",
+        0.0,
+        0.2,
+        read_only=True,
+    ),
+    Parameter(
         "sensor_config",
         "config/sensors/bimorph.yaml",
         "The sensor, for the radius of its tip and the length of its beam.",
@@ -104,9 +113,17 @@ def take_realtime(node: ManagedNode) -> int:
 
 def make_arm(node: ManagedNode, priority: int) -> UrArm:
     """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
-    name, host = values(node, "robot_config", "robot_host")
+    name, host, stalls_s = values(node, "robot_config", "robot_host", "simulated_stalls_s")
     config = read_ur_config(_path(name))
     config = replace(config, host=host or config.host)
+    if stalls_s:
+        good = config.simulated
+        require(good, "simulated_stalls_s", stalls_s, f"0 for the robot at {config.host}")
+        config = replace(
+            config,
+            max_state_age_s=config.max_state_age_s + stalls_s,
+            watchdog_hz=1 / (1 / config.watchdog_hz + stalls_s),
+        )
     if node.time_server:
         # it costs nothing there, and what a slow machine needs to connect is no fault
         config = replace(config, connect_timeout_s=max(config.connect_timeout_s, SIMULATED_S))
@@ -134,8 +151,10 @@ def require_arm_allows(config: UrArmConfig, parameters: ContactParameters, limit
 
 def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
     """The force source that the parameters name, not started yet; ValueError where they are wrong."""
-    name, host = values(node, "force_config", "force_host")
+    name, host, stalls_s = values(node, "force_config", "force_host", "simulated_stalls_s")
     config = read_force_config(Path(name).expanduser())
+    silent_s = config.limits.silent_s + stalls_s
+    config = replace(config, limits=replace(config.limits, silent_s=silent_s))
     if host:
         if config.can is None:
             raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")

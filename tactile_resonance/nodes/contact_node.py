@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -196,6 +197,12 @@ class ContactNode(ManagedNode):
     def _read_parameters(self, **changed: float) -> tuple[ContactParameters, Limits]:
         """Of the controller, as the arm allows them; ``ValueError`` where one is not accepted."""
         parameters, limits = read_parameters(self, **changed)
+        (stalls_s,) = values(self, "simulated_stalls_s")
+        limits = replace(
+            limits,
+            force_age_s=limits.force_age_s + stalls_s,
+            arm_age_s=limits.arm_age_s + stalls_s,
+        )
         if self._arm is not None:
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
         return parameters, limits
