@@ -13,6 +13,7 @@ from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
@@ -55,7 +56,8 @@ class ManagedNode(LifecycleNode):
 
     `configure` makes publishers, subscriptions, services and devices through `publish_on`, `listen`,
     `serve` and `resources`; the way back undoes them in reverse order. What arrives while the node is
-    not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells that it works.
+    not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells those who listen
+    that it works.
 
     Parameters
     ----------
@@ -74,8 +76,13 @@ class ManagedNode(LifecycleNode):
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
         self._instance = int.from_bytes(os.urandom(7), "big")
-        self._beats = self.create_publisher(msg.Heartbeat, "heartbeat", BEATS)
-        self.steady_timer(BEAT_S, self._beat)
+        # a timer that fires for nobody wakes the executor all the same, which is what an idle node costs
+        self._beat_timer = self.steady_timer(BEAT_S, self._beat)
+        self._beat_timer.cancel()
+        events = PublisherEventCallbacks(matched=self._on_listeners)
+        self._beats = self.create_publisher(
+            msg.Heartbeat, "heartbeat", BEATS, event_callbacks=events
+        )
 
     # What a subclass says
 
@@ -103,9 +110,16 @@ class ManagedNode(LifecycleNode):
 
     # What it sets up with
 
-    def publish_on(self, kind: type, topic: str, qos: QoSProfile) -> LifecyclePublisher:
-        """Publisher until the node is cleaned up."""
-        publisher = self.create_lifecycle_publisher(kind, topic, qos)
+    def publish_on(
+        self,
+        kind: type,
+        topic: str,
+        qos: QoSProfile,
+        matched: Callable[[QoSPublisherMatchedInfo], None] | None = None,
+    ) -> LifecyclePublisher:
+        """Publisher until the node is cleaned up; `matched` hears of subscribers that come or go."""
+        events = PublisherEventCallbacks(matched=matched)
+        publisher = self.create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
         self.resources.callback(self.destroy_lifecycle_publisher, publisher)
         return publisher
 
@@ -136,6 +150,16 @@ class ManagedNode(LifecycleNode):
         group = ReentrantCallbackGroup()
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
+
+    def set_up(self, make: Callable[[], None]) -> Callable[[], None]:
+        """Let `make` set up what is let go by calling what is returned, at the latest with the rest."""
+        rest, self.resources = self.resources, ExitStack()
+        try:
+            make()
+        finally:
+            made, self.resources = self.resources, rest
+            self.resources.callback(made.close)
+        return made.close
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Timer until the node is cleaned up; called while it is active, by this machine's clock."""
@@ -168,6 +192,14 @@ class ManagedNode(LifecycleNode):
             self.trigger_deactivate()
 
     # Its life
+
+    def _on_listeners(self, matched: QoSPublisherMatchedInfo) -> None:
+        """Signs of life from now on, the first at once, or none where nobody listens any more."""
+        if matched.current_count:
+            self._beat_timer.reset()
+            self._beat()
+        else:
+            self._beat_timer.cancel()
 
     def _beat(self) -> None:
         if self.working():

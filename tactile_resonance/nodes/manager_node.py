@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 
-from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
+from rclpy.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -31,6 +33,8 @@ PARAMETERS = (
 )
 
 TICK_S = 0.1
+# A node tells of its own transitions, and the graph of one that appears: a look finds those that hang.
+LOOK_S = 2.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
 LONGEST_RETRY_S = 16.0
@@ -78,22 +82,35 @@ class ManagerNode(Node):
         super().__init__("manager_node")
         declare(self, PARAMETERS)
         (names,) = values(self, "nodes")
-        self._nodes = [self._managed(name) for name in names]
-        if not self._nodes:
+        if not names:
             raise ValueError("nodes: empty, expected names of nodes")
         self._wanted_up = True
         self._was_up = False
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/shut_down", self._on_shut_down)
-        self.create_timer(TICK_S, self._tick, clock=STEADY)
+        self._timer = self.create_timer(TICK_S, self._tick, clock=STEADY)
+        self._nodes = [self._managed(name) for name in names]
 
     def _managed(self, name: str) -> _Managed:
-        return _Managed(
+        node = _Managed(
             name,
             self.create_client(GetState, f"{name}/get_state"),
             self.create_client(ChangeState, f"{name}/change_state"),
         )
+
+        def matched(info: QoSSubscriptionMatchedInfo) -> None:
+            if info.current_count_change > 0:
+                self._on_start_of(node)
+
+        self.create_subscription(
+            TransitionEvent,
+            f"{name}/transition_event",
+            lambda _: self._on_transition(node),
+            10,
+            event_callbacks=SubscriptionEventCallbacks(matched=matched),
+        )
+        return node
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._want(True, response)
@@ -105,39 +122,58 @@ class ManagerNode(Node):
         self._wanted_up = up
         for node in self._nodes:
             node.refusals, node.next_try_s = 0, 0.0
+        self._tick()
         response.success = True
         response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
         return response
 
+    def _on_start_of(self, node: _Managed) -> None:
+        """A node that was started anew does not answer what the one before it was asked."""
+        if node.pending is not None:
+            self._forget(node)
+        self._tick()
+
+    def _on_transition(self, node: _Managed) -> None:
+        """Ask what it is now, where no answer is awaited that tells it anyway."""
+        if node.pending is None and node.get.service_is_ready():
+            self._ask(node, node.get, GetState.Request(), time.monotonic())
+
     def _tick(self) -> None:
+        """One step of each node; the next when one of them is due."""
         ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
+        now_s = time.monotonic()
+        due_s = now_s + LOOK_S
         for node in self._nodes if self._wanted_up else reversed(self._nodes):
-            self._advance(node, moves if clear else {})
+            due_s = min(due_s, self._advance(node, moves if clear else {}, now_s))
             clear = clear and node.state == ready
+        self._timer.timer_period_ns = round(max(TICK_S, due_s - now_s) * 1e9)
+        self._timer.reset()
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
         self._was_up = clear and self._wanted_up
 
-    def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
-        """One step of one node: an answer taken, or a question asked."""
-        now_s = time.monotonic()
+    def _advance(self, node: _Managed, moves: dict[int, int], now_s: float) -> float:
+        """One step of one node, an answer taken or a question asked; when the next is due at the latest."""
         if node.pending is not None:
             if not node.pending.done():
-                if now_s > node.deadline_s:
-                    self._drop(node)
-                return
+                if now_s <= node.deadline_s:
+                    return node.deadline_s
+                self._forget(node)
+                self.health.error(f"{node.name} does not answer")
+                return now_s
             self._take(node, now_s)
         if not (node.get.service_is_ready() and node.change.service_is_ready()):
             node.state = State.PRIMARY_STATE_UNKNOWN
-            return
+            return now_s
         transition = moves.get(node.state)
         if transition is not None and now_s >= node.next_try_s:
             request = ChangeState.Request(transition=Transition(id=transition))
             self._ask(node, node.change, request, now_s)
         else:
             self._ask(node, node.get, GetState.Request(), now_s)
+        return node.next_try_s if transition is not None and now_s < node.next_try_s else math.inf
 
     def _ask(self, node: _Managed, client: Client, request: object, now_s: float) -> None:
         (timeout_s,) = values(self, "answer_timeout_s")
@@ -148,7 +184,7 @@ class ManagerNode(Node):
         node.pending.add_done_callback(lambda future: self._hear(node, future))
 
     def _hear(self, node: _Managed, answer: Future) -> None:
-        """An answer by which a node has moved leads to the next question at once, others at the next tick."""
+        """An answer by which a node has moved leads to the next question at once, others at the next look."""
         if node.pending is answer and not answer.cancelled():
             before = node.state
             self._take(node, time.monotonic())
@@ -175,12 +211,11 @@ class ManagerNode(Node):
             f"asked again in {wait_s:g} s"
         )
 
-    def _drop(self, node: _Managed) -> None:
-        """A node that was killed never answers."""
+    def _forget(self, node: _Managed) -> None:
+        """Await no answer any more: a node that was killed never gives one."""
         node.client.remove_pending_request(node.pending)
         node.pending = None
         node.state = State.PRIMARY_STATE_UNKNOWN
-        self.health.error(f"{node.name} does not answer")
 
     def _summary(self) -> str:
         return "active" if self._was_up else ("starting" if self._wanted_up else "shut down")

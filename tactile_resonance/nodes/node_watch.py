@@ -56,6 +56,16 @@ class NodeWatch:
         self._behind: dict[str, set[str]] = {}  # who published a topic when somebody did last
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
+    def met(self) -> bool:
+        """Whether all that publish now have given a sign of life.
+
+        A node that has hears of each subscription that was made before this watch, in the order in which
+        they were made: nothing that it publishes from then on is missed.
+        """
+        names = {name for topic in self._topics for name in self._publishers(topic)}
+        with self._lock:
+            return names <= self._signs.keys()
+
     def missing(self) -> str | None:
         """A topic that nobody at work publishes, as a sentence; None: there is none."""
         for topic in self._topics:

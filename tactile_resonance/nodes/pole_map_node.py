@@ -99,15 +99,22 @@ class PoleMapNode(ManagedNode):
         self._left_out = 0
         kinds = {"": PointCloud2, "/markers": MarkerArray}
         kinds |= {"/legend": MarkerArray, "/surface": PointCloud2}
-        self._publishers_of = {
-            name: self.publish_on(kind, f"pole_map{name}", LATCHED) for name, kind in kinds.items()
-        }
         self._old: set[str] = set()  # outputs that show less than is known
+        self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
+        self._pause.cancel()
+        self.resources.callback(self.destroy_timer, self._pause)
+        self._publishers_of = {
+            name: self.publish_on(kind, f"pole_map{name}", LATCHED, lambda _: self._show())
+            for name, kind in kinds.items()
+        }
         # heard from the configuration on: what came before comes right after it, and only then
         subscription = self.create_subscription(msg.Poles, "poles", self._on_poles, POLES)
         self.resources.callback(self.destroy_subscription, subscription)
         self.serve(Trigger, "pole_map/clear", self._on_clear)
-        self.every(PUBLISH_PERIOD_S, self._publish)
+
+    def activate(self) -> None:
+        """Soon show what was heard since the configuration."""
+        self._pause.reset()
 
     def details(self) -> Mapping[str, str]:
         """For the diagnostics."""
@@ -136,20 +143,32 @@ class PoleMapNode(ManagedNode):
             return
         self._map = self._map.with_point(point)
         self._old = set(self._publishers_of)
+        self._show()
 
     def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.message = f"{len(self._map.points)} points cleared"
         response.success = True
         self._map = PoleMap()
         self._old = set(self._publishers_of)
+        self._show()
         return response
 
-    def _publish(self) -> None:
+    def _show(self) -> None:
+        """Publish what is new and read, at once; after the pause where something was just published."""
+        if not (self.active and self._pause.is_canceled()):
+            return
         wanted = {
             name for name in self._old if self._publishers_of[name].get_subscription_count() > 0
         }
-        if not wanted:
-            return
+        if wanted:
+            self._publish(wanted)
+            self._pause.reset()
+
+    def _on_pause_over(self) -> None:
+        self._pause.cancel()
+        self._show()
+
+    def _publish(self, wanted: set[str]) -> None:
         (probability, cells) = values(self, "ellipse_probability", "surface_cells")
         header = header_message(self._frame_id, self.get_clock().now().to_msg())
         scale = self._scale(probability)

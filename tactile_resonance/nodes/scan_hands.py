@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -47,6 +48,8 @@ may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
+MET_WITHIN_S = 1.0
+"""Nodes of this package give a sign of life much sooner, those of others never."""
 # Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
 LEAST_TOUCH_STD_M = 2e-5
 
@@ -57,13 +60,14 @@ class NodeHands:
     Parameters
     ----------
     node : ManagedNode
-    recorder : ScanRecorder
     table_in_base : Pose
         Frame of the scan's points in the robot's base.
     base_frame : str
         Name of that base.
     with_robot : bool
         False: nobody moves the tip; it is taken to be where the plan says, and its pose is published.
+    tell_waiting : callable
+        Receives who keeps the scan waiting, for people; empty: nobody any more. In the scan's thread.
 
     Attributes
     ----------
@@ -74,21 +78,18 @@ class NodeHands:
     def __init__(
         self,
         node: ManagedNode,
-        recorder: ScanRecorder,
         table_in_base: Pose,
         base_frame: str,
         with_robot: bool,
         scan_time: ScanTime,
+        tell_waiting: Callable[[str], None],
     ) -> None:
         self._node = node
-        self._recorder = recorder
         self._table = table_in_base
         self._base_frame = base_frame
         self._time = scan_time
         self.free_air = with_robot
-        topics = (*STREAM_TOPICS, *([STATE_TOPIC] if with_robot else []))
-        self._nodes = NodeWatch(node, topics, scan_time.silent_s)
-        self._waited_for = ""
+        self._tell_waiting = tell_waiting
         client = GoalClient(node, Measure, "measure")
         node.resources.callback(client.destroy)
         self._measure = Goals(client, "measure")
@@ -98,10 +99,33 @@ class NodeHands:
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
 
-    @property
-    def waiting_for(self) -> str:
-        """Who keeps the scan waiting, for people; empty: nobody."""
-        return self._waited_for
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Hear what a scan needs, as long as there is one: each message costs a node that idles as much.
+
+        To be entered and left in the executor's thread.
+        """
+        stop = self._node.set_up(self._listen)
+        try:
+            yield
+        finally:
+            stop()
+
+    def _listen(self) -> None:
+        self._waited_for = ""
+        self._recorder = ScanRecorder(self._node)
+        topics = STREAM_TOPICS
+        if self._tip is not None:
+            self._tip.listen()
+            topics = (*topics, STATE_TOPIC)
+        # last: who is heard by it has been told of all the others
+        self._nodes = NodeWatch(self._node, topics, self._time.silent_s)
+
+    def meet(self) -> None:
+        """Wait until what the nodes publish is heard."""
+        deadline = time.monotonic() + MET_WITHIN_S
+        while not self._nodes.met() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
 
     def now_s(self) -> float:
         """Time by which durations count [s]."""
@@ -259,7 +283,11 @@ class NodeHands:
         instances: Instances = self._nodes.instances(topics)
 
         def poll() -> None:
-            self._waited_for = self._nodes.waited_for(instances)
+            waited_for = self._nodes.waited_for(instances)
+            who = waited_for.partition(",")[0]
+            if who != self._waited_for:
+                self._waited_for = who
+                self._tell_waiting(waited_for)
             self._end_if_hung()
             problem = self._nodes.changed(instances)
             if problem is not None:

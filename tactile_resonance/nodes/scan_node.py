@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +24,6 @@ from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, Manage
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
-from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
@@ -73,7 +71,6 @@ PARAMETERS = (
 
 RESULT_TIMEOUT_S = 900
 FEEDBACK_EVERY_S = 0.2
-LOOK_EVERY_S = 0.5
 
 
 class ScanNode(ManagedNode):
@@ -83,17 +80,15 @@ class ScanNode(ManagedNode):
         super().__init__("scan_node", PARAMETERS)
 
     def configure(self) -> None:
-        """Listen to everything that a run records."""
+        """Offer the action; nothing is heard before a scan begins."""
         contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
-        self._recorder = ScanRecorder(self)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
-        self._hands = NodeHands(self, self._recorder, table_in_base, base_frame, robot, self._time)
+        self._hands = NodeHands(
+            self, table_in_base, base_frame, robot, self._time, self._tell_waiting
+        )
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
-        self._waited_for = ""
-        self.every(LOOK_EVERY_S, self._tell_waiting)
-        self._busy = threading.Lock()
         self._progress: Progress | None = None
         for name, ask in {
             "scan/pause": lambda c: c.paused.set(),
@@ -143,7 +138,16 @@ class ScanNode(ManagedNode):
         return CancelResponse.ACCEPT
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
-        result = await in_thread(self, lambda: self._scan(goal), "scan")
+        if self._goal is not None:
+            goal.abort()
+            message = "a scan is running, cancel it or wait for its result"
+            return Scan.Result(outcome=Scan.Result.REFUSED, message=message)
+        self._goal = goal
+        try:
+            with self._hands.listening():
+                result = await in_thread(self, lambda: self._scan(goal), "scan")
+        finally:
+            self._goal = None
         if result.outcome == Scan.Result.COMPLETE:
             goal.succeed()
         elif goal.is_cancel_requested:
@@ -154,13 +158,10 @@ class ScanNode(ManagedNode):
 
     def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
         result = Scan.Result(outcome=Scan.Result.REFUSED)
-        if not self._busy.acquire(blocking=False):
-            result.message = "a scan is running, cancel it or wait for its result"
-            return result
         self._controls, tell = Controls(), self._tell_of(goal)
-        self._goal = goal
         self._time.begin()
         try:
+            self._hands.meet()
             scene, plan, run, seed = self._prepare(goal.request, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
             result.outcome = Scan.Result.ENDED
@@ -173,8 +174,7 @@ class ScanNode(ManagedNode):
             self.health.error(result.message)
         finally:
             self._time.end()
-            self._controls = self._progress = self._goal = None
-            self._busy.release()
+            self._controls = self._progress = None
         return result
 
     def _prepare(
@@ -260,15 +260,10 @@ class ScanNode(ManagedNode):
         notes = scene.notes.as_json()
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
-    def _tell_waiting(self) -> None:
+    def _tell_waiting(self, waited_for: str) -> None:
         """Say who keeps a scan waiting, once, to all who follow it."""
         goal, progress = self._goal, self._progress
-        waited_for = self._hands.waiting_for if goal is not None else ""
-        who = waited_for.partition(",")[0]
-        if who == self._waited_for:
-            return
-        self._waited_for = who
-        if who and goal is not None and progress is not None:
+        if waited_for and goal is not None and progress is not None:
             self.get_logger().warning(f"the scan waits for {waited_for}")
             goal.publish_feedback(_feedback(progress, waited_for))
 

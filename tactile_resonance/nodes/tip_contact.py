@@ -60,15 +60,19 @@ class TipContact:
         self, node: ManagedNode, scan_time: ScanTime, end_if_hung: Callable[[], None]
     ) -> None:
         self._time, self._end_if_hung = scan_time, end_if_hung
-        self.touching = True  # a scan that was killed may have left it there
-        self._state: msg.ContactState | None = None
-        # the newest only: the recorder's may have to wait behind what else is recorded
-        node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
+        self._node = node
         client = GoalClient(node, MakeContact, "make_contact")
         self._goals = Goals(client, "make_contact")
         node.resources.callback(client.destroy)
         self._retract = node.create_client(Trigger, "retract")
         node.resources.callback(node.destroy_client, self._retract)
+
+    def listen(self) -> None:
+        """Hear of contacts, for one scan; where the tip is now nobody knows."""
+        self.touching = True  # a scan that was killed may have left it there
+        self._state: msg.ContactState | None = None
+        # the newest only: the recorder's may have to wait behind what else is recorded
+        self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
 
     def hold(self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll) -> None:
         """Press there until the force is held."""
