@@ -56,11 +56,13 @@ class Client:
 
     def __init__(self, commands: socket.socket, exchange: Exchange) -> None:
         self._commands, self._exchange = commands, exchange
+        self._told = select.poll()
+        self._told.register(commands, select.POLLIN)
         self._opened: Session | None = None  # kept where it failed: see `Session.open`
         self._session: Session | None = None
         self._clock: SimulatedClock | None = None
         self._led = False  # the owner says how far simulated time may go
-        self._fed_ns = 0  # when the watchdog was fed, in simulated time or this machine's
+        self._fed_ns = 0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
         self._until_ns = 0  # up to when simulated time may go on
         # number and deceleration of a stop that the robot has not taken yet
         self._owed: tuple[int, float] | None = None
@@ -83,24 +85,26 @@ class Client:
 
     def _wait(self) -> list[bytes]:
         """Wait a while for messages of the owner; without velocities that a later command has overtaken."""
-        session, channels = self._session, [self._commands]
-        pause_s = None if session is None else 1.0 / (3 * session.config.watchdog_hz)
-        if self._clock is not None and session is not None:
-            pause_s = None  # by the bench's time
-            if not self._led:
-                channels.append(self._clock)  # type: ignore[arg-type]
-        select.select(channels, [], [], pause_s)
+        pause_ms = None
+        if self._session is not None:
+            if self._clock is None:
+                pause_ms = 1e3 / (3 * self._session.config.watchdog_hz)
+            elif not self._led:  # by the bench's time
+                select.select([self._commands, self._clock], [], [])
+                pause_ms = 0
         messages: list[bytes] = []
-        while True:
+        ready = self._told.poll(pause_ms)
+        while ready:
             try:
-                data = self._commands.recv(LONGEST_MESSAGE, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                break
+                data = self._commands.recv(LONGEST_MESSAGE)
             except OSError:
                 data = b""
             if not data:
                 raise OwnerGoneError
             messages.append(data)
+            ready = self._told.poll(0)
+        if len(messages) < 2:
+            return messages
         return [
             message
             for message, later in zip_longest(messages, messages[1:], fillvalue=b"")
@@ -119,6 +123,8 @@ class Client:
             done = self._do(lambda: session.motion.speed(command.twist, command.acceleration))
             if done:
                 self._owed = None
+                if self._clock is None:
+                    self._fed_ns = time.monotonic_ns()
             self._exchange.report(command.number, done)
         if command.until_ns and self._clock is not None:
             # the owner speaks when the time that he said last has come

@@ -53,8 +53,8 @@ class Command(NamedTuple):
     @classmethod
     def unpack(cls, data: bytes) -> Command:
         """From what was sent."""
-        kind, number, until_ns, demand, *values = _COMMAND.unpack(data)
-        return cls(kind, number, until_ns, demand, tuple(values[:6]), values[6])
+        values = _COMMAND.unpack(data)
+        return cls(*values[:4], values[4:10], values[10])
 
 
 class Seen(IntFlag):

@@ -244,6 +244,23 @@ class BenchTime:
 
     def run(self) -> None:
         """Step, serve and keep the pace until stopped; the ports stay open."""
+        if self.simulated:
+            self._run_simulated()
+        else:
+            self._run_on_the_wall_clock()
+
+    def _run_on_the_wall_clock(self) -> None:
+        due_ns = time.perf_counter_ns()
+        while not self._stopping:
+            wait_ns = due_ns - time.perf_counter_ns()
+            if wait_ns > 0:
+                self._reactor.serve(wait_ns * 1e-9, patient=False)
+                continue
+            self._reactor.serve(0.0)
+            due_ns = self._next_due(due_ns, time.perf_counter_ns())
+            self._step()
+
+    def _run_simulated(self) -> None:
         due_ns = time.perf_counter_ns()
         repeat_ns = due_ns
         while not self._stopping:

@@ -112,12 +112,10 @@ class Indenter:
             if dt_s != self._interval:
                 self._set_interval(dt_s)
             decay, gain, a = self._decay, self._gain, self.contact_radius_m
-            before = zip(decay, gain, self._sum, self._common, self._edge, strict=True)
-            self._sum, self._common, self._edge = [], [], []
-            for d, g, total, common, edge in before:
-                self._sum.append(d * total + g * moved * a)
-                self._common.append(d * common + g * moved)
-                self._edge.append(d * edge + g * moved)
+            rise = [g * moved for g in gain]
+            self._sum = [d * v + r * a for d, v, r in zip(decay, self._sum, rise, strict=True)]
+            self._common = [d * v + r for d, v, r in zip(decay, self._common, rise, strict=True)]
+            self._edge = [d * v + r for d, v, r in zip(decay, self._edge, rise, strict=True)]
             excess = self._load(a, self._edge)
             if excess < 0:
                 self._recede(excess)
@@ -157,6 +155,8 @@ class Indenter:
 
     def _touch(self, moved: float, dt_s: float) -> bool:
         """Begin a contact if the tip has met the surface, which may still be dented."""
+        if self.depth_m <= 0 and self._pull == 0:  # nothing stands out that was never pulled
+            return False
         surface, start = 0.0, [0.0] * len(self._times)
         if self._outside:
             surface, start = self._free.at(self._outside[-1], self._time)

@@ -15,25 +15,26 @@ ROWS = 64
 
 
 class NormalRows:
-    """Rows of independent standard normal numbers, without end.
+    """Rows of independent normal numbers, without end.
 
     They are drawn in blocks: a generator that is handed in is ahead of what has been taken.
 
     Parameters
     ----------
     seed : Seed
-    width : int
-        Numbers in a row.
+    rms : sequence of float
+        Standard deviation of each number of a row.
     """
 
-    def __init__(self, seed: Seed, width: int) -> None:
+    def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
         self._random = np.random.default_rng(seed)
-        self._width = width
+        self._rms = np.array(rms)  # (width,)
         self._left: list[list[float]] = []  # the next row last
 
     def take(self) -> list[float]:
         """Return the next row."""
         if not self._left:
-            self._left = self._random.standard_normal((ROWS, self._width)).tolist()
+            numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
+            self._left = numbers.tolist()
             self._left.reverse()
         return self._left.pop()

@@ -52,6 +52,8 @@ class SprungIndenter:
         require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
         self.indenter = indenter
         self._stiffness, self._mass, self._damping = k, m, c
+        self._swing_of = 0.0, 0.0  # stiffness and sub-step of the swing that was computed last
+        self._swing = 0.0, 0.0
         self.reset()
 
     @classmethod
@@ -94,8 +96,10 @@ class SprungIndenter:
             offset = k * (self._base + n * h * rate) + c * (rate - drift) - held + tangent * depth
             offset /= whole
             y, dy = depth - offset, speed - drift
-            omega = sqrt(whole / m - half * half)
-            turn, lift = cos(omega * h), sin(omega * h) / omega
+            if (whole, h) != self._swing_of:
+                omega = sqrt(whole / m - half * half)
+                self._swing_of, self._swing = (whole, h), (cos(omega * h), sin(omega * h) / omega)
+            turn, lift = self._swing
             depth = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
             speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
             ball.step(depth, h)

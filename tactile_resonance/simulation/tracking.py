@@ -112,7 +112,7 @@ class Jitter:
         """Vibrate from the next step on as a seed says, from a state drawn anew."""
         random = np.random.default_rng(seed)
         self._place, self._speed = (self._rms[:, None] * random.standard_normal((2, 3))).tolist()
-        self._rows = NormalRows(random, 6)
+        self._rows = NormalRows(random, [1.0] * 6)
 
     def step(self) -> tuple[float, float, float]:
         """Advance one period; return the displacement [m]."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from operator import add, mul
+from operator import add
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
@@ -142,8 +142,10 @@ class Transducer:
         p = parameters
         self._noise_rms = [p.force_noise_rms_n] * 3 + [p.torque_noise_rms_nm] * 3
         self._range = [p.force_range_n] * 3 + [p.torque_range_nm] * 3
+        self._least_range = min(self._range)
         self._divisor = [p.force_divisor] * 3 + [p.torque_divisor] * 3
         self._drift = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
+        self._drifts = any(self._drift)
         self._offset = [*p.force_bias_n, *p.torque_bias_nm]
         self._zero = [0.0] * 6  # what the bias command subtracts
         # of the newest reading, filtered
@@ -167,7 +169,7 @@ class Transducer:
 
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""
-        self._rows = NormalRows(seed, 6)
+        self._rows = NormalRows(seed, self._noise_rms)
         self._noise_begins = True
 
     def set_zero(self, on: bool) -> None:
@@ -182,12 +184,13 @@ class Transducer:
         Bit 5 belongs to Fx, bit 0 to Tz.
         """
         faults = self.faults
-        self._offset = list(map(add, self._offset, self._drift))
+        if self._drifts:
+            self._offset = list(map(add, self._offset, self._drift))
         signal = list(map(add, wrench, self._offset))
         if faults.flipped:  # the bias turns with the sign too
             signal = [-value for value in signal]
         signal[2] += faults.bias_step_n
-        noise = list(map(mul, self._noise_rms, self._rows.take()))
+        noise = self._rows.take()
         if self._keep:
             signal, noise = self._through_filter(signal, noise)
         self._signal, self._noise, self._noise_begins = signal, noise, False
@@ -196,7 +199,7 @@ class Transducer:
             counts = [(value + n - zero) * divisor for value, n, zero, divisor in parts]
             if max(counts) > LARGEST_COUNT or min(counts) < -LARGEST_COUNT:
                 counts = [max(-LARGEST_COUNT, min(LARGEST_COUNT, count)) for count in counts]
-            self._counts = [round(count) for count in counts]
+            self._counts = list(map(round, counts))
         result = list(self._counts)
         if faults.saturated:
             result[2] = LARGEST_COUNT
@@ -208,18 +211,21 @@ class Transducer:
         self, signal: list[float], noise: list[float]
     ) -> tuple[list[float], list[float]]:
         """Return signal and noise behind the low-pass; noise begins anywhere in its stationary state."""
-        keep = self._keep
+        keep, take = self._keep, 1 - self._keep
         if self._noise_begins:
             noise = [math.sqrt((1 - keep) / (1 + keep)) * n for n in noise]
         else:
-            noise = [keep * old + (1 - keep) * n for old, n in zip(self._noise, noise, strict=True)]
+            noise = [keep * old + take * n for old, n in zip(self._noise, noise, strict=True)]
         if self._signal is not None:
             pairs = zip(self._signal, signal, strict=True)
-            signal = [keep * old + (1 - keep) * value for old, value in pairs]
+            signal = [keep * old + take * value for old, value in pairs]
         return signal, noise
 
     def _overload_bits(self, wrench: Sequence[float]) -> int:
-        bits = 0
+        bits, least = 0, self._least_range
+        if max(wrench) <= least and -min(wrench) <= least:
+            self._overloaded = 0
+            return 0
         for load, most in zip(wrench, self._range, strict=True):
             bits = bits << 1 | (abs(load) > most)
         begun = bits & ~self._overloaded

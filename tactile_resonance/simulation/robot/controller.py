@@ -178,9 +178,9 @@ class UrController:
         KeyError
             Where an input is not known; nothing is written then.
         """
-        for name in values:
-            if name not in INPUT_TYPES:
-                raise KeyError(f"RTDE input {name!r}: not known")
+        if not INPUT_TYPES.keys() >= values.keys():
+            unknown = next(name for name in values if name not in INPUT_TYPES)
+            raise KeyError(f"RTDE input {unknown!r}: not known")
         write_registers(self.registers, values)
         self.ports.write(values)
         if "external_force_torque" in values:

@@ -105,7 +105,7 @@ class FtSensor:
     def reseed(self, random: np.random.Generator) -> None:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
         self._drift: list[float] = (self._drift_rms * random.standard_normal(6)).tolist()
-        self._rows = NormalRows(random, 12)
+        self._rows = NormalRows(random, [*self._kick, *self._noise])
 
     def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
         """Measure for one cycle; all wrenches at and in the flange.
@@ -120,10 +120,9 @@ class FtSensor:
             Measured by another sensor, to be used in place of this one's reading.
         """
         noise, keep = self._rows.take(), self._keep
-        kicks = zip(self._drift, self._kick, noise[:6], strict=True)
-        self._drift = [keep * drift + kick * n for drift, kick, n in kicks]
-        parts = zip(true, self._offset, self._drift, self._noise, noise[6:], strict=True)
-        self.raw = tuple([t + offset + drift + rms * n for t, offset, drift, rms, n in parts])
+        self._drift = [keep * drift + kick for drift, kick in zip(self._drift, noise[:6], strict=True)]
+        parts = zip(true, self._offset, self._drift, noise[6:], strict=True)
+        self.raw = tuple([t + offset + drift + n for t, offset, drift, n in parts])
         self._free = difference(self.raw if external is None else external, payload_weight)
 
     def zero(self) -> None:

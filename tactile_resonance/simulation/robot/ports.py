@@ -7,6 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from tactile_resonance.simulation.robot.registers import REGISTER_COUNT, Registers
 
+# Place of each general purpose register among those of its kind.
+_INT_REGISTERS = {f"input_int_register_{n}": n for n in range(REGISTER_COUNT)}
+_DOUBLE_REGISTERS = {f"input_double_register_{n}": n for n in range(REGISTER_COUNT)}
+_REGISTERS = _INT_REGISTERS.keys() | _DOUBLE_REGISTERS.keys()
+
 # Types of all inputs, as the RTDE guide names them.
 INPUT_TYPES: dict[str, str] = {
     "speed_slider_mask": "UINT32",
@@ -22,8 +27,8 @@ INPUT_TYPES: dict[str, str] = {
     "standard_analog_output_0": "DOUBLE",
     "standard_analog_output_1": "DOUBLE",
     "external_force_torque": "VECTOR6D",
-    **{f"input_int_register_{n}": "INT32" for n in range(REGISTER_COUNT)},
-    **{f"input_double_register_{n}": "DOUBLE" for n in range(REGISTER_COUNT)},
+    **dict.fromkeys(_INT_REGISTERS, "INT32"),
+    **dict.fromkeys(_DOUBLE_REGISTERS, "DOUBLE"),
 }
 
 # Groups of digital outputs and their first bit in the word of all.
@@ -53,6 +58,8 @@ class Ports:
 
     def write(self, values: Mapping[str, InputValue]) -> None:
         """Take the inputs of one package; only what its masks select is written."""
+        if _REGISTERS.issuperset(values):
+            return
 
         def number(name: str) -> float:
             value = values.get(name, 0)
@@ -73,11 +80,10 @@ class Ports:
 def write_registers(registers: Registers, values: Mapping[str, InputValue]) -> None:
     """Write general purpose registers by their RTDE names, and note them as refreshed."""
     for name, value in values.items():
-        kind, _, place = name.rpartition("_")
-        if kind == "input_int_register":
-            registers.input_int[int(place)] = int(value)  # type: ignore[arg-type]
-        elif kind == "input_double_register":
-            registers.input_double[int(place)] = float(value)  # type: ignore[arg-type]
+        if name in _DOUBLE_REGISTERS:
+            registers.input_double[_DOUBLE_REGISTERS[name]] = float(value)  # type: ignore[arg-type]
+        elif name in _INT_REGISTERS:
+            registers.input_int[_INT_REGISTERS[name]] = int(value)  # type: ignore[arg-type]
         else:
             continue
         registers.refreshed.add(name)

@@ -50,13 +50,24 @@ class Connection:
         self._unsent = bytearray()
         self._most_unsent = listener.most_unsent
         self.freezable = listener.freezable
-        self.frozen = False
+        self.frozen = self._patient = False
         self.is_open = True
         self.service: Service | None = None
 
     def fileno(self) -> int:
         """Return the descriptor, for select."""
         return self._socket.fileno()
+
+    @property
+    def patient(self) -> bool:
+        """What it sends counts from the next step on: on the wall clock it is read then, and wakes nobody."""
+        return self._patient
+
+    @patient.setter
+    def patient(self, value: bool) -> None:
+        if value != self._patient:
+            self._patient = value
+            self._reactor.renew()
 
     def send(self, data: bytes, droppable: bool = False) -> bool:
         """Send, or keep what the network does not take at once.
@@ -171,6 +182,7 @@ class Reactor:
         # what is called where a descriptor can be read, and the descriptors as select takes them
         self._readers: dict[int, Callable[[], None]] = {}
         self._descriptors: list[int] = []
+        self._impatient: list[int] = []
 
     def listen(
         self,
@@ -205,15 +217,20 @@ class Reactor:
         channel.setblocking(False)
         listener = _Listener(channel, serve, freezable, most_unsent)
         self._listeners.append(listener)
-        self._renew()
+        self.renew()
         return listener.port
 
-    def serve(self, wait_s: float) -> None:
-        """Wait for at most so long until somebody has sent something, and serve all who have."""
-        for connection in list(self.unsent):
-            connection.flush()
+    def serve(self, wait_s: float, *, patient: bool = True) -> None:
+        """Wait for at most so long until somebody has sent something, and serve all who have.
+
+        `patient` false: without the connections that are patient.
+        """
+        if self.unsent:
+            for connection in list(self.unsent):
+                connection.flush()
         readers = self._readers
-        for descriptor in select.select(self._descriptors, [], [], wait_s)[0]:
+        heard = self._descriptors if patient else self._impatient
+        for descriptor in select.select(heard, [], [], wait_s)[0]:
             # one served before may have closed another
             if descriptor in readers:
                 readers[descriptor]()
@@ -225,13 +242,13 @@ class Reactor:
             connection.frozen = frozen and connection.freezable
             if connection.holds_data:
                 self.unsent.add(connection)
-        self._renew()
+        self.renew()
 
     def forget(self, connection: Connection) -> None:
         """Stop serving a connection that is about to close."""
         self._connections.discard(connection)
         self.unsent.discard(connection)
-        self._renew()
+        self.renew()
 
     def close(self) -> None:
         """Close all connections and ports."""
@@ -240,7 +257,7 @@ class Reactor:
         for listener in self._listeners:
             listener.channel.close()
         self._listeners.clear()
-        self._renew()
+        self.renew()
 
     def _accept(self, listener: _Listener) -> None:
         try:
@@ -256,16 +273,20 @@ class Reactor:
             return
         self._connections.add(connection)
         connection.service = listener.serve(connection)
-        self._renew()
+        self.renew()
 
-    def _renew(self) -> None:
+    def renew(self) -> None:
         """Find anew who is listened to."""
         self._readers = {
             listener.channel.fileno(): lambda listener=listener: self._accept(listener)  # type: ignore[misc]
             for listener in self._listeners
             if not (self.frozen and listener.freezable)
         }
+        patient = set()
         for connection in self._connections:
             if not connection.frozen:
                 self._readers[connection.fileno()] = connection.read
+                if connection.patient:
+                    patient.add(connection.fileno())
         self._descriptors = list(self._readers)
+        self._impatient = [each for each in self._descriptors if each not in patient]

@@ -110,6 +110,8 @@ class Layout:
         if len(payload) != self._struct.size:
             return None
         flat = self._struct.unpack(payload)[1:]
+        if len(flat) == len(self._lengths):  # no vectors
+            return list(flat)
         values: list = []
         start = 0
         for length in self._lengths:

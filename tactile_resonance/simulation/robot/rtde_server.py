@@ -190,11 +190,11 @@ class _Service:
         return bytes([recipe]) + ",".join(types).encode()
 
     def _start(self, _: bytes) -> bytes:
-        self._started = self._outputs is not None
+        self._started = self.connection.patient = self._outputs is not None
         return bytes([self._started])
 
     def _pause(self, _: bytes) -> bytes:
-        self._started = False
+        self._started = self.connection.patient = False
         return b"\x01"
 
     def _take(self, payload: bytes) -> None:
