@@ -7,7 +7,6 @@ import gc
 from collections.abc import Sequence
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -123,15 +122,7 @@ class ContactNode(ManagedNode):
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self.every(POLL_S, self._poll)
-        server = ActionServer(
-            self,
-            MakeContact,
-            "make_contact",
-            self._on_goal,
-            goal_callback=self._on_request,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )
-        self.resources.callback(server.destroy)
+        self.act(MakeContact, "make_contact", self._on_goal, ready=self._ready)
 
     def activate(self) -> None:
         """Start the loop."""
@@ -199,10 +190,9 @@ class ContactNode(ManagedNode):
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
         return parameters, limits
 
-    def _on_request(self, _: MakeContact.Goal) -> GoalResponse:
+    def _ready(self) -> bool:
         """Goals are taken one at a time, and only while both devices are well."""
-        ready = self.active and self._goal is None and self._fault is None
-        return GoalResponse.ACCEPT if ready else GoalResponse.REJECT
+        return self._goal is None and self._fault is None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = MakeContact.Result(cause="refused")

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
@@ -133,15 +132,7 @@ class IdealContact:
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
         node.serve(Trigger, "retract", self._on_retract)
         node.every(PUBLISH_S, self._publish)
-        server = ActionServer(
-            node,
-            MakeContact,
-            "make_contact",
-            self._on_goal,
-            goal_callback=lambda _: GoalResponse.ACCEPT if node.active else GoalResponse.REJECT,
-            cancel_callback=self._on_cancel,
-        )
-        node.resources.callback(server.destroy)
+        node.act(MakeContact, "make_contact", self._on_goal, lambda _: self._draw_back())
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
@@ -224,10 +215,6 @@ class IdealContact:
         except ClockLostError:
             return False
         return not self._drawn_back.is_set()
-
-    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
-        self._draw_back()
-        return CancelResponse.ACCEPT
 
     def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._draw_back()

@@ -6,12 +6,14 @@ from __future__ import annotations
 import os
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -31,6 +33,9 @@ REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterExc
 
 BEAT_S = 0.2
 """Between two signs of life, by this machine's clock."""
+
+KEEP_RESULT_S = 900
+"""So long the result of a goal that has ended can be asked for."""
 
 TIME_SERVER = Parameter(
     "time_server",
@@ -53,8 +58,8 @@ HUNG_AFTER = Parameter(
 class ManagedNode(LifecycleNode):
     """A lifecycle node whose subclasses say only what they set up and what they do.
 
-    `configure` makes publishers, subscriptions, services and devices through `publish_on`, `listen`,
-    `serve` and `resources`; the way back undoes them in reverse order. What arrives while the node is
+    `configure` makes publishers, subscriptions, services, actions and devices through `publish_on`, `listen`,
+    `serve`, `act` and `resources`; the way back undoes them in reverse order. What arrives while the node is
     not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells that it works.
 
     Parameters
@@ -136,6 +141,38 @@ class ManagedNode(LifecycleNode):
         group = ReentrantCallbackGroup()
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
+
+    def act(
+        self,
+        kind: type,
+        name: str,
+        callback: Callable[[ServerGoalHandle], Awaitable[Any]],
+        on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
+        ready: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """Action until the node is cleaned up.
+
+        Goals are accepted while the node is active and `ready`. A request to cancel is always accepted; the
+        callback ends the goal.
+        """
+
+        def on_request(_: Any) -> GoalResponse:
+            return GoalResponse.ACCEPT if self.active and ready() else GoalResponse.REJECT
+
+        def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:
+            on_cancel(goal)
+            return CancelResponse.ACCEPT
+
+        server = ActionServer(
+            self,
+            kind,
+            name,
+            callback,
+            goal_callback=on_request,
+            cancel_callback=on_cancel_request,
+            result_timeout=KEEP_RESULT_S,
+        )
+        self.resources.callback(server.destroy)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Timer until the node is cleaned up; called while it is active, by this machine's clock."""

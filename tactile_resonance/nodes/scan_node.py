@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
@@ -71,7 +70,6 @@ PARAMETERS = (
     HUNG_AFTER,
 )
 
-RESULT_TIMEOUT_S = 900
 FEEDBACK_EVERY_S = 0.2
 LOOK_EVERY_S = 0.5
 
@@ -102,21 +100,11 @@ class ScanNode(ManagedNode):
             "scan/repeat_point": lambda c: c.ask(Request.REPEAT),
         }.items():
             self.serve(Trigger, name, self._control(ask))
-        server = ActionServer(
-            self,
-            Scan,
-            "scan",
-            self._on_goal,
-            goal_callback=lambda _: GoalResponse.ACCEPT if self.active else GoalResponse.REJECT,
-            cancel_callback=self._on_cancel,
-            result_timeout=RESULT_TIMEOUT_S,
-        )
-        self.resources.callback(server.destroy)
+        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel())
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
-        if self._controls is not None:
-            self._controls.ask(Request.CANCEL)
+        self._cancel()
 
     def details(self) -> dict[str, str]:
         """The scan under way."""
@@ -137,10 +125,9 @@ class ScanNode(ManagedNode):
 
         return serve
 
-    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
+    def _cancel(self) -> None:
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
-        return CancelResponse.ACCEPT
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
         result = await in_thread(self, lambda: self._scan(goal), "scan")
