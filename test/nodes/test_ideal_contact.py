@@ -18,6 +18,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from spinning import spin_until
 from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
 from tactile_resonance.msg import ContactState
@@ -117,10 +118,7 @@ def bench(**parameters):
         force = node.create_client(ForceOver, "force_over")
 
         def wait(holds):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not holds() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            assert holds()
+            assert spin_until(executor, holds)
 
         def answer(future):
             wait(future.done)

@@ -2,7 +2,7 @@
 """Whether nodes are at work: judged on a clock that is told, and through the real graph."""
 
 import os
-import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +12,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from spinning import spin_until
 from std_msgs.msg import String
 
 from tactile_resonance.nodes import node_watch
@@ -21,7 +22,6 @@ from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.hands import NodeAway
 
-WITHIN_S = 60.0
 SOURCE = "/poles_node"
 
 
@@ -176,13 +176,7 @@ def nodes(monkeypatch):
         listener.trigger_activate()
         executor.add_node(listener)
 
-        def wait(holds):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not holds() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            return holds()
-
-        yield listener.nodes, executor, wait, told
+        yield listener.nodes, executor, partial(spin_until, executor), told
         for node in executor.get_nodes():
             node.destroy_node()
 
