@@ -97,7 +97,7 @@ class ClockTracker:
         Raises
         ------
         ValueError
-            If the stamp is no number.
+            If the stamp is not finite.
         """
         if not math.isfinite(remote_s):
             raise ValueError(f"remote_s: {remote_s!r}, expected a finite time")

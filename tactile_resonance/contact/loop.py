@@ -176,5 +176,5 @@ class ContactLoop:
 
 
 def _rests(arm: ArmSample | None) -> bool:
-    """Whether an arm is seen to stand still; what is no number is not."""
+    """Whether an arm is seen to stand still; False where a speed is not finite."""
     return arm is not None and math.hypot(*arm.velocity[:3]) < STILL_M_S

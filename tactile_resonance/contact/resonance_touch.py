@@ -91,7 +91,7 @@ class ScatterTouch:
         return np.asarray(self._scale * np.sum(off**2, axis=-1))
 
     def touched(self, observation: ArrayLike) -> bool:
-        """Whether one observation (d,) is not one of air; what is no number tells nothing."""
+        """Whether one observation (d,) is not one of air; False where it is not finite."""
         return bool(self.statistic(observation) > self.threshold)
 
 

@@ -24,7 +24,7 @@ from tactile_resonance.drivers.ur_time import ArmTime
 ANSWER_S = 1.0
 # Without a new state for this long the link is given up; the library would do so after 2.5 s.
 GIVE_UP_S = 1.2
-# The first state comes within this, and so does a program of which the library says that it runs.
+# The first state must come within this, and so must the program, once the library reports that it runs.
 BEGIN_S = 2.0
 
 
@@ -59,21 +59,21 @@ class UrArm:
         self._refused = 0
         self._reading = threading.Lock()
 
-    # what is known of it
+    # properties
 
     @property
     def clock(self) -> Clock:
-        """On which its states are dated."""
+        """Clock on which its states are dated."""
         return self._time.clock
 
     @property
     def frames(self) -> int:
-        """In simulated time that is led: frames of the bus sent until now."""
+        """Frames that the bus of the cell has sent, while a loop leads simulated time; else 0."""
         return 0 if self._time.led is None else self._time.led.frames
 
     @property
     def waits_for(self) -> str:
-        """In simulated time that is led: what has not answered for a second, for people; empty: nothing."""
+        """What has not answered for a second while a loop leads simulated time, for people; empty: nothing."""
         client = self._client
         return "" if client is None else self._time.waits_for(client, self._heard_s)
 
@@ -93,7 +93,7 @@ class UrArm:
 
     @property
     def client_pid(self) -> int | None:
-        """Of the client's process; None while there is none."""
+        """Id of the client's process; None while none runs."""
         return None if self._client is None else self._client.pid
 
     # the contract
@@ -119,7 +119,7 @@ class UrArm:
         if self._time.led is not None:
             self._ask({"name": "lead"}, client)
             self._dated = False  # time has gone on, and the loop has not received it
-        self._client = client  # not before: a loop in another thread would speak to it
+        self._client = client  # not before: a loop in another thread would send commands to it
         self._guard()
 
     def state(self) -> ArmSample:
@@ -166,7 +166,7 @@ class UrArm:
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop; works at any time and raises only where the link is dead, or for a wrong figure.
 
-        Where states are stale the client still takes it, and tells the robot as soon as it may.
+        Where states are stale the client still takes it, and sends it to the robot as soon as it may.
         """
         self._check_acceleration(deceleration_m_s2)
         try:
@@ -187,12 +187,12 @@ class UrArm:
     # simulated time, led by a loop
 
     def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:
-        """Let simulated time go on as `wait_until` says; on the wall clock nothing is to be led.
+        """Let simulated time go on only as far as `wait_until` asks for; does nothing on the wall clock.
 
         Parameters
         ----------
         bus_port : callable
-            Local port of the connection to the bus of a load cell, of which `frames` tells; 0: none.
+            Local port of the connection to the bus of a load cell, whose frames `frames` counts; 0: none.
         """
         if self._time.address:
             self._time.lead(bus_port)
@@ -201,7 +201,7 @@ class UrArm:
             self._dated = False
 
     def follow(self) -> None:
-        """Leave the time to itself."""
+        """Lead no more: time goes on without this arm."""
         if self._time.led is None:
             return
         pending, self._pending = self._pending, None
@@ -216,7 +216,7 @@ class UrArm:
     ) -> None:
         """Let simulated time go on up to a time and wait for that, and for the robot's state at it.
 
-        What was commanded before is with the robot by then.
+        What was commanded before has reached the robot by then.
         """
         led, client = self._time.led, self._client
         assert led is not None
@@ -251,20 +251,20 @@ class UrArm:
         return self._time.led.ask_ns()
 
     def hurry(self) -> None:
-        """Let a wait that needs no time end: something needs it now. From any thread."""
+        """Make a wait that does not demand time demand it: something needs it now. From any thread."""
         client = self._client
         if self._time.led is not None and client is not None:
             self._time.hurry(client)
 
-    # parts of these
+    # helpers
 
     def _connect_again(self) -> bool:
-        """Start the program again where the connection is good; False where all is to be made anew."""
+        """Start the program again over a good connection; False where everything must be connected anew."""
         assert self._client is not None
         try:
             self._fresh()
         except ArmError:
-            if self._client is not None:  # else it was given up just now
+            if self._client is not None:  # else `_fresh` has ended it
                 self._client.end()
             self._forget()
             return False
@@ -280,7 +280,7 @@ class UrArm:
         return True
 
     def _begin(self) -> None:
-        """Hear the robot, and that nothing forbids motion."""
+        """Receive the robot's states, and check that nothing forbids motion."""
         try:
             self._time.begin()
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
@@ -296,7 +296,7 @@ class UrArm:
             raise
 
     def _guard(self) -> None:
-        """See that the program runs; from now on no other counts as ours."""
+        """Wait until the program runs; from now on no other counts as ours."""
         assert self._states is not None
         self._wait_for(
             lambda states: states.newest.runtime_state == PROGRAM_PLAYING,
@@ -330,7 +330,7 @@ class UrArm:
         newest = self._states.newest
         assert newest is not None
         stop = stop_fault(newest.safety_bits, newest.robot_mode)
-        if stop is not None:  # not released yet; the connection is good
+        if stop is not None:  # not released yet
             raise ArmError(*stop)
 
     def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
@@ -361,12 +361,12 @@ class UrArm:
         else:
             self._client.send(command)
 
-    def _read(self, told: bool = False) -> None:
-        """Take the states that have come; `told`: whoever leads knows what time it is now."""
+    def _read(self, now_known: bool = False) -> None:
+        """Take the states that have come; `now_known`: the loop that leads has received the present time."""
         assert self._states is not None
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read(told or self._time.led is None):
+                if self._states.read(now_known or self._time.led is None):
                     self._heard_s = time.monotonic()
         except ConnectionError as error:
             if self._client is not None:
@@ -379,15 +379,15 @@ class UrArm:
         """Wait for the state that the bench has sent."""
         assert self._stream is not None
         assert self._states is not None
-        self._read(told=True)
+        self._read(now_known=True)
         while (newest := self._states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
             select.select([self._stream], [], [], 0.1)
-            self._read(told=True)
+            self._read(now_known=True)
 
     def _fresh(self) -> ArmSample:
-        """Return the newest state, and show the client that its owner lives."""
+        """Return the newest state, and give the client a sign of life."""
         if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
         self._client.look()
@@ -425,7 +425,7 @@ class UrArm:
                 continue
             self._refused = number
             if self._states.fault is not None:
-                return  # a stop is why; the state tells it
+                return  # because of a stop, which the state reports
             said = self._client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
         if self._time.led is None and sent:

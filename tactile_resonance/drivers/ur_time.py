@@ -16,15 +16,16 @@ from tactile_resonance.drivers.ur_exchange import NOTHING, Command
 
 # In simulated time, between two looks at an arm that is not connected.
 AWAY_S = 0.002
-# What does not answer for so long is named.
+# After so long without an answer `waits_for` names the process.
 SILENT_S = 1.0
 
 
 class ArmTime:
     """The clock of an arm, and in simulated time the arm's part in it.
 
-    Simulated time is asked for where nobody leads it. Where a loop leads it, it goes on as far as the loop
-    says with each command; the arm's client process, which receives the commands, passes that on to the bench.
+    Where no loop leads simulated time, the bench is asked for it. Where a loop leads it, it goes on up to the
+    time that the loop sends with each command; the arm's client process, which receives the commands, passes
+    that on to the bench.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ class ArmTime:
     Attributes
     ----------
     clock : Clock
-        On which the arm's states are dated.
+        Clock on which the arm's states are dated.
     led : SimulatedClock or None
         The same while a loop leads the time.
     """
@@ -51,7 +52,7 @@ class ArmTime:
 
     @property
     def client_name(self) -> str:
-        """By which the client process takes part."""
+        """Name of the client process among the participants."""
         return f"client of the arm, process {os.getpid()}"
 
     def begin(self) -> None:
@@ -105,13 +106,13 @@ class ArmTime:
             client.send(command._replace(until_ns=until_ns, demand=int(demand)))
 
     def hurry(self, client: ClientProcess) -> None:
-        """Let a wait that needs no time end: something needs it now. From any thread."""
+        """Make a wait that does not demand time demand it: something needs it now. From any thread."""
         with contextlib.suppress(ArmError), self._speaking:
-            self._hurried = True  # the loop may be about to say that it needs no time
+            self._hurried = True  # the loop may be about to send that it needs no time
             client.send(Command(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
 
     def look_again(self) -> None:
-        """Wait a moment of this machine's time, and ask for the bench's, which nobody holds."""
+        """Wait a moment of this machine's time, and ask for the bench's, which the arm does not hold."""
         assert self.led is not None
         time.sleep(AWAY_S)
         self.led.ask_ns()

@@ -37,8 +37,8 @@ PARAMETERS = (
     Parameter(
         "publish_rate_hz",
         50.0,
-        "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench "
-        "is the mean since the last one.",
+        "Rate of pose, wrench and state [Hz]; a change of the state is published at once. The wrench is the "
+        "mean since the last one.",
         1.0,
         500.0,
         read_only=True,
@@ -46,9 +46,9 @@ PARAMETERS = (
     Parameter(
         "touch_from_poles",
         False,
-        "First contact is told by poles too, against those in air: the rest of the approach is slow then. "
+        "First contact is detected by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
-        "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and whoever measures has to ask for "
+        "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and the client has to ask for "
         "measurements of one or two periods all the time.",
         read_only=True,
     ),
@@ -235,7 +235,7 @@ class ContactNode(ManagedNode):
             return response
         self._thread.retract()
         response.success = True
-        response.message = "asked; contact_state tells when it is idle"
+        response.message = "asked; contact_state reports when it is idle"
         return response
 
     def _goal_limits(self, request: MakeContact.Goal) -> Limits:
@@ -289,7 +289,7 @@ class ContactNode(ManagedNode):
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
             if self._touch.hear(message, thread.controller.state, now_ns):
-                self.get_logger().info("the resonance tells the first contact")
+                self.get_logger().info("the resonance detects the first contact")
         except ValueError as error:
             self.health.error(f"poles: {error}")
 

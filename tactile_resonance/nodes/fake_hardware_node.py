@@ -62,7 +62,7 @@ PARAMETERS = (
         "serve_contact",
         False,
         "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the "
-        "tip is wherever tcp_pose says.",
+        "tip is where tcp_pose states.",
         read_only=True,
     ),
     Parameter(
@@ -91,7 +91,7 @@ class FakeHardwareNode(ManagedNode):
 
     With a robot the tip is where the robot holds it, and the contact that of the plant as an excitation
     begins: its force held from then on, the tissue creeping. Without one contact is ideal, at the scene's
-    force or the one asked for: wherever `tcp_pose` says, or where the action `make_contact` puts the tip,
+    force or the one asked for: where `tcp_pose` states, or where the action `make_contact` puts the tip,
     which this node serves then; the force comes back on `wrench` and from the service `force_over`. What the
     simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it is put
     somewhere or an excitation begins; of a contact that creeps also with each block. In simulated time it
@@ -103,7 +103,7 @@ class FakeHardwareNode(ManagedNode):
         self._player = BenchPlayer(self.time_server)
 
     def configure(self) -> None:
-        """Read the scene, make the sensor and, where it is asked for, the robot."""
+        """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
         scene_path = path if path.is_absolute() else share_path(scene)
@@ -154,7 +154,7 @@ class FakeHardwareNode(ManagedNode):
             )
         else:
             self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-            # whoever puts the tip somewhere waits until it is heard; others may tell as they like
+            # a scan waits until the pose is received, which needs a reliable subscription; others publish
             self.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
             self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.serve(ForceOver, "force_over", self._stays.serve)

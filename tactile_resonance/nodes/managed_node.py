@@ -35,7 +35,7 @@ BEAT_S = 0.2
 """Between two signs of life, by this machine's clock."""
 
 KEEP_RESULT_S = 900
-"""So long the result of a goal that has ended can be asked for."""
+"""The result of a goal that has ended can be asked for so long [s]."""
 
 TIME_SERVER = Parameter(
     "time_server",
@@ -47,8 +47,8 @@ TIME_SERVER = Parameter(
 HUNG_AFTER = Parameter(
     "hung_after_s",
     60.0,
-    "In simulated time: what has not answered for so long hangs, by this machine's clock: a scan ends, and "
-    "can be resumed.",
+    "In simulated time: a node without an answer for so long, by this machine's clock, hangs [s]; the "
+    "scan ends, and can be resumed.",
     5.0,
     86400.0,
     read_only=True,
@@ -56,11 +56,11 @@ HUNG_AFTER = Parameter(
 
 
 class ManagedNode(LifecycleNode):
-    """A lifecycle node whose subclasses say only what they set up and what they do.
+    """A lifecycle node whose subclasses define only what they set up and what they do.
 
     `configure` makes publishers, subscriptions, services, actions and devices through `publish_on`, `listen`,
     `serve`, `act` and `resources`; the way back undoes them in reverse order. What arrives while the node is
-    not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells that it works.
+    not active is dropped, and nothing is published then. It gives signs of life on `heartbeat`.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class ManagedNode(LifecycleNode):
         self._beats = self.create_publisher(msg.Heartbeat, "heartbeat", BEATS)
         self.steady_timer(BEAT_S, self._beat)
 
-    # What a subclass says
+    # What a subclass defines
 
     def configure(self) -> None:
         """Set up; refuse with ValueError, OSError or DeviceError."""
@@ -92,14 +92,14 @@ class ManagedNode(LifecycleNode):
         """Begin to work."""
 
     def deactivate(self) -> None:
-        """Stop working at once; may be called when nothing is under way."""
+        """Stop working at once; may be called when it is not working."""
 
     def details(self) -> Mapping[str, str]:
         """Figures for the diagnostics beside rates and errors."""
         return {}
 
     def working(self) -> bool:
-        """Whether threads of its own move on; the executor's does where this is asked."""
+        """Whether threads of its own move on; the executor calls this, so that its own does."""
         return True
 
     def waiting_for(self) -> str:
@@ -189,12 +189,12 @@ class ManagedNode(LifecycleNode):
 
     @property
     def time_server(self) -> str:
-        """Address of the simulated time in which the node lives; empty: none."""
+        """Address of the simulated time in which the node lives; empty: it lives by the machine's clock."""
         return str(values(self, TIME_SERVER.name)[0])
 
     @property
     def hung_after_s(self) -> float:
-        """In simulated time, which stands meanwhile: so long an answer is waited for."""
+        """In simulated time: how long an answer is waited for, by the machine's clock [s]."""
         return float(values(self, HUNG_AFTER.name)[0])
 
     def fail(self, reason: str) -> None:
@@ -222,7 +222,7 @@ class ManagedNode(LifecycleNode):
         return self._state_machine.current_state[1]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Set up, or say why not and stay unconfigured."""
+        """Set up, or report why not and stay unconfigured."""
         try:
             self.configure()
         except REFUSALS as error:

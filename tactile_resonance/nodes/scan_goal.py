@@ -67,7 +67,7 @@ class ScanGoal(ScanClient):
         say = self._node.get_logger().info
         say(
             f"{result.message}: {result.done} of {result.points} points with poles, {result.failed} failed, "
-            f"{result.skipped} skipped, {result.repeats} times begun again; run in {result.run_directory}"
+            f"{result.skipped} skipped, {result.repeats} repeats; run in {result.run_directory}"
         )
         if result.sensor_health:
             say(result.sensor_health)

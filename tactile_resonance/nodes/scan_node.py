@@ -46,8 +46,8 @@ PARAMETERS = (
     Parameter(
         "contact",
         "robot",
-        "Who brings the tip to the tissue: contact_node, or nobody (the tip is taken to be where the plan "
-        "says, and its pose is published).",
+        "What brings the tip to the tissue: contact_node, or nothing (the tip is taken to be where the plan "
+        "states, and its pose is published).",
         choices=("robot", "none"),
         read_only=True,
     ),
@@ -248,7 +248,7 @@ class ScanNode(ManagedNode):
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
     def _tell_waiting(self) -> None:
-        """Say who keeps a scan waiting, once, to all who follow it."""
+        """Report a node that keeps a scan waiting, once, in the log and the feedback."""
         goal, progress = self._goal, self._progress
         waited_for = self._hands.waiting_for if goal is not None else ""
         who = waited_for.partition(",")[0]

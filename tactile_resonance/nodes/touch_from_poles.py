@@ -54,7 +54,7 @@ class TouchFromPoles:
         Raises
         ------
         ValueError
-            Where they are no numbers or their covariance is unknown.
+            If they are not finite or their covariance is unknown.
         """
         poles, origin = poles_from_message(message)
         if not len(poles.f0_hz):

@@ -59,7 +59,7 @@ class _SlcanClient(BusClient):
 
 
 def _frame(line: str) -> tuple[int, bytes] | None:
-    """Identifier and data of a line ``tiiildd..``; None where it is none."""
+    """Identifier and data of a line ``tiiildd..``; None for any other line."""
     found = _FRAME.fullmatch(line)
     if found is None:
         return None

@@ -70,7 +70,7 @@ class ContactClient(NodeClient):
         return "" if self.state is None else f"{self.state.state}: {self.state.message}"
 
     def idle(self, anew=False, timeout_s=HANGS_S):
-        """Wait until the node is active and nothing is under way; `anew`: its loop begun again."""
+        """Wait until the node is active and nothing is under way; `anew`: and its loop was started anew."""
         cycles = self.state.cycles if anew else None
         self.state = None
 

@@ -128,7 +128,7 @@ def test_one_publisher_at_work_is_enough_and_all_others_are_named(watch):
         f"poles: {SOURCE} is unconfigured, not active and /robot/other is inactive, not active"
     )
     watch.graph.publishers["/poles"] = []
-    assert watch.nodes.missing() == "poles: nobody publishes it"
+    assert watch.nodes.missing() == "poles: no node publishes it"
 
 
 def test_after_an_error_only_what_is_told_from_then_on_is_believed(watch):
@@ -194,7 +194,7 @@ def heard_anew(watch, wait):
 
 def test_signs_of_life_tell_how_a_node_is(nodes):
     watch, executor, wait, clock = nodes
-    assert watch.missing() == "poles: nobody publishes it"
+    assert watch.missing() == "poles: no node publishes it"
     source = Source()
     executor.add_node(source)
     source.trigger_configure()  # from here on the publisher is in the graph

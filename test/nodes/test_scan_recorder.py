@@ -76,7 +76,10 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
         with run.begin_point(0) as recording:
             recorder.record_into(recording, KEY)
             deadline_s = time.monotonic() + 20.0
-            while not bench._truth._publisher.get_subscription_count() and time.monotonic() < deadline_s:
+            while (
+                not bench._truth._publisher.get_subscription_count()
+                and time.monotonic() < deadline_s
+            ):
                 executor.spin_once(0.05)
             if not late:
                 tell(bench, TRUTHS)
