@@ -65,7 +65,7 @@ class CanDescription:
     fields : tuple of str
         Name of each value of the layout; `CHANNELS` are among them.
     constant : dict
-        Values by which a wrench is told from other answers.
+        Values that distinguish a wrench from other answers.
     overload : tuple of str and int, or None
         Field and mask of the overload bits.
     invalid_counts : tuple of int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks scan_node for one scan, tells how it goes and ends with it: for launch files."""
+"""Asks scan_node for one scan, reports its progress and ends with it: for launch files."""
 
 from __future__ import annotations
 

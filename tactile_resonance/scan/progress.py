@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan tells of itself, on the way and at its end."""
+"""Progress of a scan, and its summary at the end."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class SlcanServer(TcpBus):
 
 class _SlcanClient(BusClient):
     def understand(self, message: bytes) -> None:
-        """Do what one line says."""
+        """Execute one line."""
         line = message.decode("ascii", "replace")
         command = line[:1]
         if command in ("S", "s"):  # while it listens the speed stays as it is
