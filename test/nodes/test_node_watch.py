@@ -81,6 +81,14 @@ def test_a_node_that_hangs_is_noticed_within_the_limit_and_not_before(watch):
     assert watch.nodes.missing() is watch.nodes.changed(watch.instances) is None
 
 
+def test_a_node_that_hangs_until_its_lease_ends_is_still_named(watch):
+    assert watch.nodes.hung() == ""
+    watch.graph.publishers["/poles"] = []
+    assert watch.nodes.hung() == ""
+    watch.clock.now_s += SILENT_S + 0.01
+    assert watch.nodes.hung() == f"{SOURCE} is silent for 1.5 s"
+
+
 def test_a_node_that_was_deactivated_is_said_to_be_so_and_not_to_hang(watch):
     for _ in range(20):
         watch.clock.now_s += BEAT_S
