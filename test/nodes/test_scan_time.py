@@ -29,6 +29,16 @@ def device():
             yield clock
 
 
+def patience(seconds=10.0):
+    """To be called while waiting: fails where a wait does not end."""
+    end_s = time.monotonic() + seconds
+
+    def check():
+        assert time.monotonic() < end_s, "time does not go on"
+
+    return check
+
+
 def stands(scan):
     """Whether time stands while this machine's goes on."""
     before_s = scan.now_s()
@@ -47,7 +57,7 @@ def test_while_a_scan_conducts_each_go_lets_one_block_pass():
         for n in (1, 2, 3):
             scan.go()
             clock.hold(begun_ns + n * BLOCK_NS, Demand.FAST)
-            clock.wait_told()
+            clock.wait_told(patience())
             assert stands(scan)
             assert round(scan.now_s() * 1e9) == begun_ns + n * BLOCK_NS
         clock.free()
