@@ -55,10 +55,15 @@ class BenchPlayer:
         if self._time_server:
             self._clock = SimulatedClock(self._time_server, "bench")
         self._stop.clear()
-        arguments = run, excitation, start_ns, hand_out
-        self._thread = threading.Thread(
-            target=self._play, args=arguments, name="bench", daemon=True
-        )
+
+        def play() -> None:
+            for block in run.play(excitation, excitation.periods):
+                end_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
+                if not self._wait_until(end_ns):
+                    return
+                hand_out(block, end_ns)
+
+        self._thread = threading.Thread(target=play, name="bench", daemon=True)
         self._thread.start()
 
     def silence(self) -> None:
@@ -72,19 +77,6 @@ class BenchPlayer:
         if self._clock is not None:
             self._clock.close()
             self._clock = None
-
-    def _play(
-        self,
-        run: BenchRun,
-        excitation: Excitation,
-        start_ns: int,
-        hand_out: Callable[[Block, int], None],
-    ) -> None:
-        for block in run.play(excitation, excitation.periods):
-            end_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
-            if not self._wait_until(end_ns):
-                return
-            hand_out(block, end_ns)
 
     def _wait_until(self, time_ns: int) -> bool:
         """Wait for a ROS time [ns]; False where it was silenced meanwhile."""
