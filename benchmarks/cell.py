@@ -27,7 +27,7 @@ FAULTS = (
     ("silent 1", "silent"),
     ("stuck 1", "stuck"),
     ("lose_second_every 1", "second frame of every wrench lost"),
-    ("invalid 1", "count that is no number"),
+    ("invalid 1", "count of an invalid value"),
     ("saturated 1", "full scale"),
     ("flipped 1", "sign flipped (30 mN on the cell)"),
     ("bias_step_n 0.03", "bias step of 30 mN"),

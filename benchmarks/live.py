@@ -152,7 +152,7 @@ def _report(
     for name, scan in zip(("One scan", "Of two, the first", "the second"), scans, strict=True):
         lines.append(
             f"- {name}: {scan.done} of {scan.points} points with poles in {scan.duration_s:.0f} s, "
-            f"{scan.repeats} begun again; the simulation stood still for more than 10 ms {scan.stalls} times."
+            f"{scan.repeats} repeats; the simulation stood still for more than 10 ms {scan.stalls} times."
         )
     ratio = GOAL_LOOP_S / loop
     lines += [

@@ -55,7 +55,7 @@ class LiveScan:
     duration_s : float
         Of that.
     points, done, repeats, stalls : int
-        Points of the plan; those with poles; how often a point was begun again; how often the simulation
+        Points of the plan; those with poles; repeats of points; how often the simulation
         stood still for more than 10 ms.
     """
 

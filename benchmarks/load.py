@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration on machines that have other things to do: what becomes of its results, and of its time.
+"""The demo under loads of the machine: its results against the truth, and its duration.
 
-In simulated time a load costs time and nothing else: every point at the first attempt, the same tissues,
-every force and every pole within 4 of its standard deviations of the truth. On the wall clock every point
-is to come, and the time may grow by no more than is stated. Nothing here is a measurement on a sensor.
+In simulated time a load may make the demo slower and change nothing else: every point is measured at the first
+attempt, the same tissues are called, and every force and every pole is within 4 of its standard deviations of
+the truth. On the wall clock every point must be measured, and the demo may become slower by a stated factor at
+most. All of it is simulated; none of it is a measurement on a sensor.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.processes import free_domain_id
 
 HOST = "127.0.81.1"
-IDLE = Load("nothing else")
+IDLE = Load("no load")
 LOADS = (
     Load("two busy loops", busy_loops=2),
     Load("without real-time priority", without_priority=True),
@@ -42,7 +43,7 @@ LOADS = (
     Load("each process stopped once", stopped=(*NODES, *BRIEFLY)),
 )
 REAL_TIME = (
-    (Load("real time, nothing else"), 1.0),
+    (Load("real time, no load"), 1.0),
     (Load("real time, a busy loop on each core", busy_loops=len(os.sched_getaffinity(0))), 1.5),
     (Load("real time, without real-time priority", without_priority=True), 2.0),
 )
@@ -57,7 +58,7 @@ def run(output: Path, quick: bool) -> str:
     Raises
     ------
     ValueError
-        Where something is wrong; the page says what, and is written all the same.
+        If a result is wrong; the page states which, and is written all the same.
     """
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     scene = QUICK_SCENE.resolve() if quick else share_path("config/scenes/demo.yaml")
@@ -91,7 +92,7 @@ def _note(
     wrong: Sequence[str],
 ) -> list[str]:
     share = shown.seconds / idle.seconds
-    figures = f"{shown.seconds:.0f}", f"{share:.2f}", f"{found.points}", f"{found.begun_again}"
+    figures = f"{shown.seconds:.0f}", f"{share:.2f}", f"{found.points}", f"{found.repeats}"
     rows.append((name, *figures, f"{found.poles:.1f}", f"{found.forces:.1f}"))
     print(" | ".join(rows[-1]), *wrong, flush=True)
     return [f"{name}: {text}" for text in wrong]
@@ -110,7 +111,7 @@ def _real_time(
         if shown.status != 0 or found.points != expected.points:
             mine.append(f"{found.points} of {expected.points} points")
         if not shown.seconds <= most * idle.seconds:
-            mine.append(f"{shown.seconds / idle.seconds:.2f} of its time, {most} is accepted")
+            mine.append(f"{shown.seconds / idle.seconds:.2f} times as long, {most} is accepted")
         wrong += _note(rows, load.name, shown, found, idle, mine)
     return wrong
 
@@ -144,11 +145,11 @@ def _page(rows: Sequence[Sequence[str]], wrong: Sequence[str], scene: Path, mome
         *textwrap.wrap(
             f"Scene `{scene.name}`; {len(os.sched_getaffinity(0))} cores, a Python loop of 5 million additions "
             f"takes {loop_s():.2f} s, a float64 rfft of 2 x 160000 samples {1e3 * fft_s():.1f} ms. "
-            "Deviations are the largest of all points, in standard deviations.",
+            "Poles and forces: largest deviation of all points from the truth, in standard deviations.",
             112,
         ),
         "",
-        "| load | time [s] | of the time without | points | begun again | poles | forces |",
+        "| load | time [s] | time / time without load | points | repeats | poles | forces |",
         "|---|---|---|---|---|---|---|",
         *("| " + " | ".join(row) + " |" for row in rows),
         "",

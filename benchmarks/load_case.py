@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One demonstration on a machine that has other things to do, and what came of it."""
+"""One run of the demo under a load of the machine, and its results against the truth."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ NODES = (
     *("pole_map_node", "scan_node", "manager_node"),
 )
 BRIEFLY = ("ur_client", "simulate-ur")
-"""What ur_rtde waits for, or is itself: its own limits allow no more than a second."""
+"""Processes that ur_rtde runs in or waits for: its own time limits allow no more than a second."""
 STOP_S, STOP_BRIEFLY_S = 5.0, 1.0
 WORK_S, REST_S = 0.1, 0.3
-"""Of a quarter of a machine, in bursts."""
+"""Throttled to a quarter: processes run and stand in turn [s]."""
 _PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23  # linux/prctl.h, linux/capability.h
 
 
 @dataclass(frozen=True)
 class Load:
-    """What else the machine does, or what the demonstration may not do.
+    """What else the machine does, or what is kept from the demo.
 
     Attributes
     ----------
     name : str
     busy_loops : int
-        Processes at normal priority that do nothing but compute.
+        Number of processes at normal priority that only compute.
     pinned : bool
         All on one core, the busy loops too.
     without_priority : bool
@@ -66,17 +66,17 @@ class Load:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """What came of one.
+    """A run of the demo.
 
     Attributes
     ----------
     seconds : float
-        From its start to its end.
+        Its duration [s].
     status : int
-        Of its exit.
+        Its exit status.
     printed, errors : str
     left : tuple of int
-        Processes that it left behind.
+        Ids of processes that it left behind.
     run_folder : Path
     stopped : tuple of str
         Processes that were stopped.
@@ -93,11 +93,11 @@ class Demonstration:
 
 @dataclass(frozen=True)
 class Findings:
-    """What its run holds.
+    """What the run of a demo holds.
 
     Attributes
     ----------
-    points, begun_again : int
+    points, repeats : int
         Points with poles, and attempts beyond the first.
     calls : tuple of (int, str)
         Point and tissue.
@@ -106,7 +106,7 @@ class Findings:
     """
 
     points: int
-    begun_again: int
+    repeats: int
     calls: tuple[tuple[int, str], ...]
     poles: float
     forces: float
@@ -186,7 +186,7 @@ def demonstrate(
 
 
 def findings(run_folder: Path) -> Findings:
-    """What a run holds, against the truth of the simulated bench; nothing where there is none."""
+    """What a run holds, against the truth of the simulated bench; no points where the run has no results."""
     if not (run_folder / "run.json").exists():
         return Findings(0, 0, (), np.nan, np.nan)
     run = read_run(run_folder)
@@ -203,14 +203,14 @@ def findings(run_folder: Path) -> Findings:
 
 
 def faults(demonstration: Demonstration, found: Findings, expected: Findings) -> list[str]:
-    """What is wrong with one in simulated time, against the same on an idle machine; empty: nothing."""
+    """What is wrong with a demo in simulated time, compared with one on an idle machine; empty: nothing."""
     wrong = []
     if demonstration.status != 0:
         wrong.append(f"ended with status {demonstration.status}: {demonstration.errors.strip()}")
     if demonstration.left:
         wrong.append(f"left processes behind: {demonstration.left}")
-    if found.begun_again:
-        wrong.append(f"{found.begun_again} points were begun again")
+    if found.repeats:
+        wrong.append(f"{found.repeats} repeats of points")
     if found.calls != expected.calls:
         wrong.append(f"points and tissues {found.calls}, on an idle machine {expected.calls}")
     for name, value in (("poles", found.poles), ("forces", found.forces)):
@@ -220,12 +220,12 @@ def faults(demonstration: Demonstration, found: Findings, expected: Findings) ->
 
 
 def _largest(values: object) -> float:
-    """NaN where one is."""
+    """Largest absolute value; NaN where one of them is NaN."""
     return float(np.max(np.abs(np.asarray(values, float)), initial=0.0))
 
 
 class _Watch:
-    """Reads what a demonstration prints, and knows its processes."""
+    """Reads what a demo prints, and keeps the ids of its processes."""
 
     def __init__(self, demo: subprocess.Popen) -> None:
         self._demo = demo
@@ -246,7 +246,7 @@ class _Watch:
                 self.errors += line
 
     def wait(self, longest_s: float) -> None:
-        """Until it has ended."""
+        """Wait until it has ended."""
         end_s = time.monotonic() + longest_s
         while self._demo.poll() is None and time.monotonic() < end_s:
             self.seen.update(descendants(self._demo.pid))

@@ -39,8 +39,8 @@ def generate_launch_description():
             default_value="true",
             choices=["true", "ideal", "false"],
             description="true: a robot brings the tip to the tissue. ideal: with use_mock_hardware, contact is "
-            "ideal and costs nothing, behind the same actions and topics. false: the tip is taken to be where "
-            "tcp_pose says.",
+            "ideal, without a 500 Hz loop, behind the same actions and topics. false: the tip is taken to be "
+            "where tcp_pose states.",
         ),
         DeclareLaunchArgument(
             "robot_ip",

@@ -264,7 +264,7 @@ def _list(array: npt.NDArray[np.floating] | None) -> list | None:
 
 
 def _numbers(values: npt.NDArray[np.floating]) -> list[float | None]:
-    """Elements; null where there is no number."""
+    """Elements; null where one is not finite."""
     return [_number(value) for value in values]
 
 

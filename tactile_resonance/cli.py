@@ -13,7 +13,7 @@ from typing import NoReturn
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as all other errors are said."""
+    """Reports wrong arguments in one line, as all other errors are reported."""
 
     def error(self, message: str) -> NoReturn:
         """End with status 2."""
@@ -38,16 +38,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def command() -> NoReturn:
     """Run one command, and end this process with its status.
 
-    Without the interpreter's own end, in which an interrupt kills it without a word, and which makes of one
-    that was heeded within an import a death by SIGINT.
+    Without the interpreter's own end: an interrupt during it kills the process without a message, and one that
+    was caught within an import makes it end by SIGINT.
     """
     status = 130
-    with contextlib.suppress(KeyboardInterrupt):  # as it ended
+    with contextlib.suppress(KeyboardInterrupt):  # one that came as the command ended
         status = main()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):  # nobody reads it any more
+        with contextlib.suppress(OSError):  # its reader has gone
             stream.flush()
     os._exit(status)
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time that devices, loops and waits live by: this machine's, or that of a simulated bench.
+"""The clock of devices, loops and waits: this machine's, or that of a simulated bench.
 
-Simulated time belongs to the bench (`simulation.bench_time`) and goes on in steps. Whoever takes part in it
-connects to the bench and says up to when it may go on without him; the bench tells him when it has come to
-that time and then waits for his next word. So what is computed never comes too late, however slow the
-machine is. He also says whether he needs the time to pass:
+Simulated time belongs to the bench (`simulation.bench_time`) and goes on in steps. Each participant connects
+to the bench and sends the time up to which it may go on. When that time is reached the bench reports it to
+the participant and waits for its next message. So nothing that is computed comes too late, however slow the
+machine is. A participant also sends its demand, whether it needs time to pass:
 
-- `Demand.NONE`: it may stand as far as he is concerned;
-- `Demand.REAL`: it goes on at the pace of real time at the most;
-- `Demand.FAST`: it goes on as fast as everybody lets it.
+- `Demand.NONE`: time may stand as far as this participant is concerned;
+- `Demand.REAL`: it goes on, at the pace of real time at most;
+- `Demand.FAST`: it goes on as fast as all participants allow.
 
-Without anybody's demand it goes on at the pace of real time; while somebody conducts (a scan), it stands
-then. A conductor lets it go on with `go`, until a device hands something over: then it stands until the
-next `go`, so that nothing passes while the conductor makes up his mind.
+Without any demand time goes on at the pace of real time; where a participant conducts (a scan), it stands
+then. The conductor lets it go on with `go` until a device hands over a result, such as a block of samples:
+then it stands until the next `go`, so that no time passes while the conductor decides.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from enum import IntEnum
 from typing import Protocol
 
 PORT = 30021
-"""Of a bench's time where no other is given."""
+"""Port of a bench's time where no other is given."""
 
 ENDLESS_NS = 1 << 62
-"""Up to here: for ever."""
+"""Time without a limit [ns]."""
 
 MESSAGE = struct.Struct("<Bxxxxxxxqqq")
-"""Kind and three integers, either way."""
+"""Kind and three integers, in both directions."""
 
 
 class Demand(IntEnum):
-    """Whether somebody needs time to pass."""
+    """Whether a participant needs time to pass."""
 
     NONE = 0
     REAL = 1
@@ -51,24 +51,21 @@ class ToBench(IntEnum):
     HOLD = 1  # time up to which it may go on [ns], demand, packets sent to the robot
     ASK = 2  # answered by TIME
     GO = 3
-    SEED = 4  # up to three integers: noise is theirs from now on
-    WAKE = 6  # time at which it is told, and which nobody waits for [ns]
-    PORTS = (
-        5  # local ports of the connections to the robot's RTDE server and to the bus of the cell
-    )
+    SEED = 4  # up to three integers, from which all noise follows from now on
+    PORTS = 5  # local ports of the connections to the robot's RTDE server and to the cell's bus
+    WAKE = 6  # time [ns] that is to be reported when it is reached; it does not hold time up
 
 
 class FromBench(IntEnum):
     """Kinds of messages from the bench, with their integers."""
 
-    TOLD = (
-        1  # time now [ns]; what was sent: stamp of the newest robot state [ns], frames of the bus
-    )
-    TIME = 2  # time now [ns]
+    # a time that was waited for: time now [ns], stamp of the newest robot state sent [ns], frames sent
+    TOLD = 1
+    TIME = 2  # the answer to ASK: time now [ns]
 
 
 class ClockLostError(ConnectionError):
-    """The bench whose time it was has gone."""
+    """The connection to the bench whose time it was is lost."""
 
 
 class Clock(Protocol):
@@ -76,7 +73,7 @@ class Clock(Protocol):
 
     @property
     def simulated(self) -> bool:
-        """Whether it is that of a bench."""
+        """Whether it is the clock of a simulated bench."""
         ...
 
     def now_ns(self) -> int:
@@ -124,27 +121,28 @@ class WallClock:
 
 
 class SimulatedClock:
-    """Takes part in the time of a bench; of one thread, but `now_ns` is anybody's.
+    """Takes part in the time of a bench; for one thread, except `now_ns`, which any thread may call.
 
     Parameters
     ----------
     address : str
         ``HOST:PORT`` of the bench's time.
     name : str
-        By which it is named where it holds the time.
+        Names the participant in messages about what holds time up.
     told_with : str
-        Name of another that holds the time in its place: told whenever that one would be.
+        Name of another participant, which holds time in place of this one; the times that it waits for are
+        reported here instead.
     hands_over : bool
-        When it is told, a conductor's `go` has ended.
+        Whether each time that it waits for ends a conductor's `go`.
     conducts : bool
-        Time stands while nobody needs it.
+        Whether time stands while no participant needs it.
 
     Raises
     ------
     ClockLostError
-        Where no bench answers.
+        If no bench answers.
     ValueError
-        Where the address is none.
+        If the address is not HOST:PORT.
     """
 
     simulated = True
@@ -177,7 +175,7 @@ class SimulatedClock:
         return self._socket.fileno()
 
     def now_ns(self) -> int:
-        """Time that was told last [ns]."""
+        """Time that the bench reported last [ns]."""
         return self._now_ns
 
     def ros_ns(self, time_ns: int) -> int:
@@ -189,7 +187,7 @@ class SimulatedClock:
         return ros_ns
 
     def ask_ns(self) -> int:
-        """Time now [ns], which may stand or go on."""
+        """Time now [ns], asked of the bench."""
         self._send(ToBench.ASK)
         while self._next(None) is not FromBench.TIME:
             pass
@@ -198,8 +196,8 @@ class SimulatedClock:
     def hold(self, until_ns: int, demand: Demand, packets: int = -1) -> None:
         """Let time go on up to a time [ns]; see the module's text for the demand.
 
-        `packets` counts what was sent to the robot since it was 0: the bench takes all of it before its next
-        step. Below 0 nothing is said of them.
+        `packets` is the number of packets sent to the robot since it was last stated as 0: the bench waits for
+        all of them before its next step. Below 0 it states nothing.
         """
         self._send(ToBench.HOLD, min(until_ns, ENDLESS_NS), demand, packets)
 
@@ -214,7 +212,7 @@ class SimulatedClock:
         /,
         while_waiting: Callable[[], None] | None = None,
     ) -> None:
-        """Let time go on up to a time [ns] and wait for that; it stands then until the next word.
+        """Let time go on up to a time [ns] and wait until it is reached; then it stands until the next call.
 
         `while_waiting` is called every tenth of a second of this machine's time; what it raises ends the
         wait.
@@ -226,7 +224,7 @@ class SimulatedClock:
             self.wait_told(while_waiting)
 
     def sleep_until(self, time_ns: int, while_waiting: Callable[[], None] | None = None) -> None:
-        """Wait until it is a time [ns], without a part in whether and when that comes."""
+        """Wait until a time [ns] is reached, without holding time up or demanding that it pass."""
         if time_ns <= self._now_ns:
             return
         self._send(ToBench.WAKE, time_ns)
@@ -234,29 +232,29 @@ class SimulatedClock:
             self.wait_told(while_waiting)
 
     def wait_told(self, while_waiting: Callable[[], None] | None = None) -> None:
-        """Wait until the bench tells a time, or tells one again."""
+        """Wait until the bench reports a time that was waited for."""
         while self._next(while_waiting) is not FromBench.TOLD:
             pass
 
     def refresh(self) -> None:
-        """Take what was told meanwhile, without waiting."""
+        """Take the messages that have come, without waiting."""
         while self._buffer or select.select([self._socket], [], [], 0)[0]:
             self._next(None)
 
     def go(self) -> None:
-        """Let time go on until a device hands something over; of one who conducts."""
+        """Let time go on until a device hands a result over; for a participant that conducts."""
         self._send(ToBench.GO)
 
     def seed(self, *integers: int) -> None:
-        """Let all noise of the bench be that of these integers, three at the most, from now on."""
+        """Let all noise of the bench follow from these integers, three at most, from now on."""
         self._send(ToBench.SEED, *integers)
 
     def ports(self, robot: int, bus: int) -> None:
-        """Name the local ports of connections whose data are to be named with each time that is told."""
+        """Name local ports; with each time the bench then reports how much it has sent to them."""
         self._send(ToBench.PORTS, robot, bus)
 
     def interrupt(self) -> None:
-        """Let whoever waits raise `ClockLostError`; from any thread."""
+        """Make a wait in another thread raise `ClockLostError`; from any thread."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
@@ -298,7 +296,7 @@ def time_address(text: str) -> tuple[str, int]:
     Raises
     ------
     ValueError
-        Where it is none.
+        If it is not HOST:PORT.
     """
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:

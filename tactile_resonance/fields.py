@@ -51,7 +51,7 @@ def known_keys(mapping: Mapping[str, Any], keys: set[str], where: str) -> None:
 
 
 def number(value: object, field: str) -> float:
-    """Return `value` as a finite float; ``ValueError`` if it is none."""
+    """Return `value` as a finite float; ``ValueError`` if it is not."""
     # an integer may be beyond all floats, which math.isfinite does not take
     good = (
         isinstance(value, (int, float))

@@ -126,7 +126,7 @@ def run_job(job: Job) -> int:
     from tactile_resonance.scan.scene import read_scan_scene
 
     begun_s = time.monotonic()
-    content = read_scan_scene(job.scene)  # what is wrong in it is said before anything is started
+    content = read_scan_scene(job.scene)  # errors in it are reported before anything is started
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     ended = _Ended()
@@ -155,9 +155,9 @@ def run_job(job: Job) -> int:
 
 
 class _Ended:
-    """Whether somebody has asked this process to end: noted, and heeded where nothing is cut in two.
+    """Notes SIGINT and SIGTERM, so that they take effect only where they may: see `check` and `at_once`.
 
-    Both signals end the nodes in order, even where a shell made this process ignore Ctrl-C.
+    Both end the nodes in order, even where a shell made this process ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -166,12 +166,12 @@ class _Ended:
             signal.signal(number, self._note)
 
     def check(self) -> None:
-        """Raise `KeyboardInterrupt` where it was asked for."""
+        """Raise `KeyboardInterrupt` if a signal has come."""
         if self._asked:
             raise KeyboardInterrupt
 
     def at_once(self) -> None:
-        """From now on nothing is under way that would have to be ended first."""
+        """From now on a signal ends the process at once: no node runs that would have to be ended first."""
         self._at_once = True
 
     def _note(self, *_: object) -> None:
@@ -183,7 +183,7 @@ class _Ended:
 
 
 def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
-    """Of each node, beside their defaults."""
+    """Parameters of each node that differ from their defaults."""
     waits_s = STALLS_S if job.real_time and not may_take_priority(PRIORITY) else 0.0
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
     simulated = not job.real_time
@@ -210,7 +210,7 @@ def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, 
 
 
 def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> Scan.Result:
-    # only here: the command answers --help, and says what is missing, without ROS
+    # only here: the command answers --help, and reports what is missing, without ROS
     from tactile_resonance.action import Scan
     from tactile_resonance.nodes.scan_client import ScanClient
 
@@ -258,7 +258,7 @@ class _Bar:
         self._bar.close()
 
     def show(self, feedback: Scan.Feedback) -> None:
-        """Take what the scan tells."""
+        """Take the feedback of the scan."""
         bar = self._bar
         if feedback.waiting_for:
             bar.write(f"waiting for {feedback.waiting_for}", file=sys.stdout)

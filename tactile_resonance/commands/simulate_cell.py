@@ -57,7 +57,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve until interrupted or told to end."""
+    """Serve until interrupted or terminated."""
     require_loopback(options.host)
     if not 0 <= options.port <= 65535:
         raise ValueError(f"--port: {options.port}, expected 0 to 65535")

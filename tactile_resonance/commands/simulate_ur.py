@@ -26,7 +26,7 @@ BENCH_DEFAULTS = {
     "mount": "table",
     "can_port": CAN_PORT,
 }
-"""Of the options that say what the tool touches."""
+"""Options that define what the tool touches."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -43,8 +43,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--simulated-time",
         action="store_true",
-        help="let time go on as those who connect to port 30021 let it, and never faster than what they "
-        "compute; without anybody there at the pace of real time (default: the wall clock)",
+        help="simulated time: it goes on only as far as the participants on port 30021 allow; without "
+        "participants at the pace of real time (default: the wall clock)",
     )
     parser.add_argument(
         "--control-port", type=int, default=30020, help="for faults and queries (default: 30020)"
@@ -90,7 +90,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve until SIGINT or SIGTERM, then say how well the pace was kept."""
+    """Serve until SIGINT or SIGTERM, then report how well the pace was kept."""
     _check(options)
     from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
     from tactile_resonance.simulation.robot.controller import ControllerConfig, UrController

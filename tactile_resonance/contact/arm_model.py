@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the arm will still do of what it was told: the commands under way along one axis."""
+"""Motion of the arm along one axis that commands under way will still cause."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ArmModel:
     Attributes
     ----------
     set_speed_m_s : float
-        That the arm was told, after the acceleration limit.
+        Commanded to the arm, after the acceleration limit.
     speed_m_s, acceleration_m_s2 : float
         Of the tip, as far as the model knows.
     """
@@ -30,7 +30,7 @@ class ArmModel:
         self.acceleration_m_s2 = 0.0
 
     def step(self, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Advance one period, told to go at a speed under an acceleration limit."""
+        """Advance one period, commanded to a speed under an acceleration limit."""
         most = acceleration_m_s2 * self._period_s
         self.set_speed_m_s += min(most, max(-most, speed_m_s - self.set_speed_m_s))
         self._line.append(self.set_speed_m_s)

@@ -7,7 +7,7 @@ that edge of their convex hull which spans the middle of the window: the line be
 smallest mean distance to them (Moon, Skelly, Towsley, Estimation and removal of clock skew from network
 delay measurements, INFOCOM 1999). Late messages, however many and however late, do not move it.
 
-The shortest delay itself cannot be told from an offset by listening only: it is stated by the caller, with
+The shortest delay itself cannot be distinguished from an offset by listening only: the caller states it, with
 its uncertainty.
 """
 
@@ -22,7 +22,7 @@ BLOCK_S = 0.25
 """Of all messages within a block the one that was quickest counts."""
 WINDOW_BLOCKS = 120
 STEP_S = 0.005
-"""A message that is earlier than the relation allows by more tells of another clock setting."""
+"""A message that is earlier than the relation allows by more means that a clock was set."""
 STEP_BLOCKS = 4
 """So many blocks on end that are later by as much do, too."""
 YOUNG_BLOCKS = 8
@@ -97,7 +97,7 @@ class ClockTracker:
         Raises
         ------
         ValueError
-            If the stamp is no number.
+            If the stamp is not finite.
         """
         if not math.isfinite(remote_s):
             raise ValueError(f"remote_s: {remote_s!r}, expected a finite time")
@@ -180,7 +180,7 @@ class ClockTracker:
             self._line = _lower_edge(points)
             unknown_s = 0.0
         above = [y - self._line[0] - self._line[1] * x for x, y in points]
-        # the newest block tells at once when something has changed
+        # the newest block shows at once when something has changed
         self._scatter_s = max(2.0 * statistics.median(above), above[-1], unknown_s)
 
 

@@ -31,7 +31,7 @@ SURFACES, STIFFNESSES = 28, 21
 """Grid of the first estimate, over the height of the touch and ln C."""
 
 RECENT, GROUP = 40, 6
-"""Of the samples before the touch was told the last are used one by one, the others in groups."""
+"""Of the samples before the touch was detected the last are used one by one, the others in groups."""
 
 
 @dataclass(frozen=True)

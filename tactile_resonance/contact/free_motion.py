@@ -35,7 +35,7 @@ class FreeMotion:
     Attributes
     ----------
     told_m : float or None
-        Height at which another sensor told the touch [m].
+        Height at which another sensor detected the touch [m].
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class FreeMotion:
         return REST
 
     def _touched(self, where: str) -> Move | None:
-        """What follows where something pushes: without a zero only a change tells that."""
+        """Result where something pushes: without a zero only a change of the force shows that."""
         force_n = self._observer.watch.force_n
         if self._travel_force_n is None:
             self._travel_force_n = force_n
@@ -100,7 +100,7 @@ class FreeMotion:
         return failed(Cause.SURFACE_EARLY, f"force changed by {1e3 * change:.1f} mN {where}")
 
     def approach(self, arm: ArmSample, place: Place) -> Move:
-        """Down along the normal until the force tells a touch."""
+        """Down along the normal until the force shows a touch."""
         p = self._parameters
         if self._observer.model is not None:
             return Move(None, State.CONTACT)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a contact is asked to do, where in its life it is, and what the arm is told."""
+"""What a contact is asked to do, where in its life it is, and what the arm is commanded."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ContactGoal:
 
 
 class Command(NamedTuple):
-    """What the arm is told: a twist in the base and its acceleration limit, or to stop.
+    """Command to the arm: a twist in the base and its acceleration limit, or to stop.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control loop: read both devices, let the controller decide, tell the arm; again and again."""
+"""The control loop, period by period: read both devices, let the controller decide, command the arm."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector
 
 STOP_AGAIN_NS = 50_000_000
-"""A stop that holds is told again after so long, at least once, and until the arm is seen to rest."""
+"""A stop that holds is sent again after so long, at least once, and until the arm is seen to rest."""
 
 
 IDLE_PERIODS = 10
-"""While nothing is under way, only every so many periods are run."""
+"""While no contact is under way, only one of so many periods is run."""
 
 
 class Cycle(NamedTuple):
@@ -68,7 +68,7 @@ class ContactLoop:
         self._listener = listener
         self._next_ns = clock.now_ns()
         self._seen: ArmSample | None = None  # the arm, in the newest cycle
-        self._refused: ArmError | None = None  # what a command raised, told in the next cycle
+        self._refused: ArmError | None = None  # what a command raised, reported in the next cycle
         self._stopped_ns: int | None = None
         self._owed: Command | None = None  # a stop of which the arm has not been seen to rest
         self._owed_ns = 0
@@ -139,7 +139,7 @@ class ContactLoop:
         except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
             fault = fault or error
         self._seen, self.fault = arm, fault
-        # the arm keeps a velocity, so a stop is told until it has worked, whatever state that ends in
+        # the arm keeps a velocity, so a stop is sent until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed
         try:
             self._tell(command, now)
@@ -160,7 +160,7 @@ class ContactLoop:
             self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, *zero, fault))
 
     def _tell(self, command: Command | None, now: int) -> None:
-        """Pass a command on; a stop that goes on is not told in every period."""
+        """Pass a command on; a stop that goes on is not sent in every period."""
         if command is None or command.twist is not None:
             self._stopped_ns = self._owed = None
         elif self._owed is None:
@@ -178,5 +178,5 @@ class ContactLoop:
 
 
 def _rests(arm: ArmSample | None) -> bool:
-    """Whether an arm is seen to stand still; what is no number is not."""
+    """Whether an arm is seen to stand still; False where a speed is not finite."""
     return arm is not None and math.hypot(*arm.velocity[:3]) < STILL_M_S

@@ -37,7 +37,7 @@ PRESSING_CAUSES = frozenset({Cause.FORCE_ABORT, Cause.FORCE_HARD, Cause.FORCE_RA
 """After these the tip is drawn back at once: while it slows down it goes deeper."""
 
 ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_INVALID})
-"""After these the tip is not drawn back by itself: the arm moves again only when told to."""
+"""After these the tip is not drawn back by itself: the arm moves again only when asked for."""
 
 
 WISH_NS = 1_000_000_000
@@ -154,7 +154,7 @@ class ContactController:
             self._wish_retract, self._wish_ns = True, None
 
     def tell_touch(self) -> bool:
-        """Another sensor tells the first contact: the rest of the approach is slow.
+        """Another sensor has detected the first contact: the rest of the approach is slow.
 
         What counts as contact for the law and its limits is still the force. Returns whether it is new
         and of use: only in an approach.
@@ -173,7 +173,7 @@ class ContactController:
         wrenches: Sequence[WrenchSample],
         fault: ArmError | ForceError | None = None,
     ) -> Command | None:
-        """Take what came since the last cycle and return what the arm is told; None: nothing.
+        """Take what came since the last cycle and return the command to the arm; None: none.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class ContactController:
         """
         if self.state is State.IDLE or self.goal is None:
             return None
-        # of an arm whose place is not finite nothing can be told but that
+        # of an arm whose place is not finite nothing else is known
         place = None if arm is None or not is_finite(arm) else self._place(arm)
         breach = self._judgement.breach(
             self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault

@@ -141,7 +141,7 @@ class Observer:
         return None
 
     def look_again(self) -> None:
-        """Estimate the contact anew from all that was kept: noise may have told the touch too early."""
+        """Estimate the contact anew from all that was kept: what was detected may have been noise."""
         self._touch(self._model_ns)
 
     def _touch(self, time_ns: int) -> ContactFilter:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The story of one contact, told as its result: reached, refined while held, ended and why."""
+"""The course of one contact, kept as its result: reached, refined while held, ended and why."""
 
 from __future__ import annotations
 

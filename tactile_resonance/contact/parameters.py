@@ -57,7 +57,7 @@ class ContactParameters:
     approach_speed_m_s, press_speed_m_s : float
         Towards the surface before and after the touch [m/s].
     told_speed_m_s : float
-        Towards it, at most, once another sensor has told the touch and the force has not yet [m/s].
+        Towards it, at most, once another sensor has detected the touch and the force has not yet [m/s].
     travel_speed_m_s, retract_speed_m_s : float
         To the standoff, and away from the tissue [m/s].
     acceleration_m_s2, relief_acceleration_m_s2 : float

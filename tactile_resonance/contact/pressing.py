@@ -131,7 +131,7 @@ class Pressing:
         return failed(Cause.CONTACT_LOST, text)
 
     def _was_noise(self, least_n: float) -> bool:
-        """Whether what told the touch was noise: no such force is there; then it is sought anew."""
+        """Whether the detected touch was noise: the force is not there; then the approach goes on."""
         mean = self._observer.watch.mean_n
         if mean is None or mean >= least_n or self._taken_back == MOST_TAKEN_BACK:
             return False

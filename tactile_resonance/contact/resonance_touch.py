@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First contact told by the resonance itself: a change against free air that noise does not explain.
+"""First contact detected by the resonance itself: a change against free air that noise does not explain.
 
 Two streams can tell it. Poles with their covariance come once a block: f0 and damping ratio against
 those in air. A lock-in on one line near the resonance comes once in two periods of that line: its complex
@@ -91,7 +91,7 @@ class ScatterTouch:
         return np.asarray(self._scale * np.sum(off**2, axis=-1))
 
     def touched(self, observation: ArrayLike) -> bool:
-        """Whether one observation (d,) is not one of air; what is no number tells nothing."""
+        """Whether one observation (d,) is not one of air; False where it is not finite."""
         return bool(self.statistic(observation) > self.threshold)
 
 

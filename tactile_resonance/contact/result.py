@@ -71,7 +71,7 @@ class ContactResult:
         Height of the first touch above the expected one, and its standard deviation from the force's
         noise [m].
     told_m : float or None
-        Height at which another sensor told the touch, on the same scale [m]; None where none did.
+        Height at which another sensor detected the touch, on the same scale [m]; None where none did.
     contact_s : float or None
         From the detection of contact until the force was reached [s].
     total_s : float

@@ -32,7 +32,7 @@ class TareLimits:
     std_n : float
         Largest standard deviation of the zero.
     drift_n_per_s : float
-        Largest drift that is told from noise.
+        Largest drift beyond what noise explains.
     offset_n : float
         Largest zero: more means a bias step, a wrong sign, or something that touches.
     """

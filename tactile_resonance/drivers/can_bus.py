@@ -34,11 +34,11 @@ class Frame(NamedTuple):
     can_id : int
     data : bytes
     stamp_s : float
-        Of the adapter [s].
+        Time stamp of the adapter [s].
     arrival_ns : int
         When it was taken from the interface (monotonic clock) [ns].
     extended, remote, error : bool
-        Identifier of 29 bits; a request for data; the interface tells of an error.
+        Identifier of 29 bits; a request for data; an error reported by the interface.
     """
 
     can_id: int
@@ -59,7 +59,7 @@ class Bus(Protocol):
 
     @property
     def drained(self) -> bool:
-        """Whether nothing more waited when it was looked at last."""
+        """Whether no more frames were waiting after the last read."""
         ...
 
     def wait(self, seconds: float) -> None:
@@ -71,7 +71,7 @@ class Bus(Protocol):
         ...
 
     def close(self) -> None:
-        """Let it go."""
+        """Disconnect."""
         ...
 
 

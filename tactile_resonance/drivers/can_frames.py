@@ -67,11 +67,11 @@ class CanDescription:
     fields : tuple of str
         Name of each value of the layout; `CHANNELS` are among them.
     constant : dict
-        Values by which a wrench is told from other answers.
+        Values that distinguish a wrench from other answers.
     overload : tuple of str and int, or None
         Field and mask of the overload bits.
     invalid_counts : tuple of int
-        Counts that are no number.
+        Counts that mean an invalid value.
     full_scale_counts : int or None
         At and beyond which a count is an overload.
     command_id : int or None
@@ -101,7 +101,7 @@ class CanDescription:
     reply: Reply | None = None
 
     def decode(self, data: bytes) -> tuple[tuple[float, ...], bool] | None:
-        """Counts (6,) and overload of the joined bytes; NaN for a count that is no number.
+        """Counts (6,) and overload of the joined bytes; NaN for a count that means an invalid value.
 
         None where the bytes are another answer.
         """

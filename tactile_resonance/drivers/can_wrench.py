@@ -72,7 +72,7 @@ class CanWrench:
 
     @property
     def local_port(self) -> int:
-        """Of the connection to a bus over TCP; 0 where there is none."""
+        """Local port of the connection to a bus over TCP; 0 for other buses."""
         return self._bus.local_port if isinstance(self._bus, SocketcandBus) else 0
 
     def start(self) -> None:

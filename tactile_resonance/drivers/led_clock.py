@@ -12,12 +12,12 @@ from tactile_resonance.drivers.ur_arm import UrArm
 
 
 class LedClock:
-    """A `Clock` that goes on as the loop says, with whom arm and cell have delivered what they have.
+    """A `Clock` that a loop leads: when it returns, the data that arm and cell sent until then have been read.
 
     Parameters
     ----------
     arm : UrArm
-        Connected; closing this clock leaves its time to itself again.
+        Connected; while this clock is open, its time goes on only as the loop asks for.
     cell : Cell
     while_waiting : callable
         Called every tenth of a second of this machine's time while simulated time stands; what it raises ends
@@ -46,21 +46,21 @@ class LedClock:
         return ros_ns
 
     def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
-        """Let time go on to a time, and wait for what the robot and the cell have sent until then."""
+        """Let time go on to a time, and wait for all data that robot and cell have sent until then."""
         self._arm.wait_until(time_ns, demand, self._while_waiting)
         if self._cell is not None:
             self._cell.catch_up(self._arm.frames)
 
     def ask_ns(self) -> int:
-        """Time now [ns], also where it has gone on without this clock."""
+        """Time now [ns], asked of the bench: it may have gone on without this clock."""
         return self._arm.ask_ns()
 
     def hurry(self) -> None:
-        """End a wait in which nothing needed time: something does now. From any thread."""
+        """Make a wait that does not demand time demand it: something needs it now. From any thread."""
         self._arm.hurry()
 
     def close(self) -> None:
-        """Leave the time to itself."""
+        """Lead no more: time goes on without the loop."""
         self._arm.follow()
 
     def _bus_port(self) -> int:

@@ -2,8 +2,8 @@
 """States of the robot straight from its RTDE server, read without waiting.
 
 ur_rtde's own receive interface runs a thread that wakes for every state and copies all of them behind locks, a
-fifth of a processor core at 500 Hz. Here whoever needs states drains the socket when he looks. Commands go
-through ur_rtde; this only listens.
+fifth of a processor core at 500 Hz. Here the thread that needs states drains the socket when it needs them.
+Commands go through ur_rtde; this only listens.
 
 Protocol: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": packets of a length (u16, itself
 included), a type (u8) and a payload, big-endian; protocol version 2.
@@ -41,8 +41,8 @@ class RobotState(NamedTuple):
     robot_time_s : float
         Its time stamp.
     pose, speed, force : tuples of 6 floats
-        Of the tool centre point in the base [m, rad], [m/s, rad/s], [N, N m]; the force is what its own sensor
-        says.
+        Of the tool centre point in the base [m, rad], [m/s, rad/s], [N, N m]; the force is measured by the
+        robot's own sensor.
     safety_bits, runtime_state, robot_mode, safety_mode : int
         As RTDE names them.
     """
@@ -58,7 +58,7 @@ class RobotState(NamedTuple):
 
 
 class RtdeStream:
-    """A connection that the robot sends its states over.
+    """A connection over which the robot sends its states.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class RtdeStream:
     Raises
     ------
     ConnectionError
-        Where nobody answers, or the robot does not send what is asked for; says why.
+        If no robot answers, or it does not send what is asked for; with the reason.
     """
 
     def __init__(self, host: str, rate_hz: float, timeout_s: float = 2.0) -> None:
@@ -86,7 +86,7 @@ class RtdeStream:
             begun_s = time.perf_counter()
             try:
                 channel = socket.create_connection((host, PORT), timeout_s)
-            except (OSError, ValueError) as error:  # ValueError: what no name or address can be
+            except (OSError, ValueError) as error:  # ValueError: neither a name nor an address
                 reason = getattr(error, "strerror", None) or error
                 raise ConnectionError(
                     f"no robot answers at {host}, port {PORT}: {reason}"
@@ -115,7 +115,7 @@ class RtdeStream:
         Raises
         ------
         ConnectionError
-            Where the robot has closed the connection, or sends what is no RTDE.
+            If the robot has closed the connection, or sends what is not RTDE.
         """
         data = self._received()
         if not data:
@@ -140,7 +140,7 @@ class RtdeStream:
         self._socket.close()
 
     def _received(self) -> bytes:
-        """All that has come: who has not looked for long wants the newest state too."""
+        """All bytes that have come: after a long time without a call, too, the newest state is among them."""
         received = b""
         while len(received) % _AT_ONCE == 0:
             try:
@@ -153,7 +153,7 @@ class RtdeStream:
         return received
 
     def _skip(self, buffer: bytes, at: int) -> int | None:
-        """Where the packet after one that is no state begins; None where it is not whole yet."""
+        """Position of the packet behind one that is not a state; None where the latter is not complete yet."""
         (length, _) = _HEAD.unpack_from(buffer, at)
         if length < _HEAD.size:
             raise ConnectionError(f"the robot sends a packet of {length} bytes")

@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 import select
 import threading
 import time
 from collections.abc import Callable, Sequence
 
-from tactile_resonance.clock import Clock, Demand, SimulatedClock, WallClock
+from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Six
@@ -22,18 +20,15 @@ from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Command,
 from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, stop_fault
 from tactile_resonance.drivers.ur_states import StateReader
+from tactile_resonance.drivers.ur_time import ArmTime
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
 # Without a new state for this long the link is given up; the library would do so after 2.5 s.
 GIVE_UP_S = 1.2
-# The first state comes within this, and so does a program of which the library says that it runs.
+# The first state must come within this, and so must the program, once the library reports that it runs.
 BEGIN_S = 2.0
-# In simulated time, between two looks at an arm that is not connected.
-AWAY_S = 0.002
-# What does not answer for so long is named.
-SILENT_S = 1.0
-# Who is called after `state` in the same period takes the state that was seen then.
+# A call after `state` in the same period takes the state that was read then.
 SAME_PERIOD_NS = 1_000_000
 
 
@@ -55,47 +50,37 @@ class UrArm:
 
     def __init__(self, config: UrArmConfig, time: str = "") -> None:
         self.config = config
-        self._time = time
-        self._clock: Clock = WallClock()
-        self._own: SimulatedClock | None = None  # in simulated time: asks for it
-        self._led: SimulatedClock | None = None  # and is told it, while a loop leads it
-        self._dated = True  # states are, by the time that is told; else from the next one on
-        self._pending: Command | None = None  # goes with the next word on the time
-        self._until_ns = 0
-        self._hurried = False  # something has come under way since the loop said what it needs
-        self._said_s = self._heard_s = 0.0  # when the client was told something, the robot heard
+        self._time = ArmTime(time)
+        self._dated = True  # False: states are dated once the loop knows the time again
+        self._pending: Command | None = None  # sent with the next time that the loop waits for
+        self._heard_s = 0.0  # when the robot was last heard
         self._client: ClientProcess | None = None
         self._stream: RtdeStream | None = None
         self._states: StateReader | None = None
         self._number = 0
-        self._sent: dict[
-            int, tuple[bytes, float]
-        ] = {}  # kind and time [s] of what has no answer yet
+        # kind and time [s] of commands without an answer yet
+        self._sent: dict[int, tuple[bytes, float]] = {}
         self._refused = 0
         self._looked_ns = 0
-        self._reading, self._speaking = threading.Lock(), threading.Lock()
+        self._reading = threading.Lock()
 
-    # what is known of it
+    # properties
 
     @property
     def clock(self) -> Clock:
-        """On which its states are dated."""
-        return self._clock
+        """Clock on which its states are dated."""
+        return self._time.clock
 
     @property
     def frames(self) -> int:
-        """In simulated time that is led: frames of the bus sent until now."""
-        return 0 if self._led is None else self._led.frames
+        """Frames that the bus of the cell has sent, while a loop leads simulated time; else 0."""
+        return 0 if self._time.led is None else self._time.led.frames
 
     @property
     def waits_for(self) -> str:
-        """In simulated time that is led: what has not answered for a second, for people; empty: nothing."""
-        client, now_s = self._client, time.monotonic()
-        if self._led is None or client is None or now_s - self._said_s < SILENT_S:
-            return ""
-        if client.exchange.heard_ns != self._until_ns:
-            return "the arm's client process"
-        return "the simulated robot" if now_s - self._heard_s > SILENT_S else ""
+        """What has not answered for a second while a loop leads simulated time, for people; empty: nothing."""
+        client = self._client
+        return "" if client is None else self._time.waits_for(client, self._heard_s)
 
     @property
     def clock_uncertainty_s(self) -> float:
@@ -113,7 +98,7 @@ class UrArm:
 
     @property
     def client_pid(self) -> int | None:
-        """Of the client's process; None while there is none."""
+        """Id of the client's process; None while none runs."""
         return None if self._client is None else self._client.pid
 
     # the contract
@@ -134,12 +119,12 @@ class UrArm:
             return
         self._begin()
         client = ClientProcess(self.config)
-        names = {"time": self._time, "time_name": self._time_name}
+        names = {"time": self._time.address, "time_name": self._time.client_name}
         self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
-        if self._led is not None:
+        if self._time.led is not None:
             self._ask({"name": "lead"}, client)
-            self._dated = False  # time has gone on while nobody was told
-        self._client = client  # not before: a loop in another thread would speak to it
+            self._dated = False  # time has gone on, and the loop has not received it
+        self._client = client  # not before: a loop in another thread would send commands to it
         self._guard()
 
     def state(self) -> ArmSample:
@@ -194,7 +179,7 @@ class UrArm:
     def stop(self, deceleration_m_s2: float) -> None:
         """Stop; works at any time and raises only where the link is dead, or for a wrong figure.
 
-        Where states are stale the client still takes it, and tells the robot as soon as it may.
+        Where states are stale the client still takes it, and sends it to the robot as soon as it may.
         """
         self._check_acceleration(deceleration_m_s2)
         try:
@@ -210,38 +195,32 @@ class UrArm:
             self._client.end()
         self._forget()
         self.follow()
-        if self._own is not None:
-            self._own.close()
-            self._own, self._clock = None, WallClock()
+        self._time.close()
 
     # simulated time, led by a loop
 
     def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:
-        """Let simulated time go on as `wait_until` says; on the wall clock nothing is to be led.
+        """Let simulated time go on only as far as `wait_until` asks for; does nothing on the wall clock.
 
         Parameters
         ----------
         bus_port : callable
-            Local port of the connection to the bus of a load cell, of which `frames` tells; 0: none.
+            Local port of the connection to the bus of a load cell, whose frames `frames` counts; 0: none.
         """
-        if self._time:
-            name = self._time_name
-            led = SimulatedClock(self._time, f"{name}: loop", told_with=name)
-            self._bus_port, self._named = bus_port, (0, 0)
-            self._led = led
+        if self._time.address:
+            self._time.lead(bus_port)
             self._ask({"name": "lead"})
-            led.ask_ns()
-            self._clock, self._dated = led, False
+            self.ask_ns()
+            self._dated = False
 
     def follow(self) -> None:
-        """Leave the time to itself."""
-        if self._led is None:
+        """Lead no more: time goes on without this arm."""
+        if self._time.led is None:
             return
         pending, self._pending = self._pending, None
         if self._client is not None and pending is not None:
             self._client.send(pending)
-        self._led.close()
-        self._led, self._clock = None, _Asked(self._own) if self._own else WallClock()
+        self._time.follow()
         if self._client is not None:
             self._ask({"name": "follow"})
 
@@ -250,68 +229,56 @@ class UrArm:
     ) -> None:
         """Let simulated time go on up to a time and wait for that, and for the robot's state at it.
 
-        What was commanded before is with the robot by then.
+        What was commanded before has reached the robot by then.
         """
-        led, client = self._led, self._client
+        led, client = self._time.led, self._client
         assert led is not None
-        if client is None:  # nobody holds the time: it goes on, and this thread looks again soon
-            time.sleep(AWAY_S)
-            led.ask_ns()
+        if client is None:
+            self._time.look_again()
             return
-        self._name_ports(led)
+        self._time.name_ports(0 if self._stream is None else self._stream.local_port)
         command, self._pending = self._pending or Command(NOTHING), None
 
         def check() -> None:
             client.look()
-            self._read()  # a robot whose time stands says so
+            self._read()  # a robot whose time stands repeats its state
             if while_waiting is not None:
                 while_waiting()
 
         try:
-            with self._speaking:
-                self._until_ns, self._said_s = time_ns, time.monotonic()
-                if self._hurried:
-                    demand, self._hurried = Demand.FAST, False
-                client.send(command._replace(until_ns=time_ns, demand=int(demand)))
+            self._time.send(client, command, time_ns, demand)
             while led.now_ns() < time_ns:
                 led.wait_told(check)
             if not self._dated:
-                led.ask_ns()  # what was told while it connected lies behind
+                led.ask_ns()  # times received while it connected are of the past
             self._looked_ns = 0
             self._catch_up(led.robot_ns)
             if not self._dated and self._states is not None:
                 self._states.date_anew()
                 self._dated = True
-        except ArmError:  # told by `state`
-            time.sleep(AWAY_S)
-            led.ask_ns()
+        except ArmError:  # reported by `state`
+            self._time.look_again()
 
     def ask_ns(self) -> int:
-        """Simulated time now [ns], also where it has gone on without whoever leads it."""
-        assert self._led is not None
-        return self._led.ask_ns()
+        """Simulated time now [ns], also where it has gone on without the loop that leads it."""
+        assert self._time.led is not None
+        return self._time.led.ask_ns()
 
     def hurry(self) -> None:
-        """Let a wait that stands still end: something is under way now. From any thread."""
+        """Make a wait that does not demand time demand it: something needs it now. From any thread."""
         client = self._client
-        if self._led is not None and client is not None:
-            with contextlib.suppress(ArmError), self._speaking:
-                self._hurried = True  # the loop may be about to say that it needs no time
-                client.send(Command(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
+        if self._time.led is not None and client is not None:
+            self._time.hurry(client)
 
-    # parts of these
-
-    @property
-    def _time_name(self) -> str:
-        return f"client of the arm, process {os.getpid()}"
+    # helpers
 
     def _connect_again(self) -> bool:
-        """Start the program again where the connection is good; False where all is to be made anew."""
+        """Start the program again over a good connection; False where everything must be connected anew."""
         assert self._client is not None
         try:
             self._fresh()
         except ArmError:
-            if self._client is not None:  # else it was given up just now
+            if self._client is not None:  # else `_fresh` has ended it
                 self._client.end()
             self._forget()
             return False
@@ -323,18 +290,16 @@ class UrArm:
         self._states.guard(False)
         self._ask({"name": "restart"})
         self._guard()
-        self._dated = self._led is None
+        self._dated = self._time.led is None
         return True
 
     def _begin(self) -> None:
-        """Hear the robot, and that nothing forbids motion."""
+        """Receive the robot's states, and check that nothing forbids motion."""
         try:
-            if self._time and self._own is None:
-                self._own = SimulatedClock(self._time, f"{self._time_name}: owner")
-                self._clock = _Asked(self._own)
+            self._time.begin()
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
-            trip_s = 0.0 if self._time else self._stream.round_trip_s
-            self._states = StateReader(self._stream, lambda: self._clock.now_ns(), trip_s)
+            trip_s = 0.0 if self._time.address else self._stream.round_trip_s
+            self._states = StateReader(self._stream, lambda: self.clock.now_ns(), trip_s)
             self._wait_for_first()
             self._check_stop()
         except ConnectionError as error:
@@ -344,16 +309,8 @@ class UrArm:
             self._forget()
             raise
 
-    def _name_ports(self, led: SimulatedClock) -> None:
-        """Have the bench tell of the connections to robot and cell, either of which may be a new one."""
-        ports = 0 if self._stream is None else self._stream.local_port, self._bus_port()
-        if ports != self._named:
-            led.ports(*ports)
-            led.ask_ns()  # it has heard that
-            self._named = ports
-
     def _guard(self) -> None:
-        """See that the program runs; from now on no other counts as ours."""
+        """Wait until the program runs; from now on no other counts as ours."""
         assert self._states is not None
         self._wait_for(
             lambda states: states.newest.runtime_state == PROGRAM_PLAYING,
@@ -387,7 +344,7 @@ class UrArm:
         newest = self._states.newest
         assert newest is not None
         stop = stop_fault(newest.safety_bits, newest.robot_mode)
-        if stop is not None:  # not released yet; the connection is good
+        if stop is not None:  # not released yet
             raise ArmError(*stop)
 
     def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
@@ -413,17 +370,17 @@ class UrArm:
         self._number += 1
         command = Command(kind, self._number, 0, 0, twist, acceleration_m_s2)
         self._sent[self._number] = (kind, time.monotonic())
-        if self._led is not None:
+        if self._time.led is not None:
             self._pending = command  # with the next word on the time
         else:
             self._client.send(command)
 
-    def _read(self, told: bool = False) -> None:
-        """Take the states that have come; `told`: whoever leads knows what time it is now."""
+    def _read(self, now_known: bool = False) -> None:
+        """Take the states that have come; `now_known`: the loop that leads has received the present time."""
         assert self._states is not None
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read(told or self._led is None):
+                if self._states.read(now_known or self._time.led is None):
                     self._heard_s = time.monotonic()
         except ConnectionError as error:
             if self._client is not None:
@@ -436,15 +393,15 @@ class UrArm:
         """Wait for the state that the bench has sent."""
         assert self._stream is not None
         assert self._states is not None
-        self._read(told=True)
+        self._read(now_known=True)
         while (newest := self._states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
             select.select([self._stream], [], [], 0.1)
-            self._read(told=True)
+            self._read(now_known=True)
 
     def _fresh(self) -> ArmSample:
-        """Return the newest state, and show the client that its owner lives."""
+        """Return the newest state, and give the client a sign of life."""
         self._looked_ns = 0
         if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
@@ -453,7 +410,7 @@ class UrArm:
         states, config = self._states, self.config
         sample = states.sample
         assert sample is not None
-        age_s = (self._clock.now_ns() - sample.time_ns) * 1e-9
+        age_s = (self.clock.now_ns() - sample.time_ns) * 1e-9
         seen = Seen.FRESH if age_s <= config.max_state_age_s else Seen(0)
         if states.fault is not None:
             seen |= Seen.FAULTY | (Seen.REVIVED if states.revived else Seen(0))
@@ -484,10 +441,10 @@ class UrArm:
                 continue
             self._refused = number
             if self._states.fault is not None:
-                return  # a stop is why; the state tells it
+                return  # because of a stop, which the state reports
             said = self._client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
-        if self._led is None and sent:
+        if self._time.led is None and sent:
             oldest_s = next(iter(sent.values()))[1]
             if time.monotonic() - oldest_s > ANSWER_S:
                 text = f"no answer to a command after {ANSWER_S:g} s"
@@ -513,20 +470,3 @@ class UrArm:
                 f"acceleration: {value:g}, the configuration allows above 0 to "
                 f"{self.config.max_acceleration_m_s2:g}"
             )
-
-
-class _Asked:
-    """Simulated time of which nobody tells: it is asked for."""
-
-    simulated = True
-
-    def __init__(self, clock: SimulatedClock) -> None:
-        self._clock = clock
-        self.ros_ns = self.own_ns = clock.ros_ns
-
-    def now_ns(self) -> int:
-        return self._clock.ask_ns()
-
-    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
-        while self.now_ns() < time_ns:
-            time.sleep(AWAY_S)

@@ -2,11 +2,11 @@
 """Client process of `UrArm`: the only place where ur_rtde runs.
 
 Started as ``python -m tactile_resonance.drivers.ur_client COMMANDS PAGE`` with two open descriptors. It does
-what its owner says and keeps the robot's watchdog quiet; states are the owner's to read. It ends by itself
+what its owner asks for and keeps the robot's watchdog quiet; the owner reads states itself. It ends by itself
 when the owner's end of COMMANDS closes.
 
-In simulated time it takes part in the bench's time: while the owner leads, time goes on as far as each
-command says; else as far as the watchdog is fed.
+It takes part in a simulated bench's time: while the owner leads, time goes on up to the time sent with each
+command; else from one feeding of the watchdog to the next.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ LEAVE_WITHIN_S = 0.5
 
 
 class OwnerGoneError(Exception):
-    """The owner's end is closed: nobody asks any more."""
+    """The owner has closed its end."""
 
 
 class Client:
@@ -61,7 +61,7 @@ class Client:
         self._opened: Session | None = None  # kept where it failed: see `Session.open`
         self._session: Session | None = None
         self._clock: SimulatedClock | None = None
-        self._led = False  # the owner says how far simulated time may go
+        self._led = False  # the owner states how far simulated time may go
         self._fed_ns = 0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
         self._until_ns = 0  # up to when simulated time may go on
         # number and deceleration of a stop that the robot has not taken yet
@@ -81,7 +81,7 @@ class Client:
         except OwnerGoneError:
             self._leave()
 
-    # what the owner says
+    # messages of the owner
 
     def _wait(self) -> list[bytes]:
         """Wait a while for messages of the owner; without velocities that a later command has overtaken."""
@@ -115,7 +115,7 @@ class Client:
         session = self._session
         assert session is not None
         if command.kind == STOP:
-            # whatever becomes of the stop itself, no velocity is said again
+            # whether the stop succeeds or not, no velocity is sent again
             session.motion.rest(command.acceleration)
             self._owed = command.number, command.acceleration
             self._pay(session)
@@ -127,7 +127,7 @@ class Client:
                     self._fed_ns = time.monotonic_ns()
             self._exchange.report(command.number, done)
         if command.until_ns and self._clock is not None:
-            # the owner speaks when the time that he said last has come
+            # the owner sends this when the time that it sent last is reached
             if command.kind == SPEED:
                 self._fed_ns = self._until_ns
             elif command.until_ns - self._fed_ns > 0.5e9 / session.config.watchdog_hz:
@@ -138,7 +138,7 @@ class Client:
             self._exchange.hear(command.until_ns)
 
     def _request(self, request: dict) -> None:
-        """Do what the owner waits for, and answer."""
+        """Do what the owner asks for, and answer."""
         name = request["name"]
         actions: dict[str, Callable[[], None]] = {
             "connect": lambda: self._connect(request),
@@ -185,26 +185,26 @@ class Client:
                 self._stand()
 
     def _stand(self) -> None:
-        """Simulated time stands until the next word of whoever leads it."""
+        """Let simulated time stand until the owner sends how far it may go."""
         if self._clock is None or self._session is None:
             return
         self._session.motion.packets = 0
         self._until_ns = self._clock.ask_ns()
         self._clock.hold(self._until_ns, Demand.NONE, 0)
-        self._clock.ask_ns()  # whoever leads has been told by now
+        self._clock.ask_ns()  # answered after the hold was received
 
-    # what the robot is told
+    # what is sent to the robot
 
     @property
     def _healthy(self) -> bool:
-        """The owner sees a robot that may be told something; he says nothing where he is away."""
+        """Whether the owner lives and sees a robot that may be given commands."""
         seen_s = self._exchange.silence_s()
         return seen_s < HEALTHY_S and Seen.FRESH in self._exchange.seen
 
     def _do(self, action: Callable[[], bool]) -> bool:
         try:
             done = action()
-        except Exception as error:  # the library raises what it likes; the owner hears of it
+        except Exception as error:  # the library documents no exceptions; the owner reads the text
             print(f"{action}: {error}", file=sys.stderr)
             done = False
         if not done:
@@ -213,7 +213,7 @@ class Client:
         return done
 
     def _pay(self, session: Session) -> None:
-        """Tell the robot of the stop that it has not taken yet, once it listens."""
+        """Send the stop that the robot has not taken yet, once it listens."""
         if self._owed is None or not self._healthy:
             return
         (number, deceleration), seen = self._owed, self._exchange.seen
@@ -249,9 +249,9 @@ class Client:
             self._fed_ns = now_ns
 
     def _feed(self, session: Session) -> None:
-        """Keep the watchdog quiet, where somebody listens to that."""
-        told_faulty = self._healthy and Seen.FAULTY in self._exchange.seen
-        if not told_faulty and session.listening:
+        """Keep the watchdog quiet, where the program runs that has one."""
+        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
+        if not faulty and session.listening:
             with contextlib.suppress(Exception):
                 session.motion.feed()
 

@@ -78,7 +78,7 @@ class ClientProcess:
         return self._process.pid
 
     def look(self) -> None:
-        """Tell the client that its owner lives; raise `ArmError` where it is gone."""
+        """Give the client a sign of life; raise `ArmError` where the client is gone."""
         with self._using:
             if not self._ended and self._process.poll() is None:
                 self.exchange.beat()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `UrArm` and its client process tell each other: commands over a socket, signs of life on a page.
+"""What `UrArm` and its client process exchange: commands over a socket, signs of life on a page.
 
 Each value on the page has one writer and eight bytes of its own; neither side waits for the other.
 """
@@ -32,9 +32,9 @@ class Command(NamedTuple):
         `SPEED`, `STOP` or `NOTHING`.
     number : int
     until_ns : int
-        In simulated time: up to when it may go on after the command; 0: not said.
+        In simulated time: up to when it may go on after the command; 0: not stated.
     demand : int
-        How, as `tactile_resonance.clock.Demand`.
+        A `tactile_resonance.clock.Demand`.
     twist : tuple of 6 floats
     acceleration : float
     """
@@ -78,7 +78,7 @@ class Exchange:
         self._page = mmap.mmap(descriptor, SIZE)
 
     def beat(self, seen: Seen | None = None) -> None:
-        """Owner: be alive, and tell what is seen of the robot."""
+        """Owner: give a sign of life, and state what is seen of the robot."""
         if seen is not None:
             self._write(_SEEN, seen)
         self._write(_BEAT, time.monotonic_ns())
@@ -93,7 +93,7 @@ class Exchange:
         return Seen(self._read(_SEEN))
 
     def report(self, number: int, done: bool) -> None:
-        """Client: say what became of a command."""
+        """Client: report that a command was done, or refused."""
         if not done:
             self._write(_REFUSED, number)
         self._write(_DONE, max(number, self._read(_DONE)))
@@ -109,12 +109,12 @@ class Exchange:
         return self._read(_REFUSED)
 
     def hear(self, until_ns: int) -> None:
-        """Client: up to this, simulated time may go on as far as the owner is concerned."""
+        """Client: state the time up to which it has let simulated time go on for the owner."""
         self._write(_HEARD, until_ns)
 
     @property
     def heard_ns(self) -> int:
-        """Owner: the time that the client has passed on last."""
+        """Owner: the time that the client has let go on to last."""
         return self._read(_HEARD)
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ REST = (0.0,) * 6
 
 
 class Motion:
-    """Speeds and stops; each call says whether the robot took it.
+    """Speeds and stops; each call returns whether the robot took it.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Motion:
     def __init__(self, control: Any) -> None:
         self._control = control
         self._twist: tuple[float, ...] = REST
-        self._acceleration_m_s2: float | None = None  # None: no velocity was told yet
+        self._acceleration_m_s2: float | None = None  # None: no velocity was sent yet
         self.packets = 0
 
     @property

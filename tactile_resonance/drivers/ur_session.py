@@ -120,7 +120,7 @@ class Session:
     def _settle(self) -> None:
         """In simulated time: let the library see that the program is ready for the next command."""
         if self._clock is not None:
-            # told itself, also where a loop that leads is told in its place
+            # this reports to the session itself, also while the loop receives the times it waits for
             self._clock.sleep_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ))
 
     def _limit_time(self) -> None:

@@ -23,7 +23,7 @@ class StateReader:
     ----------
     stream : RtdeStream
     now_ns : callable
-        Time of the clock on which states are dated [ns].
+        Returns the time of the clock on which states are dated [ns].
     round_trip_s : float
         Of the network [s].
 
@@ -31,7 +31,7 @@ class StateReader:
     ----------
     newest : RobotState or None
     sample : ArmSample or None
-        The same for those who control the arm.
+        The same state, as the contract of an arm has it.
     fault : tuple of ArmFault and str, or None
         Why no command would be followed in it.
     """
@@ -60,7 +60,7 @@ class StateReader:
         """A program runs, but not the one that was guarded: that one has ended, or was paused.
 
         Whoever started it (the library after a lost connection, someone at the pendant) has not set its
-        watchdog, and it may follow an old velocity. So it is told to the owner as stopped.
+        watchdog, and it may follow an old velocity. So it is reported as stopped.
         """
         runs = self.newest is not None and self.newest.runtime_state == PROGRAM_PLAYING
         return self._ended and runs
@@ -70,13 +70,13 @@ class StateReader:
         self._guarded, self._ended = on, False
 
     def read(self, now_known: bool = True) -> bool:
-        """Take what has come, without waiting; whether that was anything. Raises `ConnectionError`.
+        """Take the states that have come, without waiting; whether any have. Raises `ConnectionError`.
 
-        Where it is not known what time it is now, states are dated by those before.
+        Where the present time is not known, states are dated by the relation of the clocks found before.
         """
         states = self._stream.read()
         last_s = -math.inf if self.newest is None else self.newest.robot_time_s
-        # a robot that stands still in simulated time says the same again
+        # a robot whose simulated time stands repeats its state
         newest, stamps = None, self._stamps
         for state in states:
             if state.robot_time_s == last_s:
@@ -94,7 +94,7 @@ class StateReader:
         return True
 
     def date_anew(self) -> None:
-        """Forget how the robot's clock was related to this one: the newest state is of now."""
+        """Forget how the robot's clock was related to this one, and date the newest state now."""
         self._tracker = self._new_tracker()
         if self.newest is not None:
             self._date(self.newest, True)

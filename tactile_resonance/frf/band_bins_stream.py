@@ -29,7 +29,7 @@ class BandBinsStream:
     Raises
     ------
     ValueError
-        If the band is none, or holds more than `MOST_BINS` bins after the last period.
+        If the band is not 0 <= low < high, or holds more than `MOST_BINS` bins after the last period.
     """
 
     def __init__(

@@ -40,7 +40,7 @@ def poles_of_frf(
     Raises
     ------
     ValueError
-        If the method is none, or ``joint`` is not possible.
+        If the method is unknown, or ``joint`` is not possible.
     """
     if method not in POLES_METHODS:
         raise ValueError(f"method: {method!r}, accepted are {', '.join(POLES_METHODS)}")

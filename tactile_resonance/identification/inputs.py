@@ -102,7 +102,7 @@ def checked_lines(frequency_hz: npt.ArrayLike, name: str) -> FloatArray:
     Raises
     ------
     ValueError
-        Names the first line that is none.
+        Names the first line that is not finite, negative or not above the one before.
     """
     lines_hz = np.asarray(frequency_hz, float)
     if lines_hz.ndim != 1:

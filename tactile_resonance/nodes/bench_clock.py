@@ -31,7 +31,7 @@ class BenchServer:
     Raises
     ------
     ValueError
-        Where the port cannot be had.
+        If the port cannot be opened.
     """
 
     def __init__(self, address: str) -> None:
@@ -47,14 +47,14 @@ class BenchServer:
         self._thread.start()
 
     def close(self) -> None:
-        """End the time, and everybody's part in it."""
+        """End the time, for all participants."""
         self._time.stop()
         self._thread.join()
         self._reactor.close()
 
 
 class BenchNow:
-    """ROS time as the bench has it; of any thread.
+    """ROS time as the bench has it; for any thread.
 
     Parameters
     ----------
@@ -81,5 +81,5 @@ class BenchNow:
             return self._clock.ask_ns()
 
     def _publish(self) -> None:
-        with contextlib.suppress(ClockLostError):  # who owns the bench sees that it has ended
+        with contextlib.suppress(ClockLostError):  # the bench has ended, which its owner reports
             self._publisher.publish(Clock(clock=time_message(self())))

@@ -31,7 +31,7 @@ POLL_S = 5e-4
 class BenchDevice:
     """Keeps the contract of `AcquisitionDevice`; called from a thread other than the executor's.
 
-    In simulated time it lets time go on to the end of each block, and there hands over what happens.
+    In simulated time it lets time go on to the end of each block, where a conductor's `go` ends.
     """
 
     def __init__(self, node: ManagedNode, frame_id: str) -> None:

@@ -36,7 +36,7 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     Raises
     ------
     ValueError
-        If its frame is not that of the base, the way to hold is none, or orientation or normal are none.
+        If its frame is not that of the base, the way to hold is unknown, or orientation or normal is invalid.
     """
     frame = request.pose.header.frame_id
     if frame != base_frame:

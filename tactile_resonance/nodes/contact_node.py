@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -39,8 +38,8 @@ PARAMETERS = (
     Parameter(
         "publish_rate_hz",
         25.0,
-        "So often pose, wrench and state are published [Hz], and at once where the state changes; the wrench "
-        "is the mean since the last one.",
+        "Rate of pose, wrench and state [Hz]; a change of the state is published at once. The wrench is the "
+        "mean since the last one.",
         1.0,
         500.0,
         read_only=True,
@@ -48,9 +47,9 @@ PARAMETERS = (
     Parameter(
         "touch_from_poles",
         False,
-        "First contact is told by poles too, against those in air: the rest of the approach is slow then. "
+        "First contact is detected by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
-        "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and whoever measures has to ask for "
+        "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and the client has to ask for "
         "measurements of one or two periods all the time.",
         read_only=True,
     ),
@@ -125,15 +124,13 @@ class ContactNode(ManagedNode):
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self.every(FEEDBACK_EVERY_S, self._tell)
-        server = ActionServer(
-            self,
+        self.act(
             MakeContact,
             "make_contact",
             self._on_goal,
-            goal_callback=self._on_request,
-            cancel_callback=self._on_cancel,
+            on_cancel=lambda _: self._news.trigger(),
+            ready=self._ready,
         )
-        self.resources.callback(server.destroy)
 
     def activate(self) -> None:
         """Start the loop."""
@@ -207,14 +204,9 @@ class ContactNode(ManagedNode):
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
         return parameters, limits
 
-    def _on_request(self, _: MakeContact.Goal) -> GoalResponse:
+    def _ready(self) -> bool:
         """Goals are taken one at a time, and only while both devices are well."""
-        ready = self.active and self._goal is None and self._fault is None
-        return GoalResponse.ACCEPT if ready else GoalResponse.REJECT
-
-    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
-        self._news.trigger()
-        return CancelResponse.ACCEPT
+        return self._goal is None and self._fault is None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = MakeContact.Result(cause="refused")
@@ -257,7 +249,7 @@ class ContactNode(ManagedNode):
             return response
         self._thread.retract()
         response.success = True
-        response.message = "asked; contact_state tells when it is idle"
+        response.message = "asked; contact_state reports when it is idle"
         return response
 
     def _goal_limits(self, request: MakeContact.Goal) -> Limits:
@@ -319,7 +311,7 @@ class ContactNode(ManagedNode):
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
             if self._touch.hear(message, thread.controller.state, now_ns):
-                self.get_logger().info("the resonance tells the first contact")
+                self.get_logger().info("the resonance detects the first contact")
         except ValueError as error:
             self.health.error(f"poles: {error}")
 

@@ -28,14 +28,14 @@ def contact_parameters() -> tuple[Parameter, ...]:
     """One parameter for each number, the defaults from ``config/contact.yaml``."""
     made = []
     for (group, (kind, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        told = _descriptions(kind)
+        descriptions = _descriptions(kind)
         for name, (low, high) in ranges.items():
             full = f"{group}.{name}"
             made.append(
                 Parameter(
                     full,
                     getattr(defaults, name),
-                    told[name],
+                    descriptions[name],
                     low,
                     high,
                     read_only=full in _READ_ONLY,
@@ -73,8 +73,8 @@ def _defaults() -> tuple[ContactParameters, Limits]:
 def _descriptions(kind: type) -> dict[str, str]:
     """What the class's docstring says of each attribute."""
     text = (inspect.getdoc(kind) or "").split("Attributes\n----------\n", 1)[1]
-    told = {}
+    descriptions = {}
     for names, body in re.findall(r"^(\S.*?) : .*\n((?:    .*\n?)+)", text + "\n", re.MULTILINE):
         for name in names.split(", "):
-            told[name] = " ".join(body.split())
-    return told
+            descriptions[name] = " ".join(body.split())
+    return descriptions

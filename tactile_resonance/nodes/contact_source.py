@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who tells where the tip was and how hard it pressed while a block was taken."""
+"""Sources of the tip's place and force over a block: the service `force_over`, or the topic `tcp_pose`."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from tactile_resonance.srv import ForceOver
 PARAMETER = Parameter(
     "contact_source",
     "force_over",
-    "Who tells where the tip was and how hard it pressed: the service force_over of contact_node (or of the "
-    "simulated bench), or the topic tcp_pose, where nobody measures the force.",
+    "Source of the tip's place and force over a block: the service force_over of contact_node (or of the "
+    "simulated bench), or the topic tcp_pose where no force is measured.",
     choices=("force_over", "tcp_pose"),
     read_only=True,
 )
 
 ANSWER_WITHIN_S = 0.25
-"""A record waits no longer for its force, on the machine's clock; in simulated time nothing is late."""
+"""Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
 POLL_S = 5e-4
 
 
 class ContactSource(Protocol):
-    """Tells of an interval that has passed; called from a thread other than the executor's."""
+    """Place and force over a past interval; called from a thread other than the executor's."""
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
-        """Contact from one ROS time to another [ns]; where the force is unknown it says why."""
+        """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
         ...
 
 
 def make_contact_source(node: ManagedNode) -> ContactSource:
     """The source that the node's parameter names."""
     (name,) = values(node, PARAMETER.name)
-    return MeasuredContact(node) if name == "force_over" else ToldPlace(node)
+    return MeasuredContact(node) if name == "force_over" else PublishedPlace(node)
 
 
 class MeasuredContact:
@@ -55,7 +55,7 @@ class MeasuredContact:
     def over(self, start_ns: int, end_ns: int) -> Contact:
         """See `ContactSource`."""
         if not self._client.service_is_ready():
-            return Contact(reason=f"nobody serves {self._client.srv_name}")
+            return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         future = self._client.call_async(request)
         deadline = time.monotonic() + self._within_s
@@ -66,13 +66,13 @@ class MeasuredContact:
                     reason=f"no answer on {self._client.srv_name} within {self._within_s:g} s"
                 )
             time.sleep(POLL_S)
-        told: ForceOver.Response = future.result()
-        contact = contact_from_message(told.tip_pose, told.force_n, told.force_std_n)
-        return replace(contact, coverage=told.coverage, reason=told.reason)
+        over: ForceOver.Response = future.result()
+        contact = contact_from_message(over.tip_pose, over.force_n, over.force_std_n)
+        return replace(contact, coverage=over.coverage, reason=over.reason)
 
 
-class ToldPlace:
-    """By the topic `tcp_pose`: the force is measured by nobody."""
+class PublishedPlace:
+    """By the topic `tcp_pose`; the force is not measured."""
 
     def __init__(self, node: ManagedNode) -> None:
         self._pose = PoseStamped()

@@ -22,7 +22,7 @@ from tactile_resonance.drivers.ur_arm import UrArm
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0
 POLL_S = 0.01
-# A loop of which nothing was seen for so long hangs.
+# A loop without a cycle for so long hangs.
 HUNG_S = 1.0
 # Between two attempts to start a force source that has failed.
 SOURCE_AGAIN_S = 0.25
@@ -67,7 +67,7 @@ class ContactThread:
         self._arm, self._force = arm, force
         self._lock = threading.Lock()
         self._running = True
-        self._time_passed = False  # simulated time, while the loop stood at the lock
+        self._time_passed = False  # simulated time has gone on while the loop waited for the lock
         self._source_tried_s = 0.0
         self._alive_s = time.monotonic()
         self._led = LedClock(arm, force.cell, self._stay) if simulated else None
@@ -83,7 +83,7 @@ class ContactThread:
 
     @property
     def waits_for(self) -> str:
-        """What keeps simulated time from going on, for people; empty: nothing of the arm."""
+        """What holds simulated time up, for people; empty: nothing of the arm."""
         return self._arm.waits_for
 
     def configure(self, parameters: ContactParameters, limits: Limits) -> None:
@@ -105,7 +105,7 @@ class ContactThread:
         self._hurry()
 
     def tell_touch(self) -> bool:
-        """Pass on that another sensor tells the first contact; whether that is new in an approach."""
+        """Pass on that another sensor has detected the first contact; whether that is new in an approach."""
         with self._lock:
             return self.controller.tell_touch()
 
@@ -151,7 +151,7 @@ class ContactThread:
                 self.loop.wait()
                 with self._lock:
                     if self._led is not None and self._time_passed:
-                        # what came meanwhile was not waited for: it would seem old
+                        # the data of that time were not waited for, and would seem old
                         self._time_passed = False
                         self._led.ask_ns()
                         self.loop.skip()
@@ -163,7 +163,7 @@ class ContactThread:
         except _EndedError:
             pass
         except Exception as error:
-            # nobody judges any more: first of all the arm stops
+            # nothing supervises the arm any more: first of all it stops
             with contextlib.suppress(Exception):
                 self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
             self.error = error

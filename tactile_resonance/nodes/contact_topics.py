@@ -17,11 +17,11 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import STREAM, RCLError
 
 SAID_AGAIN_S = 0.1
-"""While simulated time stands the state is told again, by this machine's clock."""
+"""While simulated time stands the state is published again after so long, by this machine's clock [s]."""
 
 
 class ContactTopics:
-    """Publishes so often, and whenever the state changes, to those who listen.
+    """Publishes at a rate, and whenever the state changes, where there are subscribers.
 
     Parameters
     ----------
@@ -58,12 +58,12 @@ class ContactTopics:
         try:
             self._publish(wrenches, cycle, thread)
         except RCLError:
-            # once ROS has been shut down nobody listens, but the tip is still to be drawn back
+            # once ROS has been shut down there are no subscribers, but the tip is still to be drawn back
             if self._node.context.ok():
                 raise
 
     def say_again(self) -> None:
-        """Tell the newest state to those who missed it, where nothing new was told for a while."""
+        """Publish the newest state again, for those that missed it, where none was published for a while."""
         if self._newest is not None and time.monotonic() - self._said_s > SAID_AGAIN_S:
             self._say(self._newest)
 

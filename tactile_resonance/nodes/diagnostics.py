@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node tells about its own health on `/diagnostics`, once a second."""
+"""A node's report on its own health on `/diagnostics`, once a second."""
 
 from __future__ import annotations
 

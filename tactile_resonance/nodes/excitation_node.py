@@ -7,7 +7,6 @@ import threading
 import time
 from dataclasses import replace
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
@@ -34,7 +33,6 @@ PARAMETERS = (
 
 
 # How long a client may take to fetch a result.
-RESULT_TIMEOUT_S = 900
 # A device that is read shows life within this beyond the length of a block.
 HUNG_S = 2.0
 
@@ -74,26 +72,13 @@ class ExcitationNode(ManagedNode):
         self._measured: ServerGoalHandle | None = None
         self._measurements = 0
         self._read_by_s = float("inf")  # when a device that is read must have shown life
-        server = ActionServer(
-            self,
-            Measure,
-            "measure",
-            self._on_goal,
-            goal_callback=self._on_request,
-            cancel_callback=self._on_cancel,
-            result_timeout=RESULT_TIMEOUT_S,
-        )
-        self.resources.callback(server.destroy)
+        self.act(Measure, "measure", self._on_goal, self._on_cancel)
 
-    def _on_request(self, _: Measure.Goal) -> GoalResponse:
-        return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
-
-    def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+    def _on_cancel(self, goal: ServerGoalHandle) -> None:
         """At once where the device can, for a block under way is of no use to anybody."""
         if goal is self._measured:
             self._cancelled.set()
             self._device.interrupt()
-        return CancelResponse.ACCEPT
 
     def working(self) -> bool:
         """A device that does not come back from a block hangs."""

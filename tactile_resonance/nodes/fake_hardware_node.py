@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import math
-import threading
-import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,18 +14,15 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.clock import ClockLostError
 from tactile_resonance.configuration import share_path
-from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
+from tactile_resonance.nodes.bench_player import BenchPlayer, bench_record
 from tactile_resonance.nodes.conversions import (
-    contact_from_message,
     excitation_from_message,
-    poles_to_message,
     pose_to_message,
     record_to_message,
-    time_from_message,
     time_message,
     truth_to_response,
 )
@@ -34,9 +30,10 @@ from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
-from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, TRUTHS, run_node
-from tactile_resonance.record import Channel, Contact, Origin, Record
-from tactile_resonance.simulation.acquisition import BenchEffects, Block, ChannelSamples
+from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.truth_topic import TruthTopic
+from tactile_resonance.record import Contact
+from tactile_resonance.simulation.acquisition import BenchEffects, Block
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bench_tip import BenchTip
@@ -65,7 +62,7 @@ PARAMETERS = (
         "serve_contact",
         False,
         "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the "
-        "tip is wherever tcp_pose says.",
+        "tip is where tcp_pose states.",
         read_only=True,
     ),
     Parameter(
@@ -84,6 +81,7 @@ PARAMETERS = (
 )
 
 
+EFFECTS = ("noise", "quantisation", "nonlinearity")
 PLANT_CHECK_S = 0.5
 LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
 
@@ -93,7 +91,7 @@ class FakeHardwareNode(ManagedNode):
 
     With a robot the tip is where the robot holds it, and the contact that of the plant as an excitation
     begins: its force held from then on, the tissue creeping. Without one contact is ideal, at the scene's
-    force or the one asked for: wherever `tcp_pose` says, or where the action `make_contact` puts the tip,
+    force or the one asked for: where `tcp_pose` states, or where the action `make_contact` puts the tip,
     which this node serves then; the force comes back on `wrench` and from the service `force_over`. What the
     simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it is put
     somewhere or an excitation begins; of a contact that creeps also with each block. In simulated time it
@@ -102,12 +100,10 @@ class FakeHardwareNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("fake_hardware_node", PARAMETERS)
-        self._playing: threading.Thread | None = None
-        self._stop = threading.Event()
-        self._player_clock: SimulatedClock | None = None
+        self._player = BenchPlayer(self.time_server)
 
     def configure(self) -> None:
-        """Read the scene, make the sensor and, where it is asked for, the robot."""
+        """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
         scene, self._frame_id = values(self, "scene", "frame_id")
         path = Path(scene)
         scene_path = path if path.is_absolute() else share_path(scene)
@@ -117,7 +113,7 @@ class FakeHardwareNode(ManagedNode):
         self._tip = BenchTip(None, 0.0, 1.0)
         self._plant: PlantChild | None = None
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
-        self._truth = self.publish_on(msg.Poles, "bench/truth", TRUTHS)
+        self._truth = TruthTopic(self, self._bench, self._frame_id)
         host, table, seed, serve = values(
             self, "robot_host", "table_in_base", "seed", "serve_contact"
         )
@@ -148,7 +144,7 @@ class FakeHardwareNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Silence the output."""
-        self._silence()
+        self._player.silence()
 
     def _serve_ideal_contact(self, by_action: bool) -> None:
         if by_action:
@@ -158,7 +154,7 @@ class FakeHardwareNode(ManagedNode):
             )
         else:
             self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-            # whoever puts the tip somewhere waits until it is heard; others may tell as they like
+            # a scan waits until the pose is received, which needs a reliable subscription; others publish
             self.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
             self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.serve(ForceOver, "force_over", self._stays.serve)
@@ -196,36 +192,7 @@ class FakeHardwareNode(ManagedNode):
 
     def _put(self, tip: BenchTip, pose: PoseStamped) -> None:
         self._tip = tip
-        self._publish_truth(pose, tip)
-
-    def _publish_truth(
-        self,
-        pose: PoseStamped,
-        tip: BenchTip,
-        measurement_id: int = 0,
-        force_n: float | None = None,
-    ) -> None:
-        """Tell the exact modes of a tip; `force_n` where the force was another one on the mean."""
-        modes = truth_of(tip.coupled(self._bench), ()).modes
-        truth = Poles(
-            poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
-            f0_hz=np.array([mode.f0_hz for mode in modes]),
-            damping_ratio=np.array([mode.damping_ratio for mode in modes]),
-            residues=np.array([mode.residue_rad_s for mode in modes]),
-            method="simulation",
-            status=PolesStatus.TRUTH,
-            message="exact poles of the simulated sensor on this tissue",
-        )
-        origin = Origin(
-            measurement_id=measurement_id,
-            time_ns=time_from_message(pose.header.stamp),
-            final=True,
-            frame_id=self._frame_id,
-            label=tip.tissue.name if tip.tissue else "air",
-            simulated=True,
-            contact=contact_from_message(pose, tip.force_n if force_n is None else force_n, 0.0),
-        )
-        self._truth.publish(poles_to_message(truth, origin))
+        self._truth.publish(pose, tip)
 
     def _check_plant(self) -> None:
         if self._plant is not None and not self._plant.alive:
@@ -247,7 +214,7 @@ class FakeHardwareNode(ManagedNode):
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
         self._plant_ahead_s = true.time_s - place.time_ns * 1e-9
         self._stays.add(Stay(place.time_ns, true.force_n, pose_to_message(place)))
-        self._publish_truth(self._stays.newest.pose, self._tip)
+        self._truth.publish(self._stays.newest.pose, self._tip)
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         if not self.active:
@@ -255,15 +222,7 @@ class FakeHardwareNode(ManagedNode):
             return response
         try:
             excitation = excitation_from_message(request.excitation)
-            effects = BenchEffects(
-                **dict(
-                    zip(
-                        ("noise", "quantisation", "nonlinearity"),
-                        values(self, "noise", "quantisation", "nonlinearity"),
-                        strict=True,
-                    )
-                )
-            )
+            effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
@@ -274,22 +233,14 @@ class FakeHardwareNode(ManagedNode):
                 int(entropy.generate_state(1, np.uint64)[0]),
                 effects,
             )
-            self._silence()
+            self._player.silence()
             start_ns = self._now_ns()
-            if self.time_server:
-                self._player_clock = SimulatedClock(self.time_server, "bench")
+            hand_out = self._hand_out(excitation, start_ns, self._stays.newest.pose, self._tip)
+            self._player.play(run, excitation, start_ns, hand_out)
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
         self._say_effort(run, excitation)
-        self._stop = threading.Event()
-        self._playing = threading.Thread(
-            target=self._play,
-            args=(run, excitation, start_ns, self._stop, self._stays.newest.pose, self._tip),
-            name="bench",
-            daemon=True,
-        )
-        self._playing.start()
         response.accepted, response.start = True, time_message(start_ns)
         return response
 
@@ -322,47 +273,30 @@ class FakeHardwareNode(ManagedNode):
         return response
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._silence()
+        self._player.silence()
         response.success = True
         return response
 
-    def _silence(self) -> None:
-        self._stop.set()
-        if self._player_clock is not None:
-            self._player_clock.interrupt()
-        if self._playing is not None:
-            self._playing.join()
-            self._playing = None
-        if self._player_clock is not None:
-            self._player_clock.close()
-            self._player_clock = None
-
-    def _play(
-        self,
-        run: BenchRun,
-        excitation: Excitation,
-        start_ns: int,
-        stop: threading.Event,
-        pose: PoseStamped,
-        tip: BenchTip,
-    ) -> None:
-        """Publish block after block, each when its last sample would have been taken.
+    def _hand_out(
+        self, excitation: Excitation, start_ns: int, pose: PoseStamped, tip: BenchTip
+    ) -> Callable[[Block, int], None]:
+        """What publishes a block at its end.
 
         A contact that creeps has its truth with every block: that of the middle of all blocks so far, with
         the stamp that their poles will have, and the plant's mean force over them.
         """
-        for block in run.play(excitation, excitation.periods):
-            due_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
-            if not self._wait_until(due_ns, stop):
-                return
+
+        def hand_out(block: Block, end_ns: int) -> None:
             if tip.creeping:
                 half_s = (block.index + 1) * excitation.period_s / 2
                 middle = replace(tip, since_s=tip.since_s + half_s)
                 pose.header.stamp = time_message(start_ns + round(half_s * 1e9))
-                force_n = self._plant_force_n(start_ns, due_ns)
-                self._publish_truth(pose, middle, excitation.measurement_id, force_n)
-            first_ns = start_ns + round(block.start_time_s * 1e9)
-            self._blocks.publish(record_to_message(self._record(block, excitation, first_ns)))
+                force_n = self._plant_force_n(start_ns, end_ns)
+                self._truth.publish(pose, middle, excitation.measurement_id, force_n)
+            record = bench_record(block, excitation, start_ns, self._frame_id)
+            self._blocks.publish(record_to_message(record))
+
+        return hand_out
 
     def _plant_force_n(self, from_ns: int, to_ns: int) -> float:
         """Mean force of the plant over an interval; NaN where the plant has ended."""
@@ -372,41 +306,6 @@ class FakeHardwareNode(ManagedNode):
             return self._plant.mean_force_n(from_s, to_s)
         except OSError:
             return math.nan
-
-    def _wait_until(self, due_ns: int, stop: threading.Event) -> bool:
-        """Wait for a time; whether what is played goes on."""
-        if self._player_clock is None:
-            stop.wait(max(0, due_ns - time.time_ns()) / 1e9)
-            return not stop.is_set()
-        try:
-            self._player_clock.sleep_until(due_ns)
-        except ClockLostError:
-            return False
-        return not stop.is_set()
-
-    def _record(self, block: Block, excitation: Excitation, first_ns: int) -> Record:
-        return Record(
-            actuator=_channel(block.actuator),
-            sensor=_channel(block.sensor),
-            sample_rate_hz=block.sample_rate_hz,
-            samples_per_period=block.samples_per_period,
-            realisation=excitation.realisation,
-            block_index=block.index,
-            origin=Origin(
-                measurement_id=excitation.measurement_id,
-                excitation_id=excitation.excitation_id,
-                time_ns=first_ns,
-                frame_id=self._frame_id,
-                label=excitation.label,
-                simulated=True,
-            ),
-        )
-
-
-def _channel(samples: ChannelSamples) -> Channel:
-    if samples.counts is None:
-        return Channel(samples.volts, saturated=samples.saturated)
-    return Channel(samples.counts, samples.scale_v, 0.0, samples.saturated)
 
 
 def main() -> None:

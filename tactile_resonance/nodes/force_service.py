@@ -20,7 +20,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.srv import ForceOver
 
 WAIT_S = 0.2
-"""A block that the loop has not come to the end of is waited for so long, on the machine's clock."""
+"""An answer waits so long for the loop to come to the end of its block, on the machine's clock [s]."""
 
 
 class ForceService:
@@ -68,7 +68,7 @@ class ForceService:
             self._guard.trigger()
 
     def look(self) -> None:
-        """Answer those whose block is over by now, and those who have waited for long."""
+        """Answer requests whose block is over by now, and those that have waited too long."""
         now_s = time.monotonic()
         for entry in list(self._waiting):
             end_ns, deadline_s, future = entry

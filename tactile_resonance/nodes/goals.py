@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Goals of actions, asked for and followed from a thread of one's own while nodes come and go.
 
-Every goal has an id that is given here, before anything is sent. So one whose answer is late, or lost, is
-asked for again under the same id, and is taken once; and one that is given up can be cancelled whether its
-answer came or not. No goal is left of which nobody knows.
+Every goal has an id that is chosen here, before anything is sent. So a goal whose answer is late, or lost, is
+sent again under the same id, and accepted once; and a goal that is given up can be cancelled whether its answer
+came or not. No goal goes on that is no longer followed.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from unique_identifier_msgs.msg import UUID
 from tactile_resonance.scan.hands import Check, Interrupted, NodeAway, PointFailed, ScanEnded
 
 POLL_S = 0.005
-# A node that was started anew needs so long at most until it takes goals again.
+# A node that was started anew accepts goals again within this.
 TAKEN_WITHIN_S = 60.0
-# An answer that has not come by then may be lost: it is asked for again.
+# An answer that has not come by then may be lost: the goal is sent again.
 ASK_AGAIN_S = 2.0
 # A measurement that is cancelled ends with its block.
 GOAL_ENDS_WITHIN_S = 15.0
 REFUSED_AGAIN_S = 0.05
 
 Poll = Callable[[], None]
-"""Called while waiting; raises where waiting has become pointless."""
+"""Called while waiting; raises where what is waited for cannot come."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Goals:
     name : str
         Of the action, for messages.
     pause : callable
-        Lets a time pass [s]; answers are taken meanwhile, by another thread or by this call.
+        Waits for a time [s]; answers are received meanwhile, by another thread or by this call.
     """
 
     client: ActionClient
@@ -56,14 +56,14 @@ class Goals:
     def send(
         self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None = None
     ) -> ClientGoalHandle:
-        """Goal that was accepted; waits for a node that is being brought back, and while it is refused.
+        """Send a goal until it is accepted; waits for a node that is being brought back.
 
         Raises
         ------
         NodeAway
             If the node goes away meanwhile.
         ScanEnded
-            If none takes it.
+            If no node accepts it.
         """
         deadline = time.monotonic() + TAKEN_WITHIN_S
         while time.monotonic() < deadline:
@@ -78,7 +78,7 @@ class Goals:
         raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
 
     def follow(self, handle: ClientGoalHandle, check: Check, poll: Poll) -> Any:
-        """Result of a goal; one that is left for whatever reason is cancelled and waited for."""
+        """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for."""
         future = handle.get_result_async()
         try:
             while not future.done():
@@ -90,7 +90,7 @@ class Goals:
             if future.result().status == GoalStatus.STATUS_UNKNOWN:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
         except (PointFailed, Interrupted, ScanEnded):
-            # one that was started anew, or is gone, does not know the goal: there is no end to wait for
+            # a node that was started anew, or is gone, does not know the goal: its end is not waited for
             cancelled = handle.cancel_goal_async()
             if self._done(cancelled, ASK_AGAIN_S) and cancelled.result().goals_canceling:
                 self._done(future, GOAL_ENDS_WITHIN_S)
@@ -100,7 +100,7 @@ class Goals:
     def _send(
         self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None
     ) -> ClientGoalHandle | None:
-        """Handle of a goal that was taken; None where it was refused."""
+        """Handle of a goal that was accepted; None where it was refused."""
         goal_id = UUID(uuid=list(uuid.uuid4().bytes))
 
         def ask() -> Future:
@@ -115,7 +115,7 @@ class Goals:
                 if taken is not None:
                     return taken
                 if futures[-1].done():
-                    # of one that was asked for twice a refusal may mean that it is known already
+                    # where it was sent twice a refusal may mean that it is known already
                     refused = futures[-1].result()
                     if len(futures) > 1 and self._known(refused):
                         return refused
@@ -131,7 +131,7 @@ class Goals:
                 self.pause(POLL_S)
         except BaseException:
             _drop(futures)
-            # its answer may be lost, and a cancellation needs none; where ROS has ended nobody takes it
+            # its answer may be lost, and a cancellation does not need it; RuntimeError: ROS has been shut down
             with contextlib.suppress(RuntimeError):
                 ClientGoalHandle(self.client, goal_id, None).cancel_goal_async()
             raise
@@ -152,12 +152,12 @@ class Goals:
 
 
 def _drop(futures: list[Future]) -> None:
-    """Take no notice of answers any more, but cancel what they accept."""
+    """Ignore answers from now on, but cancel goals that they accept."""
     for future in futures:
         future.add_done_callback(_cancel_if_taken)
 
 
 def _cancel_if_taken(future: Future) -> None:
-    """A goal that nobody follows any more does not go on."""
+    """Cancel a goal that was accepted and is no longer followed."""
     if not future.cancelled() and future.exception() is None and future.result().accepted:
         future.result().cancel_goal_async()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ideal contact, served as contact_node serves that of a robot: for those who integrate, without its 500 Hz.
+"""Ideal contact through the interfaces of contact_node, to try a stack without a 500 Hz loop.
 
-The tip is wherever a goal puts it, after a time, and the force is exactly the one asked for. There is no robot,
-no load cell and no control law behind it; what those do wrong is not to be seen here.
+The tip is where a goal puts it, after a fixed time, and the force is exactly the one asked for. There is no
+robot, no load cell and no control law behind it, and none of their errors.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
@@ -46,7 +45,7 @@ class Stay:
     force_n : float
         0 in air.
     pose : PoseStamped
-        With an empty frame where nobody has told.
+        With an empty frame where it is unknown.
     """
 
     since_ns: int
@@ -98,9 +97,9 @@ class IdealContact:
     Parameters
     ----------
     node : ManagedNode
-        Whose they are, until it is cleaned up.
+        Owns the interfaces, until it is cleaned up.
     stays : Stays
-        Where it puts the tip.
+        Receives each place of the tip.
     force_at : callable
         From a place (3,) in the base [m] and the force asked for [N]: the depth that brings it [m] and the
         height of the surface above that place [m]; None where nothing is to be touched.
@@ -133,20 +132,12 @@ class IdealContact:
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
         node.serve(Trigger, "retract", self._on_retract)
         node.every(PUBLISH_S, self._publish)
-        server = ActionServer(
-            node,
-            MakeContact,
-            "make_contact",
-            self._on_goal,
-            goal_callback=lambda _: GoalResponse.ACCEPT if node.active else GoalResponse.REJECT,
-            cancel_callback=self._on_cancel,
-        )
-        node.resources.callback(server.destroy)
+        node.act(MakeContact, "make_contact", self._on_goal, lambda _: self._draw_back())
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
         if goal.is_cancel_requested:
-            self._draw_back()  # where that was asked for before the work began
+            self._draw_back()  # for a cancellation before the work began
             goal.canceled()
         elif result.reached:
             goal.succeed()
@@ -198,7 +189,7 @@ class IdealContact:
             self._lock.release()
 
     def _refusal(self, request: MakeContact.Goal) -> str:
-        """Why a goal is not taken; empty where it is."""
+        """Why a goal is refused; empty where it is accepted."""
         frame = request.pose.header.frame_id
         if frame != self._base_frame:
             return f"pose: in frame {frame!r}, accepted is {self._base_frame!r}"
@@ -225,14 +216,10 @@ class IdealContact:
             return False
         return not self._drawn_back.is_set()
 
-    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
-        self._draw_back()
-        return CancelResponse.ACCEPT
-
     def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._draw_back()
         response.success = True
-        response.message = "asked; contact_state tells when it is idle"
+        response.message = "asked; contact_state reports when it is idle"
         return response
 
     def _draw_back(self) -> None:

@@ -6,12 +6,14 @@ from __future__ import annotations
 import os
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.exceptions import ParameterException
@@ -33,6 +35,9 @@ REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterExc
 BEAT_S = 0.2
 """Between two signs of life, by this machine's clock."""
 
+KEEP_RESULT_S = 900
+"""The result of a goal that has ended can be asked for so long [s]."""
+
 TIME_SERVER = Parameter(
     "time_server",
     "",
@@ -43,8 +48,8 @@ TIME_SERVER = Parameter(
 HUNG_AFTER = Parameter(
     "hung_after_s",
     60.0,
-    "In simulated time: what has not answered for so long hangs, by this machine's clock: a scan ends, and "
-    "can be resumed.",
+    "In simulated time: a node without an answer for so long, by this machine's clock, hangs [s]; the "
+    "scan ends, and can be resumed.",
     5.0,
     86400.0,
     read_only=True,
@@ -52,12 +57,12 @@ HUNG_AFTER = Parameter(
 
 
 class ManagedNode(LifecycleNode):
-    """A lifecycle node whose subclasses say only what they set up and what they do.
+    """A lifecycle node whose subclasses define only what they set up and what they do.
 
-    `configure` makes publishers, subscriptions, services and devices through `publish_on`, `listen`,
-    `serve` and `resources`; the way back undoes them in reverse order. What arrives while the node is
-    not active is dropped, and what it publishes then goes nowhere. On `heartbeat` it tells those who listen
-    that it works.
+    `configure` makes publishers, subscriptions, services, actions and devices through `publish_on`, `listen`,
+    `serve`, `act` and `resources`; the way back undoes them in reverse order. What arrives while the node is
+    not active is dropped, and nothing is published then. Those who listen on `heartbeat` get its
+    signs of life.
 
     Parameters
     ----------
@@ -84,7 +89,7 @@ class ManagedNode(LifecycleNode):
             msg.Heartbeat, "heartbeat", BEATS, event_callbacks=events
         )
 
-    # What a subclass says
+    # What a subclass defines
 
     def configure(self) -> None:
         """Set up; refuse with ValueError, OSError or DeviceError."""
@@ -94,14 +99,14 @@ class ManagedNode(LifecycleNode):
         """Begin to work."""
 
     def deactivate(self) -> None:
-        """Stop working at once; may be called when nothing is under way."""
+        """Stop working at once; may be called when it is not working."""
 
     def details(self) -> Mapping[str, str]:
         """Figures for the diagnostics beside rates and errors."""
         return {}
 
     def working(self) -> bool:
-        """Whether threads of its own move on; the executor's does where this is asked."""
+        """Whether threads of its own move on; the executor calls this, so that its own does."""
         return True
 
     def waiting_for(self) -> str:
@@ -151,6 +156,38 @@ class ManagedNode(LifecycleNode):
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
 
+    def act(
+        self,
+        kind: type,
+        name: str,
+        callback: Callable[[ServerGoalHandle], Awaitable[Any]],
+        on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
+        ready: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """Action until the node is cleaned up.
+
+        Goals are accepted while the node is active and `ready`. A request to cancel is always accepted; the
+        callback ends the goal.
+        """
+
+        def on_request(_: Any) -> GoalResponse:
+            return GoalResponse.ACCEPT if self.active and ready() else GoalResponse.REJECT
+
+        def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:
+            on_cancel(goal)
+            return CancelResponse.ACCEPT
+
+        server = ActionServer(
+            self,
+            kind,
+            name,
+            callback,
+            goal_callback=on_request,
+            cancel_callback=on_cancel_request,
+            result_timeout=KEEP_RESULT_S,
+        )
+        self.resources.callback(server.destroy)
+
     def set_up(self, make: Callable[[], None]) -> Callable[[], None]:
         """Let `make` set up what is let go by calling what is returned, at the latest with the rest."""
         rest, self.resources = self.resources, ExitStack()
@@ -176,12 +213,12 @@ class ManagedNode(LifecycleNode):
 
     @property
     def time_server(self) -> str:
-        """Address of the simulated time in which the node lives; empty: none."""
+        """Address of the simulated time in which the node lives; empty: it lives by the machine's clock."""
         return str(values(self, TIME_SERVER.name)[0])
 
     @property
     def hung_after_s(self) -> float:
-        """In simulated time, which stands meanwhile: so long an answer is waited for."""
+        """In simulated time: how long an answer is waited for, by the machine's clock [s]."""
         return float(values(self, HUNG_AFTER.name)[0])
 
     def fail(self, reason: str) -> None:
@@ -217,7 +254,7 @@ class ManagedNode(LifecycleNode):
         return self._state_machine.current_state[1]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Set up, or say why not and stay unconfigured."""
+        """Set up, or report why not and stay unconfigured."""
         try:
             self.configure()
         except REFUSALS as error:

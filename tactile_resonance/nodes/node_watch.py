@@ -14,9 +14,9 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import BEATS
 
 SILENT_S = 1.5
-"""A node that was silent for longer hangs, or has ended [s of this machine's clock]."""
+"""A node without a sign of life for longer hangs, or has ended [s of this machine's clock]."""
 SAID_AFTER_S = 5.0
-"""Who is waited for is said after this."""
+"""A node that is waited for is named after this [s of this machine's clock]."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class _Sign:
 
 
 Instances = dict[str, int]
-"""Of each node behind the topics, which start of it is at work."""
+"""Instance (one start of a node) at work, by the node's name."""
 
 
 class NodeWatch:
-    """Listens to the signs of life of those who publish some topics.
+    """Listens to the signs of life of the nodes that publish some topics.
 
-    A publisher in the graph does not say that its node is there: one that was killed stays in it for as long
-    as its lease lasts, one that was started anew publishes nothing before it is active. A node that never
-    gave a sign of life, somebody else's, is taken to be at work while it publishes.
+    A publisher in the graph does not prove that its node is there: one that was killed stays in the graph for
+    as long as its lease lasts, one that was started anew publishes nothing before it is active. A node of
+    another package, which gives no signs of life, is taken to be at work while it publishes.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class NodeWatch:
         self._node, self._topics, self._silent_s = node, tuple(topics), silent_s
         self._lock = threading.Lock()
         self._signs: dict[str, _Sign] = {}
-        self._behind: dict[str, set[str]] = {}  # who published a topic when somebody did last
+        self._behind: dict[str, set[str]] = {}  # newest publishers of a topic, which may have gone
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
     def met(self) -> bool:
@@ -67,20 +67,20 @@ class NodeWatch:
             return names <= self._signs.keys()
 
     def missing(self) -> str | None:
-        """A topic that nobody at work publishes, as a sentence; None: there is none."""
+        """A topic that no node at work publishes, as a sentence; None: all topics are published."""
         for topic in self._topics:
             nodes = self._publishers(topic)
             if not nodes:
-                return f"{topic}: nobody publishes it"
+                return f"{topic}: no node publishes it"
             problems = [self._problem(node) for node in sorted(nodes)]
             if all(problems):
                 return f"{topic}: {' and '.join(filter(None, problems))}"
         return None
 
     def hung(self) -> str:
-        """Who is at work behind a topic, and silent for too long, as a sentence; empty: nobody.
+        """A node behind a topic that is silent for too long, as a sentence; empty: none is.
 
-        One whose lease in the graph is over by now, because it was silent, is among them.
+        Nodes whose lease in the graph has ended, because they were silent, count too.
         """
         for topic in self._topics:
             self._publishers(topic)
@@ -90,7 +90,7 @@ class NodeWatch:
         return ""
 
     def instances(self, topics: Sequence[str]) -> Instances:
-        """Which starts of the nodes behind topics are at work now."""
+        """Instances of the nodes behind topics that are at work now."""
         names = {name for topic in topics for name in self._publishers(topic)}
         with self._lock:
             return {name: self._signs[name].instance for name in names if name in self._signs}
@@ -107,7 +107,7 @@ class NodeWatch:
         return None
 
     def waited_for(self, instances: Instances) -> str:
-        """Who of these has been silent for a while, or waits himself, for people; empty: nobody."""
+        """One of these that is silent for a while, or waits for something itself, for people; empty: none."""
         now_s = time.monotonic()
         for name in instances:
             with self._lock:
@@ -122,7 +122,7 @@ class NodeWatch:
 
     @contextmanager
     def doubted_after(self, error: type[Exception]) -> Iterator[None]:
-        """After such an error believe only what is told from then on: one of them may be another by now."""
+        """After such an error doubt all nodes until their next sign of life: one may have been started anew."""
         try:
             yield
         except error:
@@ -140,7 +140,7 @@ class NodeWatch:
         return self._silence(node) or f"{node} is {sign.state}, not active"
 
     def _silence(self, node: str) -> str:
-        """That a node, or what it waits for, is silent for too long; empty where neither is."""
+        """A node, or what it waits for, is silent for too long, as a sentence; empty where neither is."""
         with self._lock:
             sign = self._signs.get(node)
         if sign is None:

@@ -30,7 +30,7 @@ from tactile_resonance.drivers.acquisition import DeviceError
 RCLError = rclpy_implementation.RCLError
 
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""This machine's, for what has to go on while simulated time stands."""
+"""This machine's clock, for timers that must go on while simulated time stands."""
 
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
 RESULTS = QoSProfile(
@@ -86,7 +86,7 @@ BEATS = QoSProfile(
 
 
 END_WITHIN_S = 20.0
-"""From being asked to end: a tip is drawn back meanwhile."""
+"""A node must end within this after a signal; it draws the tip back first [s]."""
 
 
 @contextmanager

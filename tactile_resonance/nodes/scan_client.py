@@ -37,7 +37,7 @@ class ScanClient(NodeClient):
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
     def why(self) -> str:
-        """What the diagnostics say of each node."""
+        """State of each node from the diagnostics."""
         told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
         return told or "no diagnostics"
 
@@ -46,7 +46,7 @@ class ScanClient(NodeClient):
         return self._details.get(node, {})
 
     def wait_until_up(self, timeout_s: float) -> None:
-        """Until the manager tells that all nodes are active.
+        """Wait until the manager reports that all nodes are active.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class ScanClient(NodeClient):
                 continue  # of another sensor
             name = Path(status.name).name
             self._details[name] = {value.key: value.value for value in status.values}
-            # why a node does not come up is told for seconds, that it does not for longer
+            # a node reports for seconds why it does not come up, then only that it has not
             refused = self.states.get(name, "").startswith(f"{status.message}: ")
             if status.level == DiagnosticStatus.ERROR or not refused:
                 self.states[name] = status.message

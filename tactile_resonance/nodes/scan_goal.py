@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks scan_node for one scan, tells how it goes and ends with it: for launch files."""
+"""Asks scan_node for one scan, reports its progress and ends with it: for launch files."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ScanGoal(ScanClient):
         say = self._node.get_logger().info
         say(
             f"{result.message}: {result.done} of {result.points} points with poles, {result.failed} failed, "
-            f"{result.skipped} skipped, {result.repeats} times begun again; run in {result.run_directory}"
+            f"{result.skipped} skipped, {result.repeats} repeats; run in {result.run_directory}"
         )
         if result.sensor_health:
             say(result.sensor_health)

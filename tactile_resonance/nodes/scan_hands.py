@@ -43,8 +43,8 @@ from tactile_resonance.scan.surface_search import Touch
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
-"""After its last block all of a measurement has come, on the machine's clock; in simulated time a slow machine
-may take as long as a node may be silent."""
+"""All results of a measurement come within this after its last block, on the machine's clock; in simulated time
+a slow machine may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
@@ -65,14 +65,14 @@ class NodeHands:
     base_frame : str
         Name of that base.
     with_robot : bool
-        False: nobody moves the tip; it is taken to be where the plan says, and its pose is published.
+        False: the tip is not moved; it is taken to be where the plan states, and its pose is published.
     tell_waiting : callable
-        Receives who keeps the scan waiting, for people; empty: nobody any more. In the scan's thread.
+        Called in the scan's thread with the node that keeps the scan waiting, for people; empty: none any more.
 
     Attributes
     ----------
     free_air : bool
-        Without a robot nobody lifts the tip off the tissue.
+        Whether the tip can be lifted off the tissue: not without a robot.
     """
 
     def __init__(
@@ -132,11 +132,11 @@ class NodeHands:
         return self._time.now_s()
 
     def begin(self, *integers: int) -> None:
-        """Simulated noise is that of these integers from now on."""
+        """Let simulated noise follow from these integers from now on."""
         self._time.seed(*integers)
 
     def missing(self) -> str | None:
-        """A node that points need and that is not at work."""
+        """A node that points need and that is not at work, as a sentence; None: all are at work."""
         self._end_if_hung()
         return self._nodes.missing()
 
@@ -150,9 +150,9 @@ class NodeHands:
             self._tip.hold(pose, force_n, hold, check, self._poll_of([STATE_TOPIC]))
 
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
-        """Touch a point of the surface as it is expected and draw back; tell where the ball met it."""
+        """Touch a point of the surface as it is expected and draw back; return where the ball met it."""
         if self._tip is None:
-            raise ScanEnded("surface.touch: nobody moves the tip (parameter contact is none)")
+            raise ScanEnded("surface.touch: the tip is not moved (parameter contact is none)")
         poll = self._poll_of([STATE_TOPIC])
         result = self._tip.touch(self._pose_of(point), force_n, check, poll)
         way = np.array(point.normal) * (ball_radius_m + result.surface_m)
@@ -192,14 +192,14 @@ class NodeHands:
         poles, origin = poles_from_message(seen[-1])
         touching = self._tip is not None and self._tip.touching
         if touching and np.isnan(origin.contact.force_n):
-            reason = self._recorder.force_reason or "no record says why"
+            reason = self._recorder.force_reason or "no record states why"
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
-            text = "measurement: nobody told where the tip is (tcp_pose)"
+            text = "measurement: the place of the tip is unknown (tcp_pose)"
             if (
                 self._tip is None
-            ):  # said here, to a bench that was just started and had not heard of us
-                raise PointDisturbed(text, "place unheard")
+            ):  # it was published here, to a bench that had not discovered this node
+                raise PointDisturbed(text, "place unknown")
             raise PointFailed(text)
         return Measured(poles, origin)
 
@@ -208,7 +208,7 @@ class NodeHands:
         if self._tip is not None:
             self._tip.retract()
 
-    # parts of these
+    # helpers
 
     def _record(
         self, goal: Measure.Goal, enough: Callable[[Poles, int], bool], check: Check
@@ -244,7 +244,7 @@ class NodeHands:
 
         deadline = time.monotonic() + DEVICE_BACK_WITHIN_S
         while True:
-            # once before it, and once for each block that was judged: each handing over ends it
+            # once before the measurement and once after each block: every block that is handed over ends it
             self._time.go()
             handle = self._measure.send(goal, check, poll)
             result = self._measure.follow(handle, check, each_poll)
@@ -296,7 +296,7 @@ class NodeHands:
         return poll
 
     def _end_if_hung(self) -> None:
-        """In simulated time a node that hangs holds everything, and is waited for that long only."""
+        """In simulated time a node that hangs holds time up; the scan ends where that lasts too long."""
         if self._time.simulated and (problem := self._nodes.hung()):
             raise ScanEnded(f"{problem}; the run can be resumed")
 
@@ -323,6 +323,6 @@ class NodeHands:
         )
 
     def _place(self, pose: PoseStamped) -> None:
-        """Say where the tip is, until all who listen reliably have heard it."""
+        """Publish where the tip is, until all reliable subscribers have received it."""
         self._pose.publish(pose)
         self._pose.wait_for_all_acked(Duration(seconds=PLACED_WITHIN_S))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
@@ -45,8 +44,8 @@ PARAMETERS = (
     Parameter(
         "contact",
         "robot",
-        "Who brings the tip to the tissue: contact_node, or nobody (the tip is taken to be where the plan "
-        "says, and its pose is published).",
+        "What brings the tip to the tissue: contact_node, or nothing (the tip is taken to be where the plan "
+        "states, and its pose is published).",
         choices=("robot", "none"),
         read_only=True,
     ),
@@ -69,7 +68,6 @@ PARAMETERS = (
     HUNG_AFTER,
 )
 
-RESULT_TIMEOUT_S = 900
 FEEDBACK_EVERY_S = 0.2
 
 
@@ -97,21 +95,11 @@ class ScanNode(ManagedNode):
             "scan/repeat_point": lambda c: c.ask(Request.REPEAT),
         }.items():
             self.serve(Trigger, name, self._control(ask))
-        server = ActionServer(
-            self,
-            Scan,
-            "scan",
-            self._on_goal,
-            goal_callback=lambda _: GoalResponse.ACCEPT if self.active else GoalResponse.REJECT,
-            cancel_callback=self._on_cancel,
-            result_timeout=RESULT_TIMEOUT_S,
-        )
-        self.resources.callback(server.destroy)
+        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel())
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
-        if self._controls is not None:
-            self._controls.ask(Request.CANCEL)
+        self._cancel()
 
     def details(self) -> dict[str, str]:
         """The scan under way."""
@@ -132,10 +120,9 @@ class ScanNode(ManagedNode):
 
         return serve
 
-    def _on_cancel(self, _: ServerGoalHandle) -> CancelResponse:
+    def _cancel(self) -> None:
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
-        return CancelResponse.ACCEPT
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
         if self._goal is not None:
@@ -261,7 +248,7 @@ class ScanNode(ManagedNode):
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
     def _tell_waiting(self, waited_for: str) -> None:
-        """Say who keeps a scan waiting, once, to all who follow it."""
+        """Report a node that keeps a scan waiting, once, in the log and the feedback."""
         goal, progress = self._goal, self._progress
         if waited_for and goal is not None and progress is not None:
             self.get_logger().warning(f"the scan waits for {waited_for}")

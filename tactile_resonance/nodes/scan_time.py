@@ -11,7 +11,7 @@ from tactile_resonance.nodes.node_watch import SILENT_S
 
 
 class ScanTime:
-    """Says when simulated time may go on; on the machine's clock there is nothing to be said.
+    """Conducts simulated time during a scan; on the machine's clock only `now_s` does something.
 
     While a scan conducts, simulated time passes only where something needs it to: a contact on its way, a
     block that is measured. It stands while nodes compute and while the scan decides.
@@ -21,7 +21,7 @@ class ScanTime:
     server : str
         Address of the simulated time; empty: the machine's clock.
     hung_after_s : float
-        In simulated time a node that was silent for so long is given up [s of the machine's clock].
+        In simulated time a node is given up after so long without a sign of life [s of the machine's clock].
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class ScanTime:
         self.simulated = bool(server)
         self.silent_s = hung_after_s if server else SILENT_S
         self._clock: SimulatedClock | None = None
-        self._offset_ns = self._last_ns = 0  # a bench that is started anew begins anew
+        self._offset_ns = self._last_ns = 0  # a bench that is started anew begins its time anew
 
     def begin(self) -> None:
         """Conduct; a bench that cannot be reached now is tried again by `go`."""
@@ -44,7 +44,7 @@ class ScanTime:
                 self._join()
 
     def end(self) -> None:
-        """Conduct no more: time goes on at its own pace."""
+        """Conduct no more: time goes on at the pace of real time."""
         if self._clock is not None:
             self._clock.close()
             self._clock = None
@@ -61,7 +61,7 @@ class ScanTime:
         return self._last_ns * 1e-9
 
     def go(self) -> None:
-        """Let time go on as far as somebody needs it, until a device hands something over."""
+        """Let time go on while something needs it, until a device hands a result over."""
         if not self.simulated:
             return
         with contextlib.suppress(ClockLostError):
@@ -73,7 +73,7 @@ class ScanTime:
         self.end()
 
     def seed(self, *integers: int) -> None:
-        """Let the noise of the bench follow from integers, three at the most, from now on."""
+        """Let the noise of the bench follow from integers, three at most, from now on."""
         if self._clock is not None:
             try:
                 self._clock.seed(*integers)

@@ -30,7 +30,7 @@ from tactile_resonance.scan.scene import Hold
 STATE_TOPIC = "contact_state"
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
-# What says nothing of the point: it comes again.
+# Faults of the devices, not of the point: it is repeated.
 DEVICE_CAUSES = frozenset(
     cause.value
     for cause in (
@@ -48,7 +48,7 @@ class TipContact:
     node : ManagedNode
     scan_time : ScanTime
     end_if_hung : callable
-        Raises `ScanEnded` where waiting for a node has become pointless.
+        Raises `ScanEnded` where a node that is waited for hangs.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class TipContact:
     def touch(
         self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
     ) -> MakeContact.Result:
-        """Touch and draw back; what is disturbed comes again."""
+        """Touch and draw back; a touch that is disturbed is repeated."""
         disturbed = Disturbances()
         while True:
             try:
@@ -122,7 +122,7 @@ class TipContact:
 
     def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
-        # a contact that nobody knows of any more is ended first
+        # a contact that a scan before this one left is ended first
         state = self._state
         self.touching = self.touching or (state is not None and state.state != state.STATE_IDLE)
         self.retract()
@@ -152,7 +152,7 @@ class TipContact:
         return bool(answer.result().success)
 
     def _idle_within(self, seconds: float) -> bool:
-        """Whether the tip is told to be free; longer where it is on its way."""
+        """Whether contact_node reports within a time that the tip is free."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             state = self._state
@@ -165,9 +165,9 @@ class TipContact:
         self._state = message
 
 
-def _failure(told: MakeContact.Result | msg.ContactState) -> PointFailed:
+def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:
     """What a contact that was not reached, or that ended, means for the point."""
-    text = f"contact: {told.cause}: {told.message}"
-    if told.cause in DEVICE_CAUSES:
-        return PointDisturbed(text, told.cause)
+    text = f"contact: {ended.cause}: {ended.message}"
+    if ended.cause in DEVICE_CAUSES:
+        return PointDisturbed(text, ended.cause)
     return PointFailed(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First contact told by the poles that arrive, against those in air."""
+"""First contact detected by the poles that arrive, against those in air."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORGOTTEN_NS = 1_000_000_000
 class TouchFromPoles:
     """Poles of a measurement taken in air are a reference, those of an approach are tested against them.
 
-    Poles are those of all that a measurement has taken so far. So a touch is told the sooner the shorter
+    Poles are those of all that a measurement has taken so far. So a touch is detected the sooner the shorter
     measurements are, and only the last poles of each are a reference: those before hold the same data.
 
     Parameters
@@ -49,17 +49,17 @@ class TouchFromPoles:
                 self._clear_ns = now_ns
 
     def hear(self, message: msg.Poles, state: State, now_ns: int) -> bool:
-        """Take the poles of a measurement so far; whether they have told a touch.
+        """Take the poles of a measurement so far; whether they show a touch.
 
         Raises
         ------
         ValueError
-            Where they are no numbers or their covariance is unknown.
+            If they are not finite or their covariance is unknown.
         """
         poles, origin = poles_from_message(message)
         if not len(poles.f0_hz):
             return False
-        # its middle is told; it ended before now, so it cannot have begun before this
+        # its middle is known; it ended before now, so it cannot have begun before this
         began_ns = 2 * origin.time_ns - now_ns - FORGOTTEN_NS
         if state in IN_AIR:
             if message.final and began_ns > self._air_ns:

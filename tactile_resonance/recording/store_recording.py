@@ -130,7 +130,7 @@ def _choose(folder: Path, measurement_id: int | None) -> StoredEntry:
     if measurement_id is None and len(entries) == 1:
         return entries[0]
     if measurement_id is None:
-        raise ValueError(f"measurement_id: not told which, {folder} holds {ids}")
+        raise ValueError(f"measurement_id: not given, {folder} holds {ids}")
     for entry in entries:
         if entry.measurement_id == measurement_id:
             return entry

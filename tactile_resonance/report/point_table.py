@@ -37,7 +37,7 @@ def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]
 
 
 def table_notes(results: Sequence[PointResult], truths: Mapping[int, PointTruth]) -> list[str]:
-    """Sentences below the table: how far from the truth, how often points were begun again."""
+    """Sentences below the table: how far from the truth, how often points were repeated."""
     notes = []
     off = deviations(results, truths)
     if len(off):
@@ -51,10 +51,10 @@ def table_notes(results: Sequence[PointResult], truths: Mapping[int, PointTruth]
 
 
 def repeats_sentence(results: Sequence[PointResult]) -> str:
-    """How often points were begun again, and why."""
+    """How often points were repeated, and why."""
     points = [r for r in results if r.repeats]
     if not points:
-        return "no point had to be begun again"
+        return "no point had to be repeated"
     why: Counter[str] = Counter()
     for result in points:
         for part in result.disturbances.split(", "):
@@ -62,8 +62,8 @@ def repeats_sentence(results: Sequence[PointResult]) -> str:
             why[kind] += int(count)
     causes = ", ".join(f"{kind} {count}" for kind, count in why.most_common())
     return (
-        f"{sum(r.repeats for r in points)} times a point was begun again, at {len(points)} of {len(results)} "
-        f"points: {causes}"
+        f"{len(points)} of {len(results)} points had to be repeated, {sum(r.repeats for r in points)} times in "
+        f"all: {causes}"
     )
 
 

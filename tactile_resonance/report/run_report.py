@@ -41,7 +41,7 @@ _COLUMNS = (
     ("damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
     ("tissue", lambda r: _tissue(r)),
-    ("begun again", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
+    ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
     ("outcome", lambda r: _outcome(r)),
 )
 # Facts of the run that have a place of their own on the page.
@@ -53,7 +53,7 @@ _AIR_COLUMNS = (
     ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
 )
 _TRUTH_COLUMNS = ("true f0 [Hz]", "off by [std]", "true damping", "off by [std]")
-_TEXT = {"tissue", "begun again", "outcome"}
+_TEXT = {"tissue", "repeats", "outcome"}
 
 
 def pole_map_of(run: RunContent) -> PoleMap:

@@ -68,7 +68,7 @@ def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
 
 
 def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
-    """What the bench told of the blocks that the last poles rest on, its mode next to the estimate."""
+    """The bench's truth over the blocks that the last poles rest on; its mode nearest to the estimate."""
     told, middle_ns = [], 0
     for _, _, message in read_messages_of_type(file_of(run.path, result), POLES):
         poles, origin = poles_from_message(message)

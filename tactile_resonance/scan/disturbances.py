@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What spoiled attempts without saying anything of the point, and how often an attempt may come again."""
+"""Disturbances that spoil an attempt but are not the point's fault, and how often an attempt is repeated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Disturbances:
 
     @property
     def total(self) -> int:
-        """Attempts that were begun again."""
+        """Attempts that were repeated."""
         return self._kinds.total()
 
     def __str__(self) -> str:

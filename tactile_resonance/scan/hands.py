@@ -15,7 +15,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
-# At what lost a node: it comes again when the node is back, unless it is what ends the node.
+# A point that lost its node is repeated when the node is back, so often at most: it may be what ends the node.
 ATTEMPTS_WITHOUT_NODE = 24
 NODE_BACK_WITHIN_S = 120.0
 Recording = PointRecording | ReferenceRecording

@@ -39,7 +39,7 @@ def message_types() -> Typestore:
 
 @cache
 def reader_of(type_name: str, definition: MessageDefinition) -> Callable[[bytes], Any]:
-    """Function that makes a message of CDR bytes as the definition in their file says.
+    """Function that reads a message from CDR bytes by the definition in their file.
 
     Fields of today's definition that the file's does not have are NaN, an empty text or an empty array.
 
@@ -53,8 +53,8 @@ def reader_of(type_name: str, definition: MessageDefinition) -> Callable[[bytes]
     Raises
     ------
     OtherVersionError
-        If the file holds no definition, or one in which a field has another type than today or lacks
-        though no value would say that it is unknown.
+        If the file holds no definition, or one in which a field has another type than today, or lacks a field
+        that has no value for unknown.
     """
     store = _types_of(type_name, definition)
     today, own = message_types().fielddefs[type_name][1], dict(store.fielddefs[type_name][1])

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Any
@@ -99,7 +98,6 @@ class PointResult:
 
 # in the order of the message, the header's two last
 COLUMNS = tuple(field.name for field in fields(PointResult))
-_KINDS = {field.name: str(field.type) for field in fields(PointResult)}
 _HEADER = ("time_ns", "frame_id")
 
 
@@ -135,52 +133,7 @@ def as_csv(results: Iterable[PointResult]) -> str:
     return text.getvalue()
 
 
-def from_csv(text: str) -> list[PointResult]:
-    """What `as_csv` wrote.
-
-    Raises
-    ------
-    ValueError
-        If a column is missing or a value is none of its kind.
-    """
-    reader = csv.DictReader(io.StringIO(text))
-    missing = set(COLUMNS) - set(reader.fieldnames or ())
-    if missing:
-        raise ValueError(f"results.csv: columns {sorted(missing)} are missing")
-    return [_read(row, number) for number, row in enumerate(reader, start=2)]
-
-
 def _write(value: object) -> str:
     if isinstance(value, Outcome):
         return value.name.lower()
     return repr(float(value)) if isinstance(value, float) else str(value)
-
-
-def _read(row: Mapping[str, str | None], line: int) -> PointResult:
-    content: dict[str, Any] = {}
-    for name, kind in _KINDS.items():
-        text = row[name]
-        try:
-            if text is None:
-                raise ValueError("nothing")
-            if kind == "Outcome":
-                content[name] = Outcome[text.upper()]
-            elif kind == "bool":
-                content[name] = {"True": True, "False": False}[text]
-            else:
-                content[name] = {"int": int, "float": float, "str": str}[kind](text)
-        except (ValueError, KeyError):
-            raise ValueError(
-                f"results.csv line {line}, {name}: got {text!r}; accepted is a value of type {kind}"
-            ) from None
-    return PointResult(**content)
-
-
-def same_result(a: PointResult, b: PointResult) -> bool:
-    """Equal in every field, NaN being equal to NaN."""
-
-    def equal(x: object, y: object) -> bool:
-        both = isinstance(x, float) and isinstance(y, float)
-        return x == y or (both and math.isnan(x) and math.isnan(y))  # type: ignore[arg-type]
-
-    return all(equal(getattr(a, name), getattr(b, name)) for name in COLUMNS)

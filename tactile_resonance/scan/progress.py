@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan tells of itself, on the way and at its end."""
+"""Progress of a scan, and its summary at the end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Progress:
     time_left_s : float
         Estimated from the points so far, or the plan.
     repeats : int
-        Attempts so far that were disturbed and begun again.
+        Attempts so far that were disturbed and repeated.
     """
 
     point: ScanPoint | None
@@ -56,7 +56,7 @@ class Summary:
     saved_s : float
         Measuring time saved by ending points early.
     repeats : int
-        Attempts that were disturbed and begun again.
+        Attempts that were disturbed and repeated.
     health : SensorHealth
     health_sentence : str
         What the references in air say of the sensor.

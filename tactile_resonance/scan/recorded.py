@@ -33,7 +33,7 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     Raises
     ------
     ValueError
-        If it is no run, or the measurement is not told or not there.
+        If it is not a run, or the measurement is not named or not there.
     """
     source = RunSource(run)
     by_id = {entry.measurement_id: entry for entry in source.entries}
@@ -44,7 +44,7 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     if measurement_id is None and len(points) == 1:
         (measurement_id,) = points
     if measurement_id is None:
-        raise ValueError(f"measurement_id: not told which, {run} holds {ids or 'none'}")
+        raise ValueError(f"measurement_id: not given, {run} holds {ids or 'none'}")
     if measurement_id not in by_id:
         raise ValueError(f"measurement_id: {measurement_id}, {run} holds {ids or 'none'}")
     return source.read(by_id[measurement_id])

@@ -67,7 +67,7 @@ class RelativeToAir:
 
 
 class SensorHealth(str, Enum):
-    """What the references say of the sensor."""
+    """Whether the sensor has drifted between references."""
 
     UNKNOWN = "unknown"
     STEADY = "steady"
@@ -158,5 +158,5 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
 
 
 def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
-    """What the references of a run say of the sensor."""
+    """Whether the sensor has drifted between the references of a run."""
     return judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)

@@ -175,7 +175,7 @@ class ScanRunner:
                 )
             except PointDisturbed as error:
                 if self._disturbed[point.index].again(error):
-                    self._hands.retract()  # nothing is kept of it, and the point comes again
+                    self._hands.retract()  # nothing is kept of it, and the point is repeated
                     return
                 reason = str(error)
             except PointFailed as error:

@@ -147,7 +147,7 @@ class ScanScene:
         When a point's blocks are enough; None: after the most blocks.
     blocks : BlockLimits
     tissue_classes : tuple of TissueClass
-        What points are told to be; empty: no tissue is called.
+        Tissues that a point may be called; empty: none is called.
     on_failure : OnFailure
     time_limits : TimeLimits
     drift_limits : DriftLimits

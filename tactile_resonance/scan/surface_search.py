@@ -131,7 +131,7 @@ def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> Fo
 def _expected(
     touches: Sequence[Touch], xy_m: tuple[float, float], height_m: float, ball_radius_m: float
 ) -> float:
-    """Height at which the next touch is expected: on the plane through those before, else as told."""
+    """Height at which the next touch is expected: on the plane through those before, else as configured."""
     if len(touches) >= 3:
         try:
             return float(fit_touches(touches, "plane", ball_radius_m).surface.height_m(xy_m))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time of a simulated bench: it goes on as far as all who take part let it (`tactile_resonance.clock`).
+"""The time of a simulated bench: it goes on as far as all participants allow (`tactile_resonance.clock`).
 
-`BenchTime` keeps the account and is the port to which they connect; `run` steps what is simulated, serves
-all ports in between and keeps the pace. On the wall clock (`simulated` false) nobody takes part: steps come
-at the pace of real time, and what the machine stood still for is gone.
+`BenchTime` keeps the list of participants and serves their connections; `run` steps what is simulated, serves
+all ports in between and keeps the pace. On the wall clock (`simulated` false) there are no participants: steps
+come at the pace of real time, and time for which the machine stood still is lost.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from tactile_resonance.clock import ENDLESS_NS, MESSAGE, Demand, FromBench, ToBe
 from tactile_resonance.simulation.robot.reactor import Connection, Reactor
 
 START_NS = 1_000_000_000
-"""Time when a bench begins: ROS takes 0 for no time at all."""
+"""Time at which a bench begins [ns]; not 0, which in ROS means that no time is known."""
 STALL_S = 0.010
 """On the wall clock a step that begins later than this is a stall: what ran meanwhile is not to be trusted."""
 REPEAT_S = 0.05
-"""So often, on this machine's clock, what stands is told again."""
+"""While time stands the newest data are sent again after so long, on this machine's clock [s]."""
 PACKETS_WITHIN_S = 0.5
-"""A command that its sender has sent arrives within this, on this machine's clock."""
+"""A packet that was announced is waited for so long, on this machine's clock [s]."""
 _LONGEST_JOIN = 4096
 
 
@@ -34,7 +34,7 @@ class Pace:
     Attributes
     ----------
     stalls : int
-        Steps that began more than 10 ms late, for no fault that was asked for.
+        Steps that began more than 10 ms late.
     longest_s : float
         Longest delay of a step [s].
     """
@@ -47,7 +47,7 @@ class Pace:
 
 
 class Participant:
-    """One connection to the time."""
+    """One connection of a participant."""
 
     def __init__(self, keeper: BenchTime, connection: Connection) -> None:
         self._keeper, self._connection = keeper, connection
@@ -56,12 +56,12 @@ class Participant:
         self.name = self.told_with = ""
         self.hands_over = self.conducts = False
         self.until_ns, self.demand = ENDLESS_NS, Demand.NONE
-        self.told_ns = -1  # until_ns of which it was told
+        self.told_ns = -1  # until_ns that was reported to it
         self.wake_ns = ENDLESS_NS
         self.robot_port = self.bus_port = 0
 
     def received(self, data: bytes) -> None:
-        """Take what was sent; ValueError where it makes no sense."""
+        """Take what was sent; ValueError where it is not a message."""
         self._buffer += data
         if not self.joined:
             line, end, rest = self._buffer.partition(b"\n")
@@ -80,7 +80,7 @@ class Participant:
             self._take(ToBench(kind), a, b, c)
 
     def closed(self) -> None:
-        """Whoever has gone holds nothing."""
+        """A participant that has disconnected holds time up no longer."""
         self._keeper.leave(self)
 
     def tell(self, kind: FromBench, now_ns: int, robot_ns: int = 0, frames: int = 0) -> None:
@@ -116,16 +116,16 @@ class Participant:
 
 
 class BenchTime:
-    """Who takes part, how far time may go, and the loop that lets it.
+    """The participants, how far time may go, and the loop that steps it.
 
     Parameters
     ----------
     reactor : Reactor
-        Whose ports are served.
+        Serves the ports.
     step_ns : int
-        Of what is simulated, and of the time [ns].
+        Length of a step [ns].
     simulated : bool
-        False: on the wall clock, and nobody takes part.
+        False: on the wall clock, without participants.
 
     Attributes
     ----------
@@ -136,14 +136,14 @@ class BenchTime:
     repeats : list of callables
         Called again and again while time stands.
     seeds : list of callables
-        Called with three integers from which noise is to follow.
+        Called with three integers, from which noise follows from then on.
     stalled : list of callables
         Called with the time [s] that was lost in a stall.
     robot_sent_ns, frames_sent : callables
-        From a local port of a participant: stamp of the newest robot state [ns] and number of frames of the
-        bus sent to there.
+        For a local port of a participant: stamp of the newest robot state sent to it [ns], and number of frames
+        of the bus sent to it.
     packets_arrived : callable
-        How many packets for the robot have come since the start; None while none can come.
+        Number of packets that the robot has received since the start; None while it is not connected.
     pace : Pace
     """
 
@@ -164,24 +164,24 @@ class BenchTime:
         self._packets_late_s = 0.0
         self._stopping = False
 
-    # who takes part
+    # participants
 
     def serve(self, connection: Connection) -> Participant:
         """Serve a new connection."""
         return Participant(self, connection)
 
     def join(self, participant: Participant) -> None:
-        """Count one who takes part."""
+        """Add a participant."""
         self._participants.append(participant)
         self.tell_reached()
 
     def leave(self, participant: Participant) -> None:
-        """Forget one who took part."""
+        """Remove a participant."""
         if participant in self._participants:
             self._participants.remove(participant)
 
     def expect(self, packets: int) -> None:
-        """No step before so many packets for the robot have come since the last 0; below 0 nothing is said."""
+        """Make no step before so many packets have come since 0 was stated; below 0 nothing is stated."""
         if packets < 0:
             return
         if packets == 0:
@@ -197,13 +197,13 @@ class BenchTime:
 
     @property
     def held_by(self) -> list[str]:
-        """Names of those for whom the time stands."""
+        """Names of the participants for which time stands."""
         return [p.name for p in self._participants if p.until_ns <= self.now_ns]
 
-    # the account
+    # how far time may go
 
     def demand(self) -> Demand | None:
-        """How the next step is wanted; None: it may not come."""
+        """Largest demand for the next step; None: the step may not come."""
         now_ns = self.now_ns
         wanted, conducted = Demand.NONE, False
         for participant in self._participants:
@@ -216,7 +216,7 @@ class BenchTime:
         return wanted if wanted is not Demand.NONE else None
 
     def tell_reached(self) -> None:
-        """Tell everybody whose time has come, and end a conductor's go where something is handed over."""
+        """Report the time to those that wait for it; end a conductor's `go` where a result is handed over."""
         for participant in self._participants:
             if participant.wake_ns <= self.now_ns:
                 participant.wake_ns = ENDLESS_NS
@@ -269,7 +269,7 @@ class BenchTime:
                 demand = None
             now_ns = time.perf_counter_ns()
             if demand is None:
-                # nothing is due: until somebody speaks, but what stands is told again
+                # time stands: wait for messages, and send the newest data again now and then
                 self._reactor.serve(min(REPEAT_S, max(0.0, (repeat_ns - now_ns) * 1e-9)))
                 now_ns = time.perf_counter_ns()
                 if now_ns >= repeat_ns:
@@ -289,7 +289,7 @@ class BenchTime:
             repeat_ns = time.perf_counter_ns() + round(REPEAT_S * 1e9)
 
     def _all_packets(self) -> bool:
-        """Whether what was sent to the robot is there; what does not come is waited for once."""
+        """Whether all announced packets have come; what is lost is waited for once, then no more."""
         arrived = self.packets_arrived()
         if arrived is None or self._packets_due <= arrived:
             return True
@@ -307,9 +307,9 @@ class BenchTime:
     def _next_due(self, due_ns: int, now_ns: int) -> int:
         """When the step after this one begins at the pace of real time.
 
-        On the wall clock short delays are made up for, so that the time of what is simulated keeps to that of
-        the machine. After a stall they are not: steps in quick succession would show clients what no robot
-        does; what was lost is told to those who stamp data. In simulated time nothing is lost.
+        On the wall clock short delays are made up for, so that simulated robot and cell keep to the machine's
+        time. A stall is not: steps in quick succession would show clients what no robot does. Those that stamp
+        data are called with the time that was lost (`stalled`). In simulated time none is lost.
         """
         late_ns = now_ns - due_ns
         if self.simulated:

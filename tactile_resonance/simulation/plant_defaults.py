@@ -2,7 +2,7 @@
 """What the plant's process and those who start it agree on."""
 
 READY = "simulated UR5e ready at"
-"""Begins the line that says that all ports are open."""
+"""First words of the line that is printed when all ports are open."""
 
 PRIORITY = 30
 """SCHED_FIFO priority of the simulated controller, above the control loop's: a real one has its own cores."""

@@ -156,7 +156,7 @@ class Tabletop:
         return self._tissue if self._scene is None else self._scene.tissue_at(position_m)
 
     def truth(self, _: dict) -> dict:
-        """Control port: what no instrument tells."""
+        """Control port: the true state of the contact."""
         plant = self.plant
         return {
             "time_s": plant.time_s,

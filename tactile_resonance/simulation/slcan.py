@@ -34,7 +34,7 @@ class SlcanServer(TcpBus):
 
 class _SlcanClient(BusClient):
     def understand(self, message: bytes) -> None:
-        """Do what one line says."""
+        """Execute one line."""
         line = message.decode("ascii", "replace")
         command = line[:1]
         if command in ("S", "s"):  # while it listens the speed stays as it is
@@ -59,7 +59,7 @@ class _SlcanClient(BusClient):
 
 
 def _frame(line: str) -> tuple[int, bytes] | None:
-    """Identifier and data of a line ``tiiildd..``; None where it is none."""
+    """Identifier and data of a line ``tiiildd..``; None for any other line."""
     found = _FRAME.fullmatch(line)
     if found is None:
         return None

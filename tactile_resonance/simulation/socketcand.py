@@ -49,7 +49,7 @@ class _SocketcandClient(BusClient):
         self.send(b"< hi >")
 
     def understand(self, message: bytes) -> None:
-        """Do what one message says."""
+        """Execute one message."""
         words = message.strip(b"< \r\n").decode("ascii", "replace").split()
         if not words:
             return

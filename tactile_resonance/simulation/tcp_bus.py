@@ -55,7 +55,7 @@ class BusClient(ABC):
 
     @abstractmethod
     def understand(self, message: bytes) -> None:
-        """Do what one message says."""
+        """Execute one message."""
 
 
 class TcpBus(ABC):

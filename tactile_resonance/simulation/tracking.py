@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a robot's tip follows what it is told: acceleration limit, dead time, lag, vibration."""
+"""How a robot's tip follows its commands: acceleration limit, dead time, lag, vibration."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Jitter:
         self.reseed(seed)
 
     def reseed(self, seed: Seed) -> None:
-        """Vibrate from the next step on as a seed says, from a state drawn anew."""
+        """Let vibration follow from a seed, from the next step on, beginning in a state drawn anew."""
         random = np.random.default_rng(seed)
         self._place, self._speed = (self._rms[:, None] * random.standard_normal((2, 3))).tolist()
         self._rows = NormalRows(random, [1.0] * 6)

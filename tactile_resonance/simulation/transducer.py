@@ -92,7 +92,7 @@ class CellFaults:
     lose_second_every : int
         The second frame of every n-th wrench is lost; 0: none.
     invalid : bool
-        The z axis has the count of no number.
+        The z axis has the count that means an invalid value.
     saturated : bool
         The z axis is at full scale, without an overload bit.
     flipped : bool
@@ -110,7 +110,7 @@ class CellFaults:
     bias_step_n: float = 0.0
 
     def inject(self, name: str, value: float) -> None:
-        """Set a fault by its name; 0 ends it. Raises ``ValueError`` for a name that is none."""
+        """Set a fault by its name; 0 ends it. Raises ``ValueError`` for an unknown name."""
         kinds = {f.name: type(getattr(self, f.name)) for f in fields(self)}
         require(name in kinds, "fault", name, ", ".join(kinds))
         require(math.isfinite(value), name, value, "a finite number")

@@ -92,7 +92,7 @@ class VirtualArm:
     """An `Arm` on the bench, with the faults of a real one.
 
     While the link is frozen nothing is heard and no command arrives; the robot goes on as it was
-    last told until its own watchdog stops it.
+    last commanded until its own watchdog stops it.
 
     Parameters
     ----------

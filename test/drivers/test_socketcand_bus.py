@@ -5,15 +5,12 @@ Texts are those of linux-can/socketcand, doc/protocol.md.
 """
 
 import contextlib
-import fcntl
-import socket
-import termios
 import threading
 import time
-from array import array
 
 import numpy as np
 import pytest
+from one_client import PATIENCE_S, one_client, wait_until_arrived
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 
@@ -23,58 +20,22 @@ from tactile_resonance.drivers import can_bus
 from tactile_resonance.drivers.can_bus import SocketcandBus, open_bus
 
 HOST = "127.0.6.5"
-PATIENCE_S = 30.0
 GOOD = ((b"", b"< hi >"), (b"< open can0 >", b"< ok >"), (b"< rawmode >", b"< ok >"))
-
-
-class Server:
-    """A server of one client: answers what it waits for, then says what the test says."""
-
-    def __init__(self, answers):
-        self._listener = socket.create_server((HOST, 0))
-        self.port = self._listener.getsockname()[1]
-        self.channel = None
-        self._answers = answers
-        self._thread = threading.Thread(target=self._open)
-        self._thread.start()
-
-    def _open(self):
-        self.channel, _ = self._listener.accept()
-        self.channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        with contextlib.suppress(OSError):
-            for request, answer in self._answers:
-                got = b""
-                while got != request:
-                    part = self.channel.recv(len(request) - len(got))
-                    assert part, f"{got}, expected {request}"
-                    got += part
-                self.channel.sendall(answer)
-
-    def close(self):
-        self._thread.join(PATIENCE_S)
-        self._listener.close()
-        if self.channel is not None:
-            self.channel.close()
 
 
 @pytest.fixture
 def serve():
-    """Make servers, and buses of them; all are closed after the test."""
+    """Make servers; all are closed after the test."""
     with contextlib.ExitStack() as stack:
-
-        def make(answers=GOOD):
-            server = Server(answers)
-            stack.callback(server.close)
-            return server
-
-        yield make
+        yield lambda dialogue=GOOD: stack.enter_context(one_client((HOST, 0), dialogue))
 
 
 @pytest.fixture
 def opened(serve):
     server = serve()
     bus = SocketcandBus(HOST, server.port, "can0")
-    server._thread.join(PATIENCE_S)
+    server.join()
+    assert server.heard == [request for request, _ in GOOD]
     yield server, bus
     bus.close()
 
@@ -130,7 +91,7 @@ def test_frames_come_whole_and_in_order_however_the_text_is_cut(opened, seed):
 def test_frames_that_follow_the_last_answer_at_once_are_not_lost(serve):
     server = serve((*GOOD[:2], (b"< rawmode >", b"< ok >" + TEXTS[0][0] + TEXTS[1][0][:9])))
     bus = SocketcandBus(HOST, server.port, "can0")
-    server._thread.join(PATIENCE_S)
+    server.join()
     server.channel.sendall(TEXTS[1][0][9:])
     assert content(read(bus, 2)) == [TEXTS[0][1], TEXTS[1][1]]
     bus.close()
@@ -142,10 +103,7 @@ def test_it_is_drained_once_nothing_more_waits(opened, monkeypatch):
     assert bus.read() == []
     assert bus.drained
     server.channel.sendall(TEXTS[0][0] * 25)
-    there, end_s = array("i", [0]), time.monotonic() + PATIENCE_S
-    while there[0] < 25 * len(TEXTS[0][0]):
-        assert time.monotonic() < end_s
-        fcntl.ioctl(bus._socket.fileno(), termios.FIONREAD, there)
+    wait_until_arrived(bus._socket.fileno(), 25 * len(TEXTS[0][0]))
     seen = []
     while bus.frames < 25:
         bus.wait(PATIENCE_S)
@@ -211,9 +169,7 @@ def test_a_bus_that_is_not_opened_says_why(serve, monkeypatch, answers, message)
 
 def test_a_server_that_closes_at_once_is_a_lost_link(serve):
     server = serve(((b"", b"< hi >"),))
-    closer = threading.Thread(
-        target=lambda: (server._thread.join(PATIENCE_S), server.channel.close())
-    )
+    closer = threading.Thread(target=lambda: (server.join(), server.channel.close()))
     closer.start()
     with pytest.raises(ForceError, match="the cell: .*(closed|reset|pipe)"):
         open_bus({**SETTINGS, "port": server.port}, "the cell", None, 0.1)

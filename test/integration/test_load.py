@@ -26,7 +26,7 @@ STOPPED = ("contact_node", "frf_node", "pole_map_node", "scan_node", *BRIEFLY)
 @pytest.fixture(scope="module")
 def idle(module_domain, tmp_path_factory):
     """Two points of a demo that nothing disturbs."""
-    shown = demonstrate(tmp_path_factory.mktemp("idle"), SCENE, HOST, Load("nothing else"))
+    shown = demonstrate(tmp_path_factory.mktemp("idle"), SCENE, HOST, Load("no load"))
     assert shown.status == 0, shown.errors
     found = findings(shown.run_folder)
     assert faults(shown, found, found) == []
@@ -42,10 +42,10 @@ def test_a_load_costs_time_and_nothing_else(idle, domain, tmp_path):
 
 
 def test_what_a_load_may_change_is_found(idle):
-    """A point begun again, another tissue, a force or pole that is wrong: each is a fault."""
+    """A repeat, another tissue, a force or pole that is wrong: each is a fault."""
     well = Demonstration(1.0, 0, "", "", (), Path(), ())
     for wrong in (
-        replace(idle, begun_again=1),
+        replace(idle, repeats=1),
         replace(idle, calls=idle.calls[:1]),
         replace(idle, poles=4.5),
         replace(idle, forces=float("nan")),

@@ -97,7 +97,7 @@ class TestScan(unittest.TestCase):
         assert (result.done, result.failed) == (2, 0), result.message
         run = read_run(FOLDER / "run")
         assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0)]
-        # the point that lost its node was begun again
+        # the point that lost its node was repeated
         assert run.results[1].repeats >= 1
 
 

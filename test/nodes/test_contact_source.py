@@ -124,7 +124,7 @@ def test_without_a_service_the_reason_says_so():
         told = node.source.over(START_NS, END_NS)
     assert math.isnan(told.force_n)
     assert told.position_m is None
-    assert told.reason == "nobody serves force_over"
+    assert told.reason == "no node serves force_over"
 
 
 @pytest.mark.parametrize(

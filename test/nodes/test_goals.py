@@ -14,7 +14,7 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
 
 from tactile_resonance.nodes import goals as goals_module
-from tactile_resonance.nodes.goals import ASK_AGAIN_S, TAKEN_WITHIN_S, Goals
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
 
@@ -48,6 +48,7 @@ class Node:
     def __init__(self, answers):
         self.now_s, self.up = 0.0, True
         self.answers = answers
+        self.ends_after_s = 0.0  # from a cancellation to the end of its goal
         self.asked, self.running, self.cancelled = [], [], []
         self.results = {}
         self._due = []
@@ -62,6 +63,12 @@ class Node:
         due = [entry for entry in self._due if entry[0] <= self.now_s]
         self._due = [entry for entry in self._due if entry[0] > self.now_s]
         for _, happens in due:
+            happens()
+
+    def _after(self, delay_s, happens):
+        if delay_s:
+            self._due.append((self.now_s + delay_s, happens))
+        else:
             happens()
 
     def _later(self, delay_s, result):
@@ -99,7 +106,7 @@ class Node:
         self.cancelled.append(goal_id)
         known = goal_id in self.running
         if known:
-            self.end(goal_id, GoalStatus.STATUS_CANCELED)
+            self._after(self.ends_after_s, lambda: self.end(goal_id, GoalStatus.STATUS_CANCELED))
         return self._later(0.0, SimpleNamespace(goals_canceling=[goal_id] if known else []))
 
     def _get_result_async(self, handle):
@@ -236,11 +243,22 @@ def test_a_goal_that_nobody_takes_ends_the_scan(taken):
 @pytest.mark.parametrize("error", [Interrupted("enough"), PointFailed("no"), ScanEnded("no")])
 def test_a_goal_that_is_left_is_cancelled_and_waited_for(taken, error):
     node, goals = taken()
+    node.ends_after_s = 3.0  # with its block
     handle = goals.send("goal", nothing, nothing)
     with pytest.raises(type(error)):
         goals.follow(handle, ended_by(node, error, node.now_s + 1.0), nothing)
     assert node.cancelled == node.asked
     assert node.running == []
+
+
+def test_a_goal_that_does_not_end_is_not_waited_for_for_ever(taken):
+    node, goals = taken()
+    node.ends_after_s = 1e9
+    handle = goals.send("goal", nothing, nothing)
+    cancelled_s = node.now_s
+    with pytest.raises(Interrupted):
+        goals.follow(handle, ended_by(node, Interrupted("enough"), cancelled_s), nothing)
+    assert node.now_s - cancelled_s == pytest.approx(GOAL_ENDS_WITHIN_S, abs=0.1)
 
 
 def test_a_goal_of_a_node_that_was_started_anew_is_not_waited_for(taken):

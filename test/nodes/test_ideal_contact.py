@@ -18,6 +18,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from spinning import spin_until
 from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
 from tactile_resonance.msg import ContactState
@@ -117,10 +118,7 @@ def bench(**parameters):
         force = node.create_client(ForceOver, "force_over")
 
         def wait(holds):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not holds() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            assert holds()
+            assert spin_until(executor, holds)
 
         def answer(future):
             wait(future.done)
@@ -143,7 +141,8 @@ def bench(**parameters):
         wait(lambda: force.service_is_ready() and states and wrenches)
         made = SimpleNamespace(node=node, make=make, answer=answer, wait=wait, state=state)
         made.retract = lambda: answer(retract.call_async(Trigger.Request()))
-        made.force_over, made.poses, made.wrenches = force_over, poses, wrenches
+        made.contact, made.force_over = contact, force_over
+        made.states, made.poses, made.wrenches = states, poses, wrenches
         yield made
         contact.destroy()
         node.destroy_node()
@@ -169,6 +168,7 @@ def goal_at(x_m=0.0, y_m=0.0, z_m=0.0, force_n=FORCE_N):
 
 def test_a_contact_is_made_held_told_and_drawn_back(ideal):
     assert ideal.state() == "idle"
+    assert math.isnan(ideal.states[-1].force_n)
     before_ns = time.time_ns()
     handle, future = ideal.make(goal_at())
     assert handle.accepted
@@ -186,6 +186,10 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
     assert ideal.state() == "hold"
     ideal.wait(lambda: ideal.wrenches[-1].wrench.force.z == FORCE_N and ideal.poses)
     assert ideal.poses[-1].pose == goal_at().pose.pose
+    assert {pose.header.frame_id for pose in ideal.poses} == {
+        "base"
+    }  # none before the tip is placed
+    assert ideal.states[-1].force_n == FORCE_N
     now_ns = time.time_ns()
     assert ideal.force_over(made_ns, now_ns).force_n == FORCE_N
     assert ideal.force_over(before_ns - SECOND_NS, before_ns).force_n == 0.0
@@ -226,6 +230,15 @@ def test_a_goal_in_another_frame_or_beside_another_contact_is_refused(ideal):
     _, future = ideal.make(goal_at())
     assert "goal: refused in state hold" in ideal.answer(future).result.message
     assert ideal.state() == "hold"
+
+
+def test_no_goal_is_accepted_while_the_node_is_not_active(ideal):
+    ideal.node.trigger_deactivate()
+    assert not ideal.answer(ideal.contact.send_goal_async(goal_at())).accepted
+    ideal.node.trigger_activate()
+    handle, future = ideal.make(goal_at())
+    assert handle.accepted
+    assert ideal.answer(future).result.reached
 
 
 def cancelled(ideal, when):

@@ -2,7 +2,6 @@
 """Nodes are brought up one after the other, each as soon as the one before it has answered."""
 
 import os
-import time
 
 import pytest
 
@@ -10,6 +9,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 from lifecycle_msgs.msg import State
 from rclpy.executors import SingleThreadedExecutor
+from spinning import spin_until
 
 from tactile_resonance.nodes import manager_node
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -44,17 +44,15 @@ def test_one_tick_brings_all_up_in_order(monkeypatch):
         for node in (manager, *nodes):
             executor.add_node(node)
 
-        def spin_until(done):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not done() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            return done()
-
         asked = [client for each in manager._nodes for client in (each.get, each.change)]
-        assert spin_until(lambda: all(client.service_is_ready() for client in asked))
+        assert spin_until(
+            executor, lambda: all(client.service_is_ready() for client in asked), WITHIN_S
+        )
         manager._tick()
         up = spin_until(
-            lambda: all(each.state == State.PRIMARY_STATE_ACTIVE for each in manager._nodes)
+            executor,
+            lambda: all(each.state == State.PRIMARY_STATE_ACTIVE for each in manager._nodes),
+            WITHIN_S,
         )
         for node in executor.get_nodes():
             node.destroy_node()

@@ -2,7 +2,7 @@
 """Whether nodes are at work: judged on a clock that is told, and through the real graph."""
 
 import os
-import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +12,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from spinning import spin_until
 from std_msgs.msg import String
 
 from tactile_resonance.nodes import node_watch
@@ -21,7 +22,6 @@ from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.hands import NodeAway
 
-WITHIN_S = 60.0
 SOURCE = "/poles_node"
 
 
@@ -81,6 +81,14 @@ def test_a_node_that_hangs_is_noticed_within_the_limit_and_not_before(watch):
     assert watch.nodes.missing() is watch.nodes.changed(watch.instances) is None
 
 
+def test_a_node_that_hangs_until_its_lease_ends_is_still_named(watch):
+    assert watch.nodes.hung() == ""
+    watch.graph.publishers["/poles"] = []
+    assert watch.nodes.hung() == ""
+    watch.clock.now_s += SILENT_S + 0.01
+    assert watch.nodes.hung() == f"{SOURCE} is silent for 1.5 s"
+
+
 def test_a_node_that_was_deactivated_is_said_to_be_so_and_not_to_hang(watch):
     for _ in range(20):
         watch.clock.now_s += BEAT_S
@@ -128,7 +136,7 @@ def test_one_publisher_at_work_is_enough_and_all_others_are_named(watch):
         f"poles: {SOURCE} is unconfigured, not active and /robot/other is inactive, not active"
     )
     watch.graph.publishers["/poles"] = []
-    assert watch.nodes.missing() == "poles: nobody publishes it"
+    assert watch.nodes.missing() == "poles: no node publishes it"
 
 
 def test_after_an_error_only_what_is_told_from_then_on_is_believed(watch):
@@ -176,13 +184,7 @@ def nodes(monkeypatch):
         listener.trigger_activate()
         executor.add_node(listener)
 
-        def wait(holds):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not holds() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            return holds()
-
-        yield listener.nodes, executor, wait, told
+        yield listener.nodes, executor, partial(spin_until, executor), told
         for node in executor.get_nodes():
             node.destroy_node()
 
@@ -200,7 +202,7 @@ def heard_anew(watch, wait):
 
 def test_signs_of_life_tell_how_a_node_is(nodes):
     watch, executor, wait, clock = nodes
-    assert watch.missing() == "poles: nobody publishes it"
+    assert watch.missing() == "poles: no node publishes it"
     source = Source()
     executor.add_node(source)
     source.trigger_configure()  # from here on the publisher is in the graph

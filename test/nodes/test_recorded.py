@@ -158,7 +158,7 @@ def test_analyze_reads_a_run(run, tmp_path, capsys):
     assert pole["f0_hz"] == pytest.approx(250, abs=5 * np.sqrt(pole["covariance"][0][0]))
     assert recording_of(read_recorded(run, 11)).u.shape == (1, 3, N)
     assert main(["analyze", str(run)]) == 1
-    assert "not told which" in capsys.readouterr().err
+    assert "not given" in capsys.readouterr().err
     assert main(["analyze", str(run), "--measurement", "5"]) == 1
     assert "holds 13, 11, 12" in capsys.readouterr().err
 

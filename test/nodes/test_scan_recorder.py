@@ -61,7 +61,7 @@ def tell(bench, number):
     for k in range(number):
         pose = PoseStamped()
         pose.header.stamp = time_message(1000 + k)
-        bench._publish_truth(pose, BenchTip(None, 0.0, 1.0), KEY)
+        bench._truth.publish(pose, BenchTip(None, 0.0, 1.0), KEY)
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -76,7 +76,10 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
         with run.begin_point(0) as recording:
             recorder.record_into(recording, KEY)
             deadline_s = time.monotonic() + 20.0
-            while not bench._truth.get_subscription_count() and time.monotonic() < deadline_s:
+            while (
+                not bench._truth._publisher.get_subscription_count()
+                and time.monotonic() < deadline_s
+            ):
                 executor.spin_once(0.05)
             if not late:
                 tell(bench, TRUTHS)

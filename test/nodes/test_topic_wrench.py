@@ -3,7 +3,6 @@
 
 import math
 import os
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +17,7 @@ from pathlib import Path
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from spinning import spin_until
 
 from tactile_resonance.contact.cell_checks import samples_until_stuck
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
@@ -31,7 +31,6 @@ from tactile_resonance.processes import free_domain_id
 CONFIG = replace(read_force_config(Path("topic.yaml"), force_n=0.01), latency_s=0.003)
 SILENT_S = CONFIG.limits.silent_s
 AHEAD_NS = 1_700_000_000 * 10**9  # ROS time less the clock's
-WITHIN_S = 60.0
 
 
 class Link:
@@ -62,10 +61,7 @@ class Link:
         self.wait(lambda: self._publisher.get_subscription_count() == 1)
 
     def wait(self, holds):
-        deadline_s = time.monotonic() + WITHIN_S
-        while not holds() and time.monotonic() < deadline_s:
-            self._executor.spin_once(0.05)
-        assert holds()
+        assert spin_until(self._executor, holds)
 
     def close(self):
         self.source.close()

@@ -190,7 +190,7 @@ def test_one_of_several_measurements_must_be_chosen(tmp_path):
     store = RecordStore(tmp_path)
     stores.write(store, 12)
     _, records = stores.write(store, 11)
-    with pytest.raises(ValueError, match="not told which, .* holds 12, 11"):
+    with pytest.raises(ValueError, match="not given, .* holds 12, 11"):
         read_store_recording(tmp_path)
     with pytest.raises(ValueError, match="measurement_id: 13, .* holds 12, 11"):
         read_store_recording(tmp_path, 13)

@@ -1,15 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small runs for the tests."""
+"""Small runs for the tests, and the table of a run read back."""
+
+import csv
+from dataclasses import asdict, fields
 
 import numpy as np
 
 from tactile_resonance.scan.messages import message_types
-from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.scan_point import ScanPoint
 
 POLES = "tactile_resonance/msg/Poles"
 RECORD = "tactile_resonance/msg/Record"
 START_NS = 1_700_000_000_000_000_000
+
+
+# how a value of each type stands in results.csv
+VALUES = {
+    "int": int,
+    "float": float,
+    "str": str,
+    "bool": {"True": True, "False": False}.__getitem__,
+    "Outcome": lambda text: Outcome[text.upper()],
+}
+
+
+def table_of(run_folder):
+    """Results as they stand in results.csv."""
+    rows = csv.DictReader((run_folder / "results.csv").read_text().splitlines())
+    return [
+        PointResult(**{f.name: VALUES[str(f.type)](row[f.name]) for f in fields(PointResult)})
+        for row in rows
+    ]
+
+
+def assert_same(a, b):
+    """Equal in every field, NaN being equal to NaN."""
+    np.testing.assert_equal(asdict(a), asdict(b))
 
 
 def plan(count):

@@ -77,8 +77,6 @@ def test_the_table_tells_truth_failures_and_repeats(run):
     assert lines[4].endswith("failed: contact: surface_missing")
     deviation, repeats = table_notes(run.latest, truths_of(run))
     assert "rms 3.00 of f0, 1.00 of the damping ratio; largest 3.0" in deviation
-    assert (
-        repeats == "3 times a point was begun again, at 1 of 3 points: force_stale 2, arm_stale 1"
-    )
+    assert repeats == "1 of 3 points had to be repeated, 3 times in all: force_stale 2, arm_stale 1"
     assert "true f0" not in point_table(run.latest, {})
-    assert repeats_sentence(run.latest[1:]) == "no point had to be begun again"
+    assert repeats_sentence(run.latest[1:]) == "no point had to be repeated"

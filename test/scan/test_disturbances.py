@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often an attempt that was disturbed comes again."""
+"""How often an attempt that was disturbed is repeated."""
 
 from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import ATTEMPTS, ATTEMPTS_WITHOUT_NODE, NodeAway, PointDisturbed

@@ -15,12 +15,22 @@ from rosbags.rosbag2 import Reader
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.messages import message_types
-from tactile_resonance.scan.point_result import COLUMNS, Outcome, as_csv, from_csv, same_result
+from tactile_resonance.scan.point_result import COLUMNS, Outcome, as_csv
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from runs import POLES, RECORD, START_NS, plan, record_cdr, record_point, result
+from runs import (
+    POLES,
+    RECORD,
+    START_NS,
+    assert_same,
+    plan,
+    record_cdr,
+    record_point,
+    result,
+    table_of,
+)
 
 SCENE = "name: test\nforce_n: 0.01\n"
 KILLS = 30
@@ -93,11 +103,11 @@ def test_a_row_a_message_and_a_file_say_the_same(tmp_path):
         for r in given:
             with run.begin_point(r.index) as recording:
                 recording.finish(r)
-    rows = from_csv((tmp_path / "run" / "results.csv").read_text())
+    rows = table_of(tmp_path / "run")
     read = read_run(tmp_path / "run").latest
     for a, b, c in zip(given, rows, read, strict=True):
-        assert same_result(a, b)
-        assert same_result(a, c)
+        assert_same(a, b)
+        assert_same(a, c)
     # every field of the message is a column
     fields = [name for name, _ in message_types().fielddefs["tactile_resonance/msg/PointResult"][1]]
     assert ["header", *[c for c in COLUMNS if c not in ("time_ns", "frame_id")]] == fields
@@ -115,7 +125,7 @@ def test_an_attempt_more_replaces_the_row_and_keeps_the_file(tmp_path):
         assert run.content.next_point.index == 2
     names = sorted(path.name for path in (tmp_path / "run" / "recording").glob("*.mcap"))
     assert names == ["point-00000-00.mcap", "point-00000-01.mcap", "point-00001-00.mcap"]
-    assert from_csv((tmp_path / "run" / "results.csv").read_text())[0].attempt == 1
+    assert table_of(tmp_path / "run")[0].attempt == 1
 
 
 def test_what_is_not_finished_leaves_nothing(tmp_path):
@@ -216,7 +226,7 @@ def test_killed_at_any_moment_no_finished_point_is_lost_or_repeated(tmp_path):
             following = resumed.content.next_point
         assert (following.index if following else 60) == len(finished)
         announced = finished
-        assert from_csv((path / "results.csv").read_text()) != [] or not finished
+        assert len(table_of(path)) == len(finished)
         assert (path / "results.csv").read_text() == as_csv(run.latest)
         with Reader(path / "recording") as reader:
             assert reader.message_count == 4 * len(finished)

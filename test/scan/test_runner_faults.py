@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that fail or are disturbed, nodes that go away: what comes again, what goes on, what ends."""
+"""Points that fail or are disturbed, nodes that go away: what is repeated, what goes on, what ends."""
 
 import sys
 import threading

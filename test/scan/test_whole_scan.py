@@ -12,11 +12,12 @@ import pytest
 from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
 from tactile_resonance.report.run_report import pole_map_of
-from tactile_resonance.scan.point_result import Outcome, PointResult, from_csv, same_result
+from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from runs import assert_same, table_of
 from scanned import begin, go_on, true_poles
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")
@@ -155,6 +156,7 @@ def test_report_of_no_run_says_so(tmp_path, capsys):
 
 def test_table_and_recording_hold_the_same_bits(run_folder):
     results = read_run(run_folder).latest
-    rows = from_csv((run_folder / "results.csv").read_text())
+    rows = table_of(run_folder)
     assert len(rows) == 25
-    assert all(same_result(a, b) for a, b in zip(results, rows, strict=True))
+    for a, b in zip(results, rows, strict=True):
+        assert_same(a, b)

@@ -42,7 +42,7 @@ class Joints:
         return rate(self._slower, self.qd)
 
     def reseed(self, seed: Seed) -> None:
-        """Tremble from the next step on as a seed says."""
+        """Let vibration follow from a seed, from the next step on."""
         if self._jitter is not None:
             self._jitter.reseed(seed)
 

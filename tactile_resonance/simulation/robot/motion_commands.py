@@ -69,7 +69,7 @@ class MotionCommands:
             yield from move
 
     def _told(self, work: Thread) -> Thread:
-        """Run a motion as an asynchronous operation, its begin and end told to the client."""
+        """Run a motion as an asynchronous operation, and report its begin and end to the client."""
         self._script.begin_asynchronous()
         yield from work
         self._script.end_asynchronous()
@@ -96,11 +96,11 @@ class MotionCommands:
             yield from work
 
     def speedl(self) -> None:
-        """Move the TCP with a twist until told otherwise."""
+        """Move the TCP with a twist until the next command."""
         self._speed_to(motion.speedl)
 
     def speedj(self) -> None:
-        """Move the joints with speeds until told otherwise."""
+        """Move the joints with speeds until the next command."""
         self._speed_to(motion.speedj)
 
     def _speed_to(self, run: SpeedMotion) -> None:

@@ -88,7 +88,7 @@ class Program:
         return True
 
     def _loop(self) -> Thread:
-        """Serve commands until told to stop: one look at the command register in each cycle.
+        """Serve commands until the stop command: one look at the command register in each cycle.
 
         A streaming command is done anew as long as it stands in the register; any other once, until
         the client has taken it away.

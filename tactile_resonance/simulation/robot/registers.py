@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 # Numbers 0 to 23 are the lower range, 24 to 47 the upper one.
 REGISTER_COUNT = 48
-# No figure that a robot is told is larger; beyond, sums and squares of them end in no number.
+# Larger figures are refused: sums and squares of them would not be finite.
 LARGEST_FIGURE = 1e6
 
 

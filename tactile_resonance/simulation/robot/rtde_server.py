@@ -63,7 +63,7 @@ class RtdeServer:
             service.publish(cycle, known)
 
     def repeat(self) -> None:
-        """Send what was sent last again: clients take a robot that says nothing for lost."""
+        """Send what was sent last again: clients take a silent robot for lost."""
         for service in list(self._services):
             service.repeat()
 

@@ -78,7 +78,7 @@ class Script:
         Raises
         ------
         ScriptError
-            Where one of them is no number within +-1e6.
+            If one of them is not finite or beyond +-1e6.
         """
         first = number + self.offset
         values = self._registers.input_double[first : first + count]

@@ -54,7 +54,7 @@ def wait_for_fault(arm, limit_s=2.0):
 
 
 def pass_time(arm, seconds):
-    """Let time go on whatever becomes of the arm; its owner shows that he lives."""
+    """Let time go on whatever becomes of the arm; its owner gives signs of life."""
     end_ns = arm.clock.now_ns() + round(seconds * 1e9)
     while arm.clock.now_ns() < end_ns:
         with contextlib.suppress(ArmError):

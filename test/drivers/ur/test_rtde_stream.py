@@ -6,23 +6,18 @@ Universal Robots, "Real-Time Data Exchange (RTDE) Guide": a packet is its length
 """
 
 import contextlib
-import fcntl
 import os
-import socket
 import struct
-import termios
-import threading
 import time
-from array import array
 
 import numpy as np
 import pytest
+from one_client import PATIENCE_S, one_client, wait_until_arrived
 
 from tactile_resonance.drivers import rtde_stream
 from tactile_resonance.drivers.rtde_stream import PORT, RobotState, RtdeStream
 
 HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.231"
-PATIENCE_S = 30.0
 VERSION = b"\x00\x05V\x00\x02"
 NAMES = (
     b"timestamp,actual_TCP_pose,actual_TCP_speed,actual_TCP_force,safety_status_bits,runtime_state,"
@@ -39,53 +34,15 @@ REQUESTS = (VERSION, packet(b"O", struct.pack(">d", 125.0) + NAMES), packet(b"S"
 GOOD = (packet(b"V", b"\x01"), packet(b"O", b"\x01" + TYPES), packet(b"S", b"\x01"))
 
 
-class Robot:
-    """A robot's RTDE port: hears three requests, answers as it is told; then `channel` is the test's."""
-
-    def __init__(self, answers=GOOD):
-        self.heard = []
-        self.channel = None
-        self._listener = socket.create_server((HOST, PORT))
-        self._answers = answers
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self):
-        for _ in range(2):  # only to see how long a connection takes
-            self._listener.accept()[0].close()
-        self.channel, _ = self._listener.accept()
-        self.channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        with contextlib.suppress(OSError):
-            for request, answer in zip(REQUESTS, self._answers, strict=False):
-                got = b""
-                while len(got) < len(request):
-                    part = self.channel.recv(len(request) - len(got))
-                    if not part:
-                        return
-                    got += part
-                self.heard.append(got)
-                for at in range(0, len(answer), 7):
-                    self.channel.sendall(answer[at : at + 7])
-
-    def join(self):
-        self._thread.join(PATIENCE_S)
-
-    def close(self):
-        self.join()
-        self._listener.close()
-        if self.channel is not None:
-            self.channel.close()
-
-
 @pytest.fixture
 def serve():
     """Make a robot that answers in some way; it is gone after the test."""
     with contextlib.ExitStack() as stack:
 
         def make(answers=GOOD):
-            robot = Robot(answers)
-            stack.callback(robot.close)
-            return robot
+            dialogue = list(zip(REQUESTS, answers, strict=False))
+            # two connections before it only show how long connecting takes
+            return stack.enter_context(one_client((HOST, PORT), dialogue, probes=2, piece=7))
 
         yield make
 
@@ -123,14 +80,6 @@ def read(stream, count):
         time.sleep(0.0005)
     assert stream.read() == []
     return states
-
-
-def arrived(stream, size):
-    """Wait until so many bytes are there to be read."""
-    there, end_s = array("i", [0]), time.monotonic() + PATIENCE_S
-    while there[0] < size:
-        assert time.monotonic() < end_s, f"{there[0]} bytes of {size}"
-        fcntl.ioctl(stream.fileno(), termios.FIONREAD, there)
 
 
 def test_it_asks_for_version_2_and_its_variables_at_its_rate(connected):
@@ -189,7 +138,7 @@ def test_one_look_brings_all_that_has_come(connected, monkeypatch, at_once):
     states = [state(n) for n in range(50)]
     text = b"".join(map(data, states))
     robot.channel.sendall(text)
-    arrived(stream, len(text))
+    wait_until_arrived(stream.fileno(), len(text))
     assert stream.read() == states
 
 
@@ -198,7 +147,7 @@ def test_nothing_to_read_is_nothing_and_a_closed_connection_an_error(connected):
     assert stream.read() == []
     robot.channel.sendall(data(state(1)))
     robot.channel.close()
-    arrived(stream, len(data(state(1))))
+    wait_until_arrived(stream.fileno(), len(data(state(1))))
     assert stream.read() == [state(1)]
     with pytest.raises(ConnectionError, match="the robot has closed the connection"):
         read(stream, 1)

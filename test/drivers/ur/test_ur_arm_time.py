@@ -282,8 +282,8 @@ def test_a_loop_that_dies_while_it_leads_holds_nothing(robot, start_arm, module_
     arm.speed(UP, ACCELERATION_M_S2)
     keep_for(arm, 0.1)
     os.kill(arm.client_pid, signal.SIGKILL)
-    arm._led.close()
-    arm._own.close()
+    arm._time.led.close()
+    arm._time._asked.close()
     robot.until(runtime_state="STOPPED")  # by its watchdog: time goes on
 
 

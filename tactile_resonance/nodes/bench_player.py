@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Playing an excitation on the simulated bench: block after block, each when its last sample is taken."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Channel, Origin, Record
+from tactile_resonance.simulation.acquisition import Block, ChannelSamples
+from tactile_resonance.simulation.bench_run import BenchRun
+
+
+class BenchPlayer:
+    """Plays one excitation at a time, in a thread of its own.
+
+    Parameters
+    ----------
+    time_server : str
+        Address of the simulated time in which it plays; empty: the machine's clock.
+    """
+
+    def __init__(self, time_server: str) -> None:
+        self._time_server = time_server
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._clock: SimulatedClock | None = None
+
+    def play(
+        self,
+        run: BenchRun,
+        excitation: Excitation,
+        start_ns: int,
+        hand_out: Callable[[Block, int], None],
+    ) -> None:
+        """Begin to play; what was played before must have been silenced.
+
+        Parameters
+        ----------
+        run : BenchRun
+        excitation : Excitation
+        start_ns : int
+            ROS time of the first sample [ns].
+        hand_out : callable
+            Called in the thread with each block and the ROS time of its end [ns], at that time.
+
+        Raises
+        ------
+        ClockLostError
+            If no bench serves the simulated time.
+        """
+        if self._time_server:
+            self._clock = SimulatedClock(self._time_server, "bench")
+        self._stop.clear()
+
+        def play() -> None:
+            for block in run.play(excitation, excitation.periods):
+                end_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
+                if not self._wait_until(end_ns):
+                    return
+                hand_out(block, end_ns)
+
+        self._thread = threading.Thread(target=play, name="bench", daemon=True)
+        self._thread.start()
+
+    def silence(self) -> None:
+        """Stop at once; returns when nothing more is handed out."""
+        self._stop.set()
+        if self._clock is not None:
+            self._clock.interrupt()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+
+    def _wait_until(self, time_ns: int) -> bool:
+        """Wait for a ROS time [ns]; False where it was silenced meanwhile."""
+        if self._clock is None:
+            return not self._stop.wait(max(0, time_ns - time.time_ns()) / 1e9)
+        try:
+            self._clock.sleep_until(time_ns)
+        except ClockLostError:
+            return False
+        return not self._stop.is_set()
+
+
+def bench_record(block: Block, excitation: Excitation, start_ns: int, frame_id: str) -> Record:
+    """Record of a block of an excitation that began at a ROS time [ns]."""
+    return Record(
+        actuator=_channel(block.actuator),
+        sensor=_channel(block.sensor),
+        sample_rate_hz=block.sample_rate_hz,
+        samples_per_period=block.samples_per_period,
+        realisation=excitation.realisation,
+        block_index=block.index,
+        origin=Origin(
+            measurement_id=excitation.measurement_id,
+            excitation_id=excitation.excitation_id,
+            time_ns=start_ns + round(block.start_time_s * 1e9),
+            frame_id=frame_id,
+            label=excitation.label,
+            simulated=True,
+        ),
+    )
+
+
+def _channel(samples: ChannelSamples) -> Channel:
+    if samples.counts is None:
+        return Channel(samples.volts, saturated=samples.saturated)
+    return Channel(samples.counts, samples.scale_v, 0.0, samples.saturated)
