@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -68,7 +67,8 @@ class _Managed:
     client: Client | None = None
     deadline_s: float = 0.0
     refusals: int = 0
-    next_try_s: float = field(default=0.0)
+    next_try_s: float = 0.0
+    next_look_s: float = 0.0
 
 
 class ManagerNode(Node):
@@ -128,28 +128,41 @@ class ManagerNode(Node):
         return response
 
     def _on_start_of(self, node: _Managed) -> None:
-        """A node that was started anew does not answer what the one before it was asked."""
+        """A node that was started anew does not answer what the one before it was asked.
+
+        It is asked a little later: what it answers before it knows of the client is lost.
+        """
         if node.pending is not None:
             self._forget(node)
-        self._tick()
+        node.next_look_s = 0.0
+        self._look_after(TICK_S)
 
     def _on_transition(self, node: _Managed) -> None:
         """Ask what it is now, where no answer is awaited that tells it anyway."""
         if node.pending is None and node.get.service_is_ready():
             self._ask(node, node.get, GetState.Request(), time.monotonic())
 
+    @property
+    def _wanted(self) -> int:
+        """State of all nodes in the end."""
+        if self._wanted_up:
+            return State.PRIMARY_STATE_ACTIVE
+        return State.PRIMARY_STATE_UNCONFIGURED
+
+    def _look_after(self, seconds: float) -> None:
+        self._timer.timer_period_ns = round(seconds * 1e9)
+        self._timer.reset()
+
     def _tick(self) -> None:
         """One step of each node; the next when one of them is due."""
-        ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
         now_s = time.monotonic()
         due_s = now_s + LOOK_S
         for node in self._nodes if self._wanted_up else reversed(self._nodes):
             due_s = min(due_s, self._advance(node, moves if clear else {}, now_s))
-            clear = clear and node.state == ready
-        self._timer.timer_period_ns = round(max(TICK_S, due_s - now_s) * 1e9)
-        self._timer.reset()
+            clear = clear and node.state == self._wanted
+        self._look_after(max(TICK_S, due_s - now_s))
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
         self._was_up = clear and self._wanted_up
@@ -171,24 +184,25 @@ class ManagerNode(Node):
         if transition is not None and now_s >= node.next_try_s:
             request = ChangeState.Request(transition=Transition(id=transition))
             self._ask(node, node.change, request, now_s)
-        else:
+        elif node.state == State.PRIMARY_STATE_UNKNOWN or now_s >= node.next_look_s - LOOK_S / 2:
+            # with those who are due soon, who would wake the manager one by one
             self._ask(node, node.get, GetState.Request(), now_s)
-        return node.next_try_s if transition is not None and now_s < node.next_try_s else math.inf
+        return node.next_look_s if transition is None else min(node.next_look_s, node.next_try_s)
 
     def _ask(self, node: _Managed, client: Client, request: object, now_s: float) -> None:
         (timeout_s,) = values(self, "answer_timeout_s")
         if client is node.get:
             timeout_s = min(timeout_s, STATE_WITHIN_S)
         node.client, node.pending = client, client.call_async(request)
-        node.deadline_s = now_s + timeout_s
+        node.deadline_s = node.next_look_s = now_s + timeout_s
         node.pending.add_done_callback(lambda future: self._hear(node, future))
 
     def _hear(self, node: _Managed, answer: Future) -> None:
-        """An answer by which a node has moved leads to the next question at once, others at the next look."""
+        """An answer of a node that has moved, or is to move, leads to the next step at once."""
         if node.pending is answer and not answer.cancelled():
             before = node.state
             self._take(node, time.monotonic())
-            if node.state != before:
+            if node.state != before or node.state != self._wanted:
                 self._tick()
 
     def _take(self, node: _Managed, now_s: float) -> None:
@@ -196,7 +210,7 @@ class ManagerNode(Node):
         if isinstance(answer, GetState.Response):
             if node.state == State.PRIMARY_STATE_ACTIVE != answer.current_state.id:
                 self.health.error(f"{node.name} is {_NAMES.get(answer.current_state.id)} again")
-            node.state = answer.current_state.id
+            node.state, node.next_look_s = answer.current_state.id, now_s + LOOK_S
             return
         node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:

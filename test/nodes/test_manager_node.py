@@ -36,7 +36,13 @@ class Managed(ManagedNode):
 
 def test_one_tick_brings_all_up_in_order(monkeypatch):
     monkeypatch.setattr(manager_node, "TICK_S", 3600.0)
-    log, names = [], ["first", "second", "third"]
+    log, names, appeared = [], ["first", "second", "third"], []
+    on_start_of = ManagerNode._on_start_of
+    monkeypatch.setattr(
+        ManagerNode,
+        "_on_start_of",
+        lambda manager, node: (appeared.append(node.name), on_start_of(manager, node)),
+    )
     arguments = ["--ros-args", "-p", f"manager_node:nodes:=[{','.join(names)}]"]
     with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
         manager, nodes = ManagerNode(), [Managed(name, log) for name in names]
@@ -46,7 +52,11 @@ def test_one_tick_brings_all_up_in_order(monkeypatch):
 
         asked = [client for each in manager._nodes for client in (each.get, each.change)]
         assert spin_until(
-            executor, lambda: all(client.service_is_ready() for client in asked), WITHIN_S
+            executor,
+            lambda: (
+                sorted(appeared) == names and all(client.service_is_ready() for client in asked)
+            ),
+            WITHIN_S,
         )
         manager._tick()
         up = spin_until(
@@ -58,3 +68,32 @@ def test_one_tick_brings_all_up_in_order(monkeypatch):
             node.destroy_node()
     assert up, log
     assert log == [(step, name) for name in names for step in ("configure", "activate")]
+
+
+def test_what_a_node_does_by_itself_is_followed_without_a_look(monkeypatch):
+    monkeypatch.setattr(manager_node, "LOOK_S", 3600.0)
+    log = []
+    arguments = ["--ros-args", "-p", "manager_node:nodes:=[first]"]
+    with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
+        executor = SingleThreadedExecutor()
+        manager = ManagerNode()
+        executor.add_node(manager)
+
+        def came_up(node, times):
+            def up():
+                return log.count(("activate", "first")) == times and manager._was_up
+
+            return spin_until(executor, up, WITHIN_S) and node.state_name() == "active"
+
+        node = Managed("first", log)
+        executor.add_node(node)
+        assert came_up(node, 1), log
+        node.fail("told to")
+        assert came_up(node, 2), log
+        executor.remove_node(node)
+        node.destroy_node()
+        node = Managed("first", log)  # started anew
+        executor.add_node(node)
+        assert came_up(node, 3), log
+        for each in executor.get_nodes():
+            each.destroy_node()
