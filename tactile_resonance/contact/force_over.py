@@ -38,9 +38,6 @@ LEAST_COVERAGE = 0.8
 BATCHES, LEAST_WRENCHES = 8, 32
 """For the standard deviation of the mean."""
 
-SMOOTH_NS = 20_000_000
-"""Smallest and largest force are those of the mean over so long [ns]."""
-
 SPARE = 1.1
 """A source may be faster than it states by this factor without losing the oldest wrenches."""
 
@@ -57,8 +54,6 @@ class ForceOver:
         Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
         correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
         Modeling and Analysis*, section 9.5.3). NaN for fewer than 32 wrenches.
-    force_min_n, force_max_n : float
-        Smallest and largest mean over 20 ms within the interval [N]; that of all where it is shorter.
     coverage : float
         Share of the interval over which valid wrenches came without a gap.
     position_m : tuple of 3 floats
@@ -71,8 +66,6 @@ class ForceOver:
 
     force_n: float
     force_std_n: float
-    force_min_n: float
-    force_max_n: float
     coverage: float
     position_m: Vector
     rotation_rad: Vector
@@ -101,11 +94,6 @@ class ForceRecord:
         self._poses = _Ring(6, math.ceil(SPARE * length_s / period_s) + 1)
         self._now_ns, self._zero_std_n = 0, 0.0
         self._lock = threading.Lock()
-
-    @property
-    def newest_ns(self) -> int:
-        """Time of the newest wrench [ns]: up to then an interval can be asked for; 0 before the first."""
-        return self._forces.newest_ns
 
     def restart(self, zero_std_n: float = 0.0) -> None:
         """Forget all forces, as of a new tare: earlier ones are not less its zero.
@@ -174,17 +162,15 @@ class ForceRecord:
             rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
         reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, spans.coverage)
         if reason:
-            unknown = math.nan, math.nan, math.nan, math.nan
-            return ForceOver(*unknown, spans.coverage, position_m, rotation_rad, reason)
+            return ForceOver(
+                math.nan, math.nan, spans.coverage, position_m, rotation_rad, reason
+            )
         heard = np.count_nonzero((times >= t0_ns) & (times <= t1_ns) & np.isfinite(rows[:, 0]))
         std_n = math.nan
         if heard >= LEAST_WRENCHES:
             std_n = math.hypot(spans.std_of_mean(), zero_std_n)
         force_n = float(spans.mean()[0])
-        least_n, most_n = spans.range_of_means(SMOOTH_NS)
-        return ForceOver(
-            force_n, std_n, least_n, most_n, spans.coverage, position_m, rotation_rad, ""
-        )
+        return ForceOver(force_n, std_n, spans.coverage, position_m, rotation_rad, "")
 
     def _missing(
         self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: int | None, coverage: float
@@ -256,15 +242,6 @@ class _Spans:
         ends = np.linspace(0.0, covered[-1], BATCHES + 1)
         means = np.diff(np.interp(ends, covered, sums)) / (covered[-1] / BATCHES)
         return float(means.std(ddof=1) / math.sqrt(BATCHES))
-
-    def range_of_means(self, window_ns: float) -> tuple[float, float]:
-        """Smallest and largest mean of the first column over a window of covered time."""
-        covered, sums = self._covered_ns, self._sums[:, 0]
-        window_ns = min(window_ns, float(covered[-1]))
-        begin = covered[covered <= covered[-1] - window_ns]
-        means = np.interp(begin + window_ns, covered, sums) - sums[: len(begin)]
-        means = self._reference[0] + means / window_ns
-        return float(means.min()), float(means.max())
 
 
 class _Ring:

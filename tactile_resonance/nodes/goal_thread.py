@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -32,7 +34,8 @@ async def in_thread(node: Node, work: Callable[[], Any], name: str) -> Any:
             outcome.append(work())
         except Exception as error:
             raised.append(error)
-        guard.trigger()
+        with contextlib.suppress(InvalidHandle):  # the node has gone, and nobody waits
+            guard.trigger()
 
     threading.Thread(target=run, name=name, daemon=True).start()
     await finished

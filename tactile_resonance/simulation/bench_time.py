@@ -195,11 +195,6 @@ class BenchTime:
         for call in self.seeds:
             call((integers[0], integers[1], integers[2]))
 
-    @property
-    def held_by(self) -> list[str]:
-        """Names of the participants for which time stands."""
-        return [p.name for p in self._participants if p.until_ns <= self.now_ns]
-
     # how far time may go
 
     def demand(self) -> Demand | None:

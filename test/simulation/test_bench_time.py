@@ -96,7 +96,6 @@ def test_the_slowest_decides(bench, conductor):
     waited.start()
     time.sleep(0.1)
     assert slow.ask_ns() == begun_ns + 10 * STEP_NS
-    assert "slow" in bench.time.held_by
     slow.free()
     waited.join(10)
     assert quick.now_ns() == begun_ns + 100 * STEP_NS
