@@ -26,6 +26,7 @@ from tactile_resonance.srv import Play
 
 ANSWER_TIMEOUT_S = 10.0
 POLL_S = 5e-4
+ASK_AGAIN_S = 2.0
 
 
 class BenchDevice:
@@ -150,12 +151,17 @@ class BenchDevice:
             raise DeviceError(f"device: {error}") from error
 
     def _call(self, client: Client, request: object):
-        """Call a service from a worker thread while the executor's thread spins."""
-        future = client.call_async(request)
+        """Call a service from a worker thread while the executor's thread spins.
+
+        An answer that the bench gives before it has discovered this client is lost: it is asked again.
+        """
         deadline = time.monotonic() + self._answer_s
-        while not future.done():
-            if time.monotonic() > deadline:
-                future.cancel()
-                raise DeviceError(f"device: no answer on {client.srv_name}")
-            time.sleep(POLL_S)
-        return future.result()
+        while time.monotonic() < deadline:
+            future = client.call_async(request)
+            again = min(deadline, time.monotonic() + ASK_AGAIN_S)
+            while time.monotonic() < again:
+                if future.done():
+                    return future.result()
+                time.sleep(POLL_S)
+            client.remove_pending_request(future)
+        raise DeviceError(f"device: no answer on {client.srv_name}")

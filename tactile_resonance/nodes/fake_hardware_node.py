@@ -101,6 +101,7 @@ class FakeHardwareNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("fake_hardware_node", PARAMETERS)
         self._player = BenchPlayer(self.time_server)
+        self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
 
     def configure(self) -> None:
         """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
@@ -144,7 +145,11 @@ class FakeHardwareNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Silence the output."""
+        self._silence()
+
+    def _silence(self) -> None:
         self._player.silence()
+        self._played = None
 
     def _serve_ideal_contact(self, by_action: bool) -> None:
         if by_action:
@@ -220,6 +225,9 @@ class FakeHardwareNode(ManagedNode):
         if not self.active:
             response.message = f"fake_hardware_node is {self.state_name()}"
             return response
+        asked_id = request.excitation.excitation_id
+        if self._played is not None and self._played[0] == asked_id != 0:
+            return self._played[1]  # asked again: the answer was lost, or late
         try:
             excitation = excitation_from_message(request.excitation)
             effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
@@ -233,7 +241,7 @@ class FakeHardwareNode(ManagedNode):
                 int(entropy.generate_state(1, np.uint64)[0]),
                 effects,
             )
-            self._player.silence()
+            self._silence()
             start_ns = self._now_ns()
             hand_out = self._hand_out(excitation, start_ns, self._stays.newest.pose, self._tip)
             self._player.play(run, excitation, start_ns, hand_out)
@@ -242,6 +250,7 @@ class FakeHardwareNode(ManagedNode):
             return response
         self._say_effort(run, excitation)
         response.accepted, response.start = True, time_message(start_ns)
+        self._played = excitation.excitation_id, response
         return response
 
     def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:
@@ -273,7 +282,7 @@ class FakeHardwareNode(ManagedNode):
         return response
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._player.silence()
+        self._silence()
         response.success = True
         return response
 
