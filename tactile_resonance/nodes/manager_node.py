@@ -106,7 +106,7 @@ class ManagerNode(Node):
         self.create_subscription(
             TransitionEvent,
             f"{name}/transition_event",
-            lambda _: self._on_transition(node),
+            lambda event: self._on_transition(node, event.goal_state.id),
             10,
             event_callbacks=SubscriptionEventCallbacks(matched=matched),
         )
@@ -137,10 +137,14 @@ class ManagerNode(Node):
         node.next_look_s = 0.0
         self._look_after(TICK_S)
 
-    def _on_transition(self, node: _Managed) -> None:
-        """Ask what it is now, where no answer is awaited that tells it anyway."""
+    def _on_transition(self, node: _Managed, goal_id: int) -> None:
+        """Ask what it is now; an answer to the transition is awaited a little longer, since it may be lost."""
+        now_s = time.monotonic()
         if node.pending is None and node.get.service_is_ready():
-            self._ask(node, node.get, GetState.Request(), time.monotonic())
+            self._ask(node, node.get, GetState.Request(), now_s)
+        elif node.client is node.change and goal_id in _NAMES:  # none of those in between
+            node.deadline_s = min(node.deadline_s, now_s + STATE_WITHIN_S)
+            self._look_after(TICK_S)
 
     @property
     def _wanted(self) -> int:

@@ -43,5 +43,7 @@ def test_a_simulated_robot_that_stalls_is_waited_for_longer():
 
 
 def test_no_robot_of_hardware_is_waited_for_longer():
-    with pytest.raises(ValueError, match=r"simulated_stalls_s.*0\.05.*0 for the robot at 192.0.2.1"):
+    with pytest.raises(
+        ValueError, match=r"simulated_stalls_s.*0\.05.*0 for the robot at 192.0.2.1"
+    ):
         contact_devices.make_arm(Node(robot_host="192.0.2.1", simulated_stalls_s=0.05), 0)

@@ -9,6 +9,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 from lifecycle_msgs.msg import State
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
 from spinning import spin_until
 
 from tactile_resonance.nodes import manager_node
@@ -95,5 +96,33 @@ def test_what_a_node_does_by_itself_is_followed_without_a_look(monkeypatch):
         node = Managed("first", log)  # started anew
         executor.add_node(node)
         assert came_up(node, 3), log
+        for each in executor.get_nodes():
+            each.destroy_node()
+
+
+def test_a_transition_whose_answer_is_lost_does_not_hold_up_the_others(monkeypatch):
+    monkeypatch.setattr(manager_node, "STATE_WITHIN_S", 0.5)
+    lost = []
+    ask = ManagerNode._ask
+
+    def ask_and_lose_one(manager, node, client, request, now_s):
+        ask(manager, node, client, request, now_s)
+        if client is node.change and not lost:
+            lost.append(node.pending)
+            node.pending = Future()  # the node does as it is told, and nobody hears of it
+
+    monkeypatch.setattr(ManagerNode, "_ask", ask_and_lose_one)
+    log, names = [], ["first", "second"]
+    arguments = ["--ros-args", "-p", f"manager_node:nodes:=[{','.join(names)}]"]
+    arguments += ["-p", "manager_node:answer_timeout_s:=600.0"]
+    with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
+        executor = SingleThreadedExecutor()
+        manager = ManagerNode()
+        executor.add_node(manager)
+        for name in names:
+            executor.add_node(Managed(name, log))
+        assert spin_until(executor, lambda: manager._was_up, WITHIN_S), log
+        assert log == [(step, name) for name in names for step in ("configure", "activate")]
+        assert lost
         for each in executor.get_nodes():
             each.destroy_node()
