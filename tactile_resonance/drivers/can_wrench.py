@@ -30,8 +30,8 @@ class CanWrench:
     """Wrenches of a cell on CAN, in its own frame (a `contact.interfaces.Cell`).
 
     `read` takes the frames that have come, joins them, stamps and checks each wrench. Silence is only
-    declared where nothing waited. A reader that was held up itself, perhaps with what brings the frames,
-    waits once more for as long as a cell may be silent.
+    declared where nothing waited. If the call itself comes late, the machine may have stood still, and the
+    process that brings the frames with it: then the time of silence begins anew, once.
 
     Parameters
     ----------

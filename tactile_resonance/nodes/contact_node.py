@@ -318,7 +318,7 @@ class ContactNode(ManagedNode):
     # each cycle, in the loop's thread
 
     def _on_cycle(self, cycle: Cycle) -> None:
-        # a force source is started again once the tip has been drawn back: not before is it given up
+        # a force source is started again once the tip has been drawn back; only then its fault counts
         waits = isinstance(cycle.fault, ForceError) and cycle.state is not State.IDLE
         if cycle.fault is None or waits or self._sound_ns is None:
             self._sound_ns = cycle.time_ns

@@ -138,7 +138,7 @@ class ContactThread:
             raise _EndedError
 
     def _start_source_again(self) -> None:
-        """Start a force source that has failed, once nothing is under way that would wait for the loop."""
+        """Start a force source that has failed; only while no contact is under way, since it takes a while."""
         now_s = time.monotonic()
         if self.controller.state is State.IDLE and now_s - self._source_tried_s > SOURCE_AGAIN_S:
             self._source_tried_s = now_s

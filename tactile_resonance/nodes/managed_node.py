@@ -61,8 +61,8 @@ class ManagedNode(LifecycleNode):
 
     `configure` makes publishers, subscriptions, services, actions and devices through `publish_on`, `listen`,
     `serve`, `act` and `resources`; the way back undoes them in reverse order. What arrives while the node is
-    not active is dropped, and nothing is published then. Those who listen on `heartbeat` get its
-    signs of life.
+    not active is dropped, and nothing is published then. While `heartbeat` has
+    subscribers, it publishes signs of life there.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class ManagedNode(LifecycleNode):
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
         self._instance = int.from_bytes(os.urandom(7), "big")
-        # a timer that fires for nobody wakes the executor all the same, which is what an idle node costs
+        # started by the first subscriber: each call of a timer wakes the executor, most of what an idle node costs
         self._beat_timer = self.steady_timer(BEAT_S, self._beat)
         self._beat_timer.cancel()
         events = PublisherEventCallbacks(matched=self._on_listeners)
@@ -122,7 +122,7 @@ class ManagedNode(LifecycleNode):
         qos: QoSProfile,
         matched: Callable[[QoSPublisherMatchedInfo], None] | None = None,
     ) -> LifecyclePublisher:
-        """Publisher until the node is cleaned up; `matched` hears of subscribers that come or go."""
+        """Publisher until the node is cleaned up; `matched` is called when a subscriber comes or goes."""
         events = PublisherEventCallbacks(matched=matched)
         publisher = self.create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
         self.resources.callback(self.destroy_lifecycle_publisher, publisher)
@@ -189,7 +189,10 @@ class ManagedNode(LifecycleNode):
         self.resources.callback(server.destroy)
 
     def set_up(self, make: Callable[[], None]) -> Callable[[], None]:
-        """Let `make` set up what is let go by calling what is returned, at the latest with the rest."""
+        """Run `make`, and return a function that undoes all that it set up.
+
+        Without a call of that function it is undone when the node is cleaned up.
+        """
         rest, self.resources = self.resources, ExitStack()
         try:
             make()
@@ -231,7 +234,7 @@ class ManagedNode(LifecycleNode):
     # Its life
 
     def _on_listeners(self, matched: QoSPublisherMatchedInfo) -> None:
-        """Signs of life from now on, the first at once, or none where nobody listens any more."""
+        """Start the signs of life with the first subscriber, at once, and end them with the last."""
         if matched.current_count:
             self._beat_timer.reset()
             self._beat()

@@ -32,7 +32,7 @@ PARAMETERS = (
 )
 
 TICK_S = 0.1
-# A node tells of its own transitions, and the graph of one that appears: a look finds those that hang.
+# Transitions are published and new nodes discovered: that the state is asked for finds only nodes that hang.
 LOOK_S = 2.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
@@ -128,9 +128,9 @@ class ManagerNode(Node):
         return response
 
     def _on_start_of(self, node: _Managed) -> None:
-        """A node that was started anew does not answer what the one before it was asked.
+        """Await no answer to requests sent to the process before this one; ask the new one.
 
-        It is asked a little later: what it answers before it knows of the client is lost.
+        A little later: an answer that is given before the client is discovered is lost.
         """
         if node.pending is not None:
             self._forget(node)
@@ -138,7 +138,10 @@ class ManagerNode(Node):
         self._look_after(TICK_S)
 
     def _on_transition(self, node: _Managed, goal_id: int) -> None:
-        """Ask what it is now; an answer to the transition is awaited a little longer, since it may be lost."""
+        """Ask for the state; where the answer to the transition is still awaited, do so after a few seconds.
+
+        That answer may be lost.
+        """
         now_s = time.monotonic()
         if node.pending is None and node.get.service_is_ready():
             self._ask(node, node.get, GetState.Request(), now_s)
@@ -202,7 +205,7 @@ class ManagerNode(Node):
         node.pending.add_done_callback(lambda future: self._hear(node, future))
 
     def _hear(self, node: _Managed, answer: Future) -> None:
-        """An answer of a node that has moved, or is to move, leads to the next step at once."""
+        """Take an answer; after a change of state, or where one is wanted, go on at once."""
         if node.pending is answer and not answer.cancelled():
             before = node.state
             self._take(node, time.monotonic())

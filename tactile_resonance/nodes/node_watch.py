@@ -57,10 +57,10 @@ class NodeWatch:
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
     def met(self) -> bool:
-        """Whether all that publish now have given a sign of life.
+        """Whether all nodes that publish now have given a sign of life.
 
-        A node that has hears of each subscription that was made before this watch, in the order in which
-        they were made: nothing that it publishes from then on is missed.
+        Subscriptions are discovered in the order in which they were made. So a node whose sign of life arrives
+        has discovered those made before this watch: nothing that it publishes from then on is missed.
         """
         names = {name for topic in self._topics for name in self._publishers(topic)}
         with self._lock:

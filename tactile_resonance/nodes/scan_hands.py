@@ -49,7 +49,7 @@ NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
 MET_WITHIN_S = 1.0
-"""Nodes of this package give a sign of life much sooner, those of others never."""
+"""Nodes of this package give a sign of life much sooner, those of other packages never."""
 # Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
 LEAST_TOUCH_STD_M = 2e-5
 
@@ -101,7 +101,7 @@ class NodeHands:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear what a scan needs, as long as there is one: each message costs a node that idles as much.
+        """Subscribe to what a scan needs while there is one: idle, each message would cost as much.
 
         To be entered and left in the executor's thread.
         """
@@ -118,11 +118,11 @@ class NodeHands:
         if self._tip is not None:
             self._tip.listen()
             topics = (*topics, STATE_TOPIC)
-        # last: who is heard by it has been told of all the others
+        # last: a node whose sign of life arrives has discovered all subscriptions made before
         self._nodes = NodeWatch(self._node, topics, self._time.silent_s)
 
     def meet(self) -> None:
-        """Wait until what the nodes publish is heard."""
+        """Wait until the nodes have discovered the subscriptions of this scan."""
         deadline = time.monotonic() + MET_WITHIN_S
         while not self._nodes.met() and time.monotonic() < deadline:
             time.sleep(POLL_S)

@@ -78,7 +78,7 @@ class ScanNode(ManagedNode):
         super().__init__("scan_node", PARAMETERS)
 
     def configure(self) -> None:
-        """Offer the action; nothing is heard before a scan begins."""
+        """Offer the action; the topics are subscribed to when a scan begins."""
         contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
