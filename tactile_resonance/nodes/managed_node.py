@@ -81,7 +81,7 @@ class ManagedNode(LifecycleNode):
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
         self._instance = int.from_bytes(os.urandom(7), "big")
-        # started by the first subscriber: each call of a timer wakes the executor, most of what an idle node costs
+        # started by the first subscriber: each call wakes the executor: most of the cost of an idle node
         self._beat_timer = self.steady_timer(BEAT_S, self._beat)
         self._beat_timer.cancel()
         events = PublisherEventCallbacks(matched=self._on_listeners)
