@@ -222,12 +222,18 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> Scan.Result:
         notes=job.notes,
     )
 
+    up = False
+
     def check() -> None:
         ended.check()
         nodes.check()
+        state, _, reason = client.states.get("fake_hardware_node", "").partition(": ")
+        if not up and state == "unconfigured" and reason:
+            raise ValueError(f"the simulated bench does not start: {reason}")
 
     with ScanClient(check) as client:
         client.wait_until_up(START_WITHIN_S)
+        up = True
         with _Bar() as bar:
             result = client.scan(goal, bar.show, SCAN_WITHIN_S)
         stalls = client.details("fake_hardware_node").get("simulator stalls")

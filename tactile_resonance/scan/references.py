@@ -124,8 +124,8 @@ def judge_drift(
     std = np.sqrt(np.diag(before.covariance) + np.diag(after.covariance))
     most = np.array([limits.f0_hz, limits.damping_ratio])
     figures = (
-        f"f0 in air {before.estimate[0]:.3f} Hz before, {change[0]:+.3f} +- {std[0]:.2g} Hz after; damping "
-        f"ratio {before.estimate[1]:.5f} before, {change[1]:+.2g} +- {std[1]:.2g} after "
+        f"f0 in air {before.estimate[0]:.3f} Hz before, changed by {change[0]:+.4f} +- {std[0]:.2g} Hz; "
+        f"damping ratio {before.estimate[1]:.5f} before, changed by {change[1]:+.2g} +- {std[1]:.2g} "
         f"(limits {most[0]:g} Hz, {most[1]:g})"
     )
     if not np.all(np.isfinite(std)):

@@ -159,7 +159,12 @@ class Bench(RobotAtHand):
     def __init__(self, log, tissue="gel10"):
         super().__init__(HOST)
         server = f"{HOST}:{TIME_PORT}"
-        self.parameters = {"robot_host": HOST, "force_host": HOST, "time_server": server}
+        self.parameters = {
+            "robot_host": HOST,
+            "force_host": HOST,
+            "time_server": server,
+            "publish_rate_hz": 50.0,  # `until_state` looks every 20 ms
+        }
         self.plant = subprocess.Popen(
             [
                 *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", HOST),
