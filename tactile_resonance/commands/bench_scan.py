@@ -115,7 +115,10 @@ def _checked_notes(text: str) -> str:
 
 
 def run_job(job: Job) -> int:
-    """Start the nodes, scan, report; always end the nodes. 0 where every point of the plan is finished."""
+    """Start the nodes, scan, report; always end the nodes.
+
+    Returns 0 where every point of the plan is finished and one at least has poles, else 1.
+    """
     for package in ("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags"):
         if find_spec(package) is None:
             raise ValueError(
@@ -151,7 +154,7 @@ def run_job(job: Job) -> int:
     ended.at_once()  # every file of a report is whole or not there
     report.run(argparse.Namespace(run_folder=job.output))
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
-    return 0 if result.outcome == type(result).COMPLETE else 1
+    return 0 if result.outcome == type(result).COMPLETE and result.done else 1
 
 
 class _Ended:
