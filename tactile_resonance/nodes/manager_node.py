@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from lifecycle_msgs.msg import State, Transition, TransitionEvent
+from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
-from rclpy.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -32,8 +31,6 @@ PARAMETERS = (
 )
 
 TICK_S = 0.1
-# Transitions are published and new nodes discovered: that the state is asked for finds only nodes that hang.
-LOOK_S = 2.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
 LONGEST_RETRY_S = 16.0
@@ -67,8 +64,7 @@ class _Managed:
     client: Client | None = None
     deadline_s: float = 0.0
     refusals: int = 0
-    next_try_s: float = 0.0
-    next_look_s: float = 0.0
+    next_try_s: float = field(default=0.0)
 
 
 class ManagerNode(Node):
@@ -82,35 +78,22 @@ class ManagerNode(Node):
         super().__init__("manager_node")
         declare(self, PARAMETERS)
         (names,) = values(self, "nodes")
-        if not names:
+        self._nodes = [self._managed(name) for name in names]
+        if not self._nodes:
             raise ValueError("nodes: empty, expected names of nodes")
         self._wanted_up = True
         self._was_up = False
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/shut_down", self._on_shut_down)
-        self._timer = self.create_timer(TICK_S, self._tick, clock=STEADY)
-        self._nodes = [self._managed(name) for name in names]
+        self.create_timer(TICK_S, self._tick, clock=STEADY)
 
     def _managed(self, name: str) -> _Managed:
-        node = _Managed(
+        return _Managed(
             name,
             self.create_client(GetState, f"{name}/get_state"),
             self.create_client(ChangeState, f"{name}/change_state"),
         )
-
-        def matched(info: QoSSubscriptionMatchedInfo) -> None:
-            if info.current_count_change > 0:
-                self._on_start_of(node)
-
-        self.create_subscription(
-            TransitionEvent,
-            f"{name}/transition_event",
-            lambda event: self._on_transition(node, event.goal_state.id),
-            10,
-            event_callbacks=SubscriptionEventCallbacks(matched=matched),
-        )
-        return node
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._want(True, response)
@@ -122,94 +105,54 @@ class ManagerNode(Node):
         self._wanted_up = up
         for node in self._nodes:
             node.refusals, node.next_try_s = 0, 0.0
-        self._tick()
         response.success = True
         response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
         return response
 
-    def _on_start_of(self, node: _Managed) -> None:
-        """Await no answer to requests sent to the process before this one; ask the new one.
-
-        A little later: an answer that is given before the client is discovered is lost.
-        """
-        if node.pending is not None:
-            self._forget(node)
-        node.next_look_s = 0.0
-        self._look_after(TICK_S)
-
-    def _on_transition(self, node: _Managed, goal_id: int) -> None:
-        """Ask for the state; where the answer to the transition is still awaited, do so after a few seconds.
-
-        That answer may be lost.
-        """
-        now_s = time.monotonic()
-        if node.pending is None and node.get.service_is_ready():
-            self._ask(node, node.get, GetState.Request(), now_s)
-        elif node.client is node.change and goal_id in _NAMES:  # none of those in between
-            node.deadline_s = min(node.deadline_s, now_s + STATE_WITHIN_S)
-            self._look_after(TICK_S)
-
-    @property
-    def _wanted(self) -> int:
-        """State of all nodes in the end."""
-        if self._wanted_up:
-            return State.PRIMARY_STATE_ACTIVE
-        return State.PRIMARY_STATE_UNCONFIGURED
-
-    def _look_after(self, seconds: float) -> None:
-        self._timer.timer_period_ns = round(seconds * 1e9)
-        self._timer.reset()
-
     def _tick(self) -> None:
-        """One step of each node; the next when one of them is due."""
+        ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
-        now_s = time.monotonic()
-        due_s = now_s + LOOK_S
         for node in self._nodes if self._wanted_up else reversed(self._nodes):
-            due_s = min(due_s, self._advance(node, moves if clear else {}, now_s))
-            clear = clear and node.state == self._wanted
-        self._look_after(max(TICK_S, due_s - now_s))
+            self._advance(node, moves if clear else {})
+            clear = clear and node.state == ready
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
         self._was_up = clear and self._wanted_up
 
-    def _advance(self, node: _Managed, moves: dict[int, int], now_s: float) -> float:
-        """One step of one node, an answer taken or a question asked; when the next is due at the latest."""
+    def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
+        """One step of one node: an answer taken, or a question asked."""
+        now_s = time.monotonic()
         if node.pending is not None:
             if not node.pending.done():
-                if now_s <= node.deadline_s:
-                    return node.deadline_s
-                self._forget(node)
-                self.health.error(f"{node.name} does not answer")
-                return now_s
+                if now_s > node.deadline_s:
+                    self._drop(node)
+                return
             self._take(node, now_s)
         if not (node.get.service_is_ready() and node.change.service_is_ready()):
             node.state = State.PRIMARY_STATE_UNKNOWN
-            return now_s
+            return
         transition = moves.get(node.state)
         if transition is not None and now_s >= node.next_try_s:
             request = ChangeState.Request(transition=Transition(id=transition))
             self._ask(node, node.change, request, now_s)
-        elif node.state == State.PRIMARY_STATE_UNKNOWN or now_s >= node.next_look_s - LOOK_S / 2:
-            # with those who are due soon, who would wake the manager one by one
+        else:
             self._ask(node, node.get, GetState.Request(), now_s)
-        return node.next_look_s if transition is None else min(node.next_look_s, node.next_try_s)
 
     def _ask(self, node: _Managed, client: Client, request: object, now_s: float) -> None:
         (timeout_s,) = values(self, "answer_timeout_s")
         if client is node.get:
             timeout_s = min(timeout_s, STATE_WITHIN_S)
         node.client, node.pending = client, client.call_async(request)
-        node.deadline_s = node.next_look_s = now_s + timeout_s
+        node.deadline_s = now_s + timeout_s
         node.pending.add_done_callback(lambda future: self._hear(node, future))
 
     def _hear(self, node: _Managed, answer: Future) -> None:
-        """Take an answer; after a change of state, or where one is wanted, go on at once."""
+        """An answer by which a node has moved leads to the next question at once, others at the next tick."""
         if node.pending is answer and not answer.cancelled():
             before = node.state
             self._take(node, time.monotonic())
-            if node.state != before or node.state != self._wanted:
+            if node.state != before:
                 self._tick()
 
     def _take(self, node: _Managed, now_s: float) -> None:
@@ -217,7 +160,7 @@ class ManagerNode(Node):
         if isinstance(answer, GetState.Response):
             if node.state == State.PRIMARY_STATE_ACTIVE != answer.current_state.id:
                 self.health.error(f"{node.name} is {_NAMES.get(answer.current_state.id)} again")
-            node.state, node.next_look_s = answer.current_state.id, now_s + LOOK_S
+            node.state = answer.current_state.id
             return
         node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:
@@ -232,11 +175,12 @@ class ManagerNode(Node):
             f"asked again in {wait_s:g} s"
         )
 
-    def _forget(self, node: _Managed) -> None:
-        """Await no answer any more: a node that was killed never gives one."""
+    def _drop(self, node: _Managed) -> None:
+        """A node that was killed never answers."""
         node.client.remove_pending_request(node.pending)
         node.pending = None
         node.state = State.PRIMARY_STATE_UNKNOWN
+        self.health.error(f"{node.name} does not answer")
 
     def _summary(self) -> str:
         return "active" if self._was_up else ("starting" if self._wanted_up else "shut down")
