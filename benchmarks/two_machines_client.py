@@ -31,15 +31,15 @@ class Client(ScanClient):
         for topic, kind in COUNTED.items():
             self._node.create_subscription(kind, topic, self._counter(topic), RESULTS)
 
-    def measure(self, periods: int) -> Measure.Result:
-        """One measurement; waits until everything of it has come, for so long as it may take."""
+    def measure(self, periods: int, late_s: float = 20.0) -> Measure.Result:
+        """One measurement; waits until everything of it has come, so long at most after its last block."""
         self.wait(self._measure.server_is_ready, 30.0, "the action measure")
         sent = self._measure.send_goal_async(Measure.Goal(periods=periods))
         self.wait(sent.done, 30.0, "the goal to be taken")
         future = sent.result().get_result_async()
         self.wait(future.done, 600.0, "the measurement")
         result = future.result().result
-        end_s = time.monotonic() + 20.0
+        end_s = time.monotonic() + late_s
         while time.monotonic() < end_s:
             self.spin(0.05)
             if set(self.counts(result.measurement_id).values()) == {result.blocks}:
@@ -64,7 +64,7 @@ def main() -> None:
     with Client(lambda: None) as client:
         client.wait_until_up(UP_WITHIN_S)
         for _ in range(10):  # until all have found each other
-            if set(client.counts(client.measure(3).measurement_id).values()) == {3}:
+            if set(client.counts(client.measure(3, 5.0).measurement_id).values()) == {3}:
                 break
         begun_s = time.monotonic()
         if order == "measure":

@@ -104,7 +104,7 @@ class NodeProcesses:
     def stop(self) -> None:
         """Interrupt, and kill what has not ended within the grace period.
 
-        What a killed node had started ends by itself soon after; that is waited for, too.
+        Child processes of a killed node end soon after it; they are waited for, too.
         """
         for process in self._processes.values():
             _signal(process, signal.SIGINT)

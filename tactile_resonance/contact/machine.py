@@ -37,7 +37,7 @@ PRESSING_CAUSES = frozenset({Cause.FORCE_ABORT, Cause.FORCE_HARD, Cause.FORCE_RA
 """After these the tip is drawn back at once: while it slows down it goes deeper."""
 
 ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_INVALID})
-"""After these the tip is not drawn back by itself: the arm moves again only when asked for."""
+"""After these the tip is not drawn back: the arm moves again only on request."""
 
 
 WISH_NS = 1_000_000_000

@@ -2,7 +2,7 @@
 """Client process of `UrArm`: the only place where ur_rtde runs.
 
 Started as ``python -m tactile_resonance.drivers.ur_client COMMANDS PAGE`` with two open descriptors. It does
-what its owner asks for and keeps the robot's watchdog quiet; the owner reads states itself. It ends by itself
+what its owner asks for and keeps the robot's watchdog fed; the owner reads the robot's states. It ends
 when the owner's end of COMMANDS closes.
 
 It takes part in a simulated bench's time: while the owner leads, time goes on up to the time sent with each

@@ -261,7 +261,7 @@ class ContactNode(ManagedNode):
     # what the loop has done, in the executor's thread
 
     def _tell(self) -> None:
-        """Look, and tell what was not told by itself."""
+        """Publish what has not changed for a while, and the feedback of a goal."""
         self._look()
         thread = self._thread
         if thread is None:

@@ -48,6 +48,8 @@ a slow machine may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
+DISCOVERED_WITHIN_S = 10.0
+RECORDERS = 1  # of the subscribers of tcp_pose: the scan's own
 MET_WITHIN_S = 1.0
 """Nodes of this package give a sign of life much sooner, those of other packages never."""
 # Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
@@ -144,7 +146,7 @@ class NodeHands:
         """Bring the tip there and press until the force is held."""
         pose = self._pose_of(point)
         if self._tip is None:
-            self._place(pose)
+            self._place(pose, check)
             return
         with self._nodes.doubted_after(NodeAway):
             self._tip.hold(pose, force_n, hold, check, self._poll_of([STATE_TOPIC]))
@@ -196,9 +198,7 @@ class NodeHands:
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
             text = "measurement: the place of the tip is unknown (tcp_pose)"
-            if (
-                self._tip is None
-            ):  # it was published here, to a bench that had not discovered this node
+            if self._tip is None:  # published here, to a bench that had not discovered this node
                 raise PointDisturbed(text, "place unknown")
             raise PointFailed(text)
         return Measured(poles, origin)
@@ -322,7 +322,11 @@ class NodeHands:
             )
         )
 
-    def _place(self, pose: PoseStamped) -> None:
-        """Publish where the tip is, until all reliable subscribers have received it."""
+    def _place(self, pose: PoseStamped, check: Check) -> None:
+        """Publish where the tip is, once another node listens, and wait until it is received there."""
+        deadline = time.monotonic() + DISCOVERED_WITHIN_S
+        while self._pose.get_subscription_count() <= RECORDERS and time.monotonic() < deadline:
+            check()
+            time.sleep(POLL_S)
         self._pose.publish(pose)
         self._pose.wait_for_all_acked(Duration(seconds=PLACED_WITHIN_S))

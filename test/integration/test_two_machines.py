@@ -22,8 +22,8 @@ def test_a_scan_over_the_network_loses_no_record(tmp_path):
     with TwoMachines() as machines:
         told = on_two_machines(machines, tmp_path, ["scan"])
     assert told["outcome"] == Scan.Result.COMPLETE, told["message"]
-    assert (told["done"], told["failed"]) == (4, 0)
     run = read_run(tmp_path / "run")
+    assert (told["done"], told["failed"]) == (4, 0), [r.reason for r in run.results]
     assert run.problems == ()
     assert [(r.index, r.attempt, r.blocks) for r in run.results] == [(k, 0, 4) for k in range(4)]
     counts, ids = Counter(), set()
