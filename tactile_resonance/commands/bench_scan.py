@@ -259,6 +259,7 @@ class _Bar:
 
         self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None)
         self._begun_s, self._finished = time.monotonic(), -1
+        self._waiting_for = ""
 
     def __enter__(self) -> _Bar:
         return self
@@ -269,8 +270,9 @@ class _Bar:
     def show(self, feedback: Scan.Feedback) -> None:
         """Take the feedback of the scan."""
         bar = self._bar
-        if feedback.waiting_for:
-            bar.write(f"waiting for {feedback.waiting_for}", file=sys.stdout)
+        if feedback.waiting_for and feedback.waiting_for != self._waiting_for:
+            bar.write(f"waiting: {feedback.waiting_for}", file=sys.stdout)
+        self._waiting_for = feedback.waiting_for
         if bar.disable:
             if feedback.finished != self._finished:
                 self._finished = feedback.finished

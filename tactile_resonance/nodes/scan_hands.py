@@ -142,6 +142,10 @@ class NodeHands:
         self._end_if_hung()
         return self._nodes.missing()
 
+    def held(self) -> bool:
+        """Whether what is missing was deactivated, as a supervisor does."""
+        return self._nodes.held()
+
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
         pose = self._pose_of(point)

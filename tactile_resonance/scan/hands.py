@@ -104,6 +104,10 @@ class Hands(Protocol):
         """What points need and is not there now, for people; None: nothing. Asked with the tip free."""
         ...
 
+    def held(self) -> bool:
+        """Whether somebody keeps what is missing from its work, and will let it go on."""
+        ...
+
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
         ...
