@@ -54,6 +54,15 @@ class NodeAway(PointDisturbed):
     attempts = ATTEMPTS_WITHOUT_NODE
 
 
+class Stopped(PointDisturbed):
+    """Somebody keeps the tip out of the tissue until further notice."""
+
+    attempts = ATTEMPTS_WITHOUT_NODE
+
+    def __init__(self) -> None:
+        super().__init__("contact: the tip is stopped (service or topic stop)", "stopped")
+
+
 class ScanEnded(Exception):
     """The scan cannot or shall not go on; the message says why."""
 
