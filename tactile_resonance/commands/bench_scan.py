@@ -142,7 +142,7 @@ def run_job(job: Job) -> int:
     if job.real_time and not priority:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
-    parameters = node_parameters(job, bool(content.tissue_classes), work)
+    parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
     computing = () if priority or not job.real_time else COMPUTING
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
@@ -185,7 +185,9 @@ class _Ended:
             os._exit(INTERRUPTED)
 
 
-def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
+def node_parameters(
+    job: Job, classes: bool, work: Path, map_frame: str = "table"
+) -> dict[str, dict[str, object]]:
     """Parameters of each node that differ from their defaults."""
     waits_s = STALLS_S if job.real_time and not may_take_priority(PRIORITY) else 0.0
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
@@ -206,7 +208,11 @@ def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, 
             "simulated_stalls_s": waits_s,
             **time_server,
         },
-        "pole_map_node": {"classes_file": job.scene if classes else "''"},
+        "pole_map_node": {
+            "classes_file": job.scene if classes else "''",
+            "frame_id": map_frame,
+            "table_in_base": table,
+        },
         "scan_node": {"table_in_base": table, **time_server},
     }
     return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}

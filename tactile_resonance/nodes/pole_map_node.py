@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 from tactile_resonance import msg
 from tactile_resonance.nodes.conversions import poles_from_message
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.pole_map_messages import (
     cloud_message,
     header_message,
@@ -30,7 +30,16 @@ PARAMETERS = (
     Parameter(
         "frame_id",
         "",
-        "Frame of the map; poles in another one are left out. Empty: that of the first poles.",
+        "Frame of the map; poles in another one than this and base_frame are left out. Empty: that of the "
+        "first poles.",
+        read_only=True,
+    ),
+    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    Parameter(
+        "table_in_base",
+        [0.0] * 6,
+        "Pose of frame_id in base_frame, position [m] and rotation vector [rad], that of scan_node: where "
+        "frame_id is given, poles in base_frame are shown in it.",
         read_only=True,
     ),
     Parameter(
@@ -92,6 +101,10 @@ class PoleMapNode(ManagedNode):
     def configure(self) -> None:
         """Topics, classes and an empty map."""
         (self._frame_id, classes_file) = values(self, "frame_id", "classes_file")
+        (base_frame, table) = values(self, "base_frame", "table_in_base")
+        self._table = pose_of(table, "table_in_base")
+        # poles in it are shown in frame_id
+        self._moved_frame = base_frame if self._frame_id not in ("", base_frame) else None
         self._classes: tuple[TissueClass, ...] = ()
         if classes_file:
             self._classes = read_classes(Path(classes_file))
@@ -133,6 +146,9 @@ class PoleMapNode(ManagedNode):
             frame_id = origin.contact.frame_id
             if not self._frame_id:
                 self._frame_id = frame_id
+            if frame_id == self._moved_frame:
+                point = point.seen_from(self._table.position_m, self._table.rotation)
+                frame_id = self._frame_id
             if frame_id != self._frame_id:
                 raise ValueError(
                     f"frame of tip_pose: got {frame_id!r}; accepted is {self._frame_id!r}"

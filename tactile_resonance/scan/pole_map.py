@@ -74,6 +74,11 @@ class MapPoint:
         """(2,) of f0 [Hz] and damping ratio."""
         return np.sqrt(np.diag(self.covariance))
 
+    def seen_from(self, origin_m: FloatArray, rotation: Rotation) -> MapPoint:
+        """The same in a frame whose origin (3,) and rotation in the present one are given."""
+        place = rotation.inv().apply(self.position_m - origin_m)
+        return replace(self, position_m=place, normal=rotation.inv().apply(self.normal))
+
 
 def map_point(
     poles: Poles, origin: Origin, classes: Sequence[TissueClass] = (), unknown_level: float = 0.01

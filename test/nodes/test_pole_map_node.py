@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
@@ -25,12 +26,13 @@ from tactile_resonance.nodes.running import LATCHED, POLES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 NUMPY = {PointField.FLOAT32: "<f4", PointField.UINT8: "u1"}
 COVARIANCE = np.array([[[4e-4, 0.0], [0.0, 4e-9]]])
 
 
-def poles(key, x, f0_hz, damping=0.0336, frame="table", status=PolesStatus.OK):
+def poles(key, x, f0_hz, damping=0.0336, frame="table", status=PolesStatus.OK, place=None):
     found = f0_hz is not None
     w = 2 * np.pi * (f0_hz or 0.0)
     result = Poles(
@@ -42,7 +44,8 @@ def poles(key, x, f0_hz, damping=0.0336, frame="table", status=PolesStatus.OK):
         status=status,
         message="" if found else "no resonance in the band",
     )
-    contact = Contact(0.01, 1e-4, (x, 0.001 * key, 0.0), (0.0, 0.0, 0.0, 1.0), frame, 1)
+    place = (x, 0.001 * key, 0.0) if place is None else tuple(place)
+    contact = Contact(0.01, 1e-4, place, (0.0, 0.0, 0.0, 1.0), frame, 1)
     return poles_to_message(result, Origin(measurement_id=key, simulated=True, contact=contact))
 
 
@@ -162,6 +165,26 @@ def test_nothing_is_made_that_nobody_reads(bench, monkeypatch):
     deadline = time.monotonic() + 0.6
     bench.until(lambda: time.monotonic() > deadline)
     assert made == ["/legend"]
+
+
+def test_poles_in_the_robots_base_are_shown_on_the_table_of_the_namespace():
+    given = {"frame_id": "left_table", "base_frame": "left_base", "table_in_base": TABLE_IN_BASE}
+    arguments = ["--ros-args", "-r", "__ns:=/left"]
+    for name, value in given.items():
+        arguments += ["-p", f"{name}:={value}"]
+    places = np.array([[0.01, -0.01, 0.0], [0.0, 0.01, 0.001]])
+    turn = Rotation.from_rotvec(TABLE_IN_BASE[3:])
+    seen = np.array(TABLE_IN_BASE[:3]) + turn.apply(places)
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
+        assert bench.map_node.get_fully_qualified_name() == "/left/pole_map_node"
+        bench.send(*[poles(k, 0, 250.0, frame="left_base", place=seen[k]) for k in range(2)])
+        cloud = bench.read(PointCloud2, "pole_map")[0]
+        markers = bench.read(MarkerArray, "pole_map/legend")[0].markers
+        bench.publisher.publish(poles(2, 0.0, 250.0, frame="base"))
+        bench.until(lambda: bench.map_node._left_out == 1)
+    rows = table(cloud)
+    np.testing.assert_allclose(np.stack([rows[n] for n in "xyz"], axis=-1), places, atol=1e-7)
+    assert {m.header.frame_id for m in (cloud, *markers)} == {"left_table"}
 
 
 def test_failures_are_crosses_and_no_points(bench):

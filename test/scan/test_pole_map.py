@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -129,6 +130,19 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
     )
     assert PoleMap((bare,)).ellipse_scale().m_per_hz > 0
     assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
+
+
+def test_a_point_is_seen_from_another_frame():
+    normal = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    here = map_point(poles(), origin(0.01, 0.02, 0.03, normal=normal))
+    turn, place = Rotation.from_rotvec([0.1, 0.2, -1.5]), np.array([-0.5, 0.1, 0.2])
+    there = replace(
+        here, position_m=place + turn.apply(here.position_m), normal=turn.apply(here.normal)
+    )
+    again = there.seen_from(place, turn)
+    np.testing.assert_allclose(again.position_m, here.position_m, atol=1e-15)
+    np.testing.assert_allclose(again.normal, here.normal, atol=1e-15)
+    np.testing.assert_array_equal(again.estimate, here.estimate)
 
 
 def test_surface_follows_the_points_and_their_plane():
