@@ -193,7 +193,8 @@ def _nodes(context):
                 package="rviz2",
                 executable="rviz2",
                 namespace=LaunchConfiguration("namespace"),
-                arguments=["-d", view],
+                # the view's topics are relative: those of the namespace, which the title names
+                arguments=["-d", view, "-f", given("table_frame"), "-t", "Pole map of {NAMESPACE}"],
                 parameters=[{"use_sim_time": simulated_time}],
                 remappings=[("/clock", "clock")],
             )

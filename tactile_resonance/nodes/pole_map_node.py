@@ -19,6 +19,7 @@ from tactile_resonance.nodes.pole_map_messages import (
     header_message,
     legend_message,
     marker_message,
+    restamp,
     surface_message,
 )
 from tactile_resonance.nodes.running import LATCHED, POLES, run_node
@@ -81,14 +82,16 @@ PARAMETERS = (
 
 # Poles may come faster than anybody looks.
 PUBLISH_PERIOD_S = 0.2
+# rviz drops a cloud whose frame it does not know yet, and the markers of what is switched off.
+REPEAT_PERIOD_S = 1.5
 
 
 class PoleMapNode(ManagedNode):
     """Keeps the latest poles of every place, and shows them to whoever looks.
 
     `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses and failures), `pole_map/legend` and
-    `pole_map/surface` (PointCloud2) are latched; each is made when there is something new and somebody
-    subscribed, at the latest when somebody does.
+    `pole_map/surface` are latched; each is made when there is something new and somebody subscribed, at the
+    latest when somebody does, and repeated while somebody is.
     """
 
     # diagnostics ask for them from the beginning
@@ -110,9 +113,9 @@ class PoleMapNode(ManagedNode):
             self._classes = read_classes(Path(classes_file))
         self._map = PoleMap()
         self._left_out = 0
-        kinds = {"": PointCloud2, "/markers": MarkerArray}
-        kinds |= {"/legend": MarkerArray, "/surface": PointCloud2}
+        kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
+        self._shown: dict[str, PointCloud2 | MarkerArray] = {}
         self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
         self._pause.cancel()
         self.resources.callback(self.destroy_timer, self._pause)
@@ -124,6 +127,7 @@ class PoleMapNode(ManagedNode):
         subscription = self.create_subscription(msg.Poles, "poles", self._on_poles, POLES)
         self.resources.callback(self.destroy_subscription, subscription)
         self.serve(Trigger, "pole_map/clear", self._on_clear)
+        self.every(REPEAT_PERIOD_S, self._repeat)
 
     def activate(self) -> None:
         """Soon show what was heard since the configuration."""
@@ -193,11 +197,20 @@ class PoleMapNode(ManagedNode):
             "": lambda: cloud_message(self._map, names, header),
             "/markers": lambda: marker_message(self._map, scale, probability, header),
             "/legend": lambda: legend_message(self._map, scale, probability, names, header),
-            "/surface": lambda: surface_message(self._map.surface(cells), header),
+            "/surface": lambda: surface_message(self._map, cells, header),
         }
         for name in wanted:
-            self._publishers_of[name].publish(makers[name]())
+            self._shown[name] = makers[name]()
+            self._publishers_of[name].publish(self._shown[name])
             self._old.discard(name)
+
+    def _repeat(self) -> None:
+        """Publish what is shown once more, dated now: the frame may be known from now on only."""
+        now = self.get_clock().now().to_msg()
+        for name, message in self._shown.items():
+            if name not in self._old and self._publishers_of[name].get_subscription_count() > 0:
+                restamp(message, now)
+                self._publishers_of[name].publish(message)
 
     def _scale(self, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
