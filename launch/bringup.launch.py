@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the nodes of a scan: mock.launch.py and ur.launch.py say on which hardware."""
+"""Start the nodes of a scan. Not to be started itself: mock.launch.py and ur.launch.py say on which hardware."""
 
 import shutil
 import time
@@ -31,12 +31,6 @@ def generate_launch_description():
     """Nodes and arguments; of a parameter's argument that is empty, params_file decides."""
     share = FindPackageShare(PACKAGE)
     arguments = [
-        DeclareLaunchArgument(
-            "use_mock_hardware",
-            choices=["true", "false"],
-            description="true: with the simulated bench, as mock.launch.py; its results are no measurements. "
-            "false: with a robot and a sensor, as ur.launch.py.",
-        ),
         DeclareLaunchArgument(
             "namespace",
             default_value="",

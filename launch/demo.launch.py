@@ -39,10 +39,9 @@ def generate_launch_description():
             description="Of the session, as YAML: {temperature_c: 21.5, tip_wetness: wet, adhesion: none}.",
         ),
     ]
-    # whatever else the mock can be told goes through to it: namespace, robot_ip, rviz, record ...
+    # the scene, and whatever else the mock can be told, go through to it: namespace, robot_ip, rviz ...
     mock = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "mock.launch.py"])),
-        launch_arguments={"scene": LaunchConfiguration("scene")}.items(),
+        PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "mock.launch.py"]))
     )
     goal = Node(
         package=PACKAGE,

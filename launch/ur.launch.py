@@ -10,7 +10,7 @@ from launch import LaunchDescription
 
 
 def generate_launch_description():
-    """Arguments of the arm; all of bringup.launch.py hold too, but use_mock_hardware."""
+    """Arguments of the arm; all of bringup.launch.py hold too."""
     bringup = PathJoinSubstitution(
         [FindPackageShare("tactile_resonance"), "launch", "bringup.launch.py"]
     )

@@ -175,7 +175,10 @@ def plan_bringup(
     """
     plan = _Decisions(arguments, sections, namespace)
     given, tell, value = plan.given, plan.tell, plan.value
-    mock = given.get("use_mock_hardware") == "true"
+    hardware = given.get("use_mock_hardware")
+    accepted = "true, as mock.launch.py says, or false, as ur.launch.py"
+    require(hardware in ("true", "false"), "use_mock_hardware", hardware, accepted)
+    mock = hardware == "true"
     robot = given.get("robot") or _robot(plan.stated, mock)
     require(mock or robot != "ideal", "robot", robot, "true or false without the simulated bench")
     for argument, (name, *its_nodes) in ARGUMENTS.items():

@@ -2,6 +2,8 @@
 """An argument wins over the parameter file, the file over what the simulated bench needs."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ REAL = {
     "force_config": "can_rft40.yaml",
     "table_in_base": "[0.4, 0, 0.1, 0, 0, 1]",
 }
+ROBOT_PAGE = Path(__file__).resolve().parents[1] / "docs" / "robot.md"
 TABLE = [-0.49, -0.13, 0.2, 0.0, 0.0, -math.pi / 2]
 
 
@@ -70,6 +73,7 @@ def heard(arguments, sections=None, namespace="/"):
         ("robot", "false", "contact", "robot", "robot", ["scan_node"]),
         ("robot", "true", "contact", "none", "robot", ["scan_node"]),
         ("robot", "ideal", "serve_contact", False, False, ["fake_hardware_node"]),
+        ("robot", "true", "contact_source", "tcp_pose", "force_over", ["excitation_node"]),
         ("real_time", "true", "use_sim_time", True, True, NODES),
         ("real_time", "false", "use_sim_time", False, True, NODES),
         (
@@ -86,6 +90,7 @@ def test_argument_over_file_over_default(argument, given, parameter, by_file, by
     accepted = {
         "contact": {"false": "none", "true": "robot"},
         "serve_contact": {"ideal": True},
+        "contact_source": {"true": "force_over"},
         "use_sim_time": {"true": False, "false": True},
         "time_server": {"true": ""},
         "table_in_base": {given: [1.0, 2.0, 3.0, 0.0, 0.0, 0.0]},
@@ -208,6 +213,7 @@ def test_nodes_with_a_robot_are_told_nothing_that_is_simulated():
     [
         (REAL | {"force_config": ""}, {}, "force_config: got None; accepted is"),
         (REAL | {"table_in_base": ""}, {}, "table_in_base: got None; accepted is"),
+        ({}, {}, "use_mock_hardware: got None; accepted is true, as mock.launch.py"),
         (REAL | {"robot": "ideal"}, {}, "robot: got 'ideal'; accepted is true or false"),
         (MOCK, {"/**": {"robot_host": "10.9.9.9"}}, "robot_host: got '10.9.9.9'; .* 127.x.y.z"),
         (MOCK | {"robot_ip": "10.9.9.9"}, {}, "robot_host: got '10.9.9.9'; .* 127.x.y.z"),
@@ -225,6 +231,16 @@ def test_a_real_robot_may_have_all_from_the_file():
     file = {"/**": {"force_config": "can_rft40.yaml", "table_in_base": [0.0] * 6}}
     plan, _ = heard({"use_mock_hardware": "false"}, file)
     assert plan.nodes["contact_node"] == {}
+
+
+def test_the_file_of_the_page_is_enough_for_a_robot(tmp_path):
+    (text,) = re.findall(r"```yaml\n(.*?)```", ROBOT_PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    plan, nodes = heard({"use_mock_hardware": "false"}, read_parameter_file(path), "/left")
+    assert plan.nodes["scan_node"] == {"contact": "robot"}
+    assert nodes["excitation_node"]["device"] == "nidaqmx"
+    assert nodes["contact_node"]["robot_config"].endswith("mine.yaml")
 
 
 def test_a_section_that_would_win_over_an_argument_is_refused():
