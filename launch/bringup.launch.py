@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start the nodes of a scan. Not to be started itself: mock.launch.py and ur.launch.py say on which hardware."""
+"""The nodes of a scan; not started itself: mock.launch.py and ur.launch.py say on which hardware."""
 
 import shutil
 import time
