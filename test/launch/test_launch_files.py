@@ -2,6 +2,7 @@
 """What the nodes that the launch files start are told, by the real launch and the real rclpy."""
 
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,8 +73,9 @@ def start(file, *before, **given):
 
 
 @pytest.fixture(autouse=True)
-def alone(monkeypatch):
+def alone(monkeypatch, tmp_path):
     monkeypatch.setenv(DISCOVERY, "LOCALHOST")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # launch leaves a file for each node
 
 
 @pytest.mark.parametrize(
