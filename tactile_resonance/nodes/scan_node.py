@@ -15,13 +15,14 @@ import numpy as np
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
+from tactile_resonance import msg
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.vectors import rotated, turn_from_quaternion
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
-from tactile_resonance.nodes.running import run_node
+from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.controls import Controls, Request
@@ -30,7 +31,9 @@ from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.notes import parse_notes
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.progress import Progress, Summary
+from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
@@ -72,7 +75,10 @@ FEEDBACK_EVERY_S = 0.2
 
 
 class ScanNode(ManagedNode):
-    """Action `scan`; services `scan/pause`, `scan/resume`, `scan/skip_point`, `scan/repeat_point`."""
+    """Action `scan`; services `scan/pause`, `scan/resume`, `scan/skip_point`, `scan/repeat_point`.
+
+    Publishes `point_result` (latched).
+    """
 
     def __init__(self) -> None:
         super().__init__("scan_node", PARAMETERS)
@@ -85,6 +91,7 @@ class ScanNode(ManagedNode):
         self._hands = NodeHands(
             self, table_in_base, base_frame, robot, self._time, self._tell_waiting
         )
+        self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
         self._progress: Progress | None = None
@@ -154,8 +161,11 @@ class ScanNode(ManagedNode):
             result.outcome = Scan.Result.ENDED
             self.get_logger().info(f"run goes to {run.path}")
             with run:
-                runner = ScanRunner(scene, plan, run, self._hands, self._controls, tell, seed)
-                _fill(result, runner.run())
+                publish = self._results.publish
+                for cdr in recorded_results(run.content):  # of a run that is gone on with
+                    publish(cdr)
+                scan = (scene, plan, run, self._hands, self._controls, tell, seed, publish)
+                _fill(result, ScanRunner(*scan).run())
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)

@@ -37,7 +37,7 @@ def poles(recording, topic, status, measurement_id, middle_ns, f0_hz):
         **{name: np.array(value) for name, value in values.items()},
     )
     cdr = message_types().serialize_cdr(message, POLES)
-    recording.write(topic, POLES, stamp_ns, cdr, topic.endswith("truth"))
+    recording.write(topic, POLES, stamp_ns, cdr)
 
 
 @pytest.fixture
