@@ -46,7 +46,7 @@ class Cancelled(Exception):
 
 
 class ExcitationNode(ManagedNode):
-    """Action `measure`; publishes `excitation` (latched), `record`, and of a run that it replays `point_result` (latched).
+    """Action `measure`; publishes `excitation` (latched), `record`; of a run it replays `point_result`.
 
     Every record is on disk before it is published. Records carry the place of the tip and the mean force
     over the block, where the device is no replay; they never wait long for it. The device is read in a

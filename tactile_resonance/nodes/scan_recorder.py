@@ -25,9 +25,9 @@ from tactile_resonance.scan.point_file import offered_qos
 class Recorded:
     """A topic that is recorded.
 
-    `qos` is asked for; `offered`, by its publisher, is recorded where it is more than that. `measured` where its
-    messages belong to a measurement: only those of the scan's own are kept. `counted` where the scan needs to
-    know how many came.
+    `qos` is asked for; `offered`, by its publisher, is recorded where it is more than that. `measured` where
+    its messages belong to a measurement: only those of the scan's own are kept. `counted` where the scan needs
+    to know how many came.
     """
 
     kind: type

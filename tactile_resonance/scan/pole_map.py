@@ -187,9 +187,7 @@ class PoleMap:
     def with_point(self, point: MapPoint) -> PoleMap:
         """The same with one point more; it replaces what its own measurement or place had before."""
         kept = (
-            p
-            for p in self.without(point.place).points
-            if p.measurement_id != point.measurement_id
+            p for p in self.without(point.place).points if p.measurement_id != point.measurement_id
         )
         return replace(self, points=(*kept, point))
 
