@@ -161,11 +161,12 @@ class ScanNode(ManagedNode):
             result.outcome = Scan.Result.ENDED
             self.get_logger().info(f"run goes to {run.path}")
             with run:
-                publish = self._results.publish
                 for cdr in recorded_results(run.content):  # of a run that is gone on with
-                    publish(cdr)
-                scan = (scene, plan, run, self._hands, self._controls, tell, seed, publish)
-                _fill(result, ScanRunner(*scan).run())
+                    self._publish(cdr)
+                runner = ScanRunner(
+                    *(scene, plan, run, self._hands, self._controls, tell, seed, self._publish)
+                )
+                _fill(result, runner.run())
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
@@ -173,6 +174,10 @@ class ScanNode(ManagedNode):
             self._time.end()
             self._controls = self._progress = None
         return result
+
+    def _publish(self, result: bytes) -> None:
+        if self.active:  # a scan that the node's end interrupts ends after its publishers
+            self._results.publish(result)
 
     def _prepare(
         self, request: Scan.Goal, tell: Callable[[Progress], None]

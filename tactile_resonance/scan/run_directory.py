@@ -250,18 +250,19 @@ class _FileRecording:
         poles = types.deserialize_cdr(self._poles, POLES_TYPE) if self._poles else None
         return serialised(result, poles)
 
-    def _keep(self, result: PointResult) -> FileContent:
-        qos = offered_qos(RESULTS_DEPTH, latched=True)
-        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, self.message_of(result), qos)
-        return self._writer.finish()
+    def _keep(self, result: PointResult, of_point: PointResult | None) -> bytes:
+        cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
+        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
+        self._run._add(self._writer.finish(), of_point)
+        return cdr
 
 
 class ReferenceRecording(_FileRecording):
     """Receives the messages of one reference."""
 
-    def finish(self, result: PointResult) -> None:
-        """Keep it with its result, durably."""
-        self._run._add(self._keep(result), None)
+    def finish(self, result: PointResult) -> bytes:
+        """Keep it with its result, durably; returns `message_of` it."""
+        return self._keep(result, None)
 
 
 class PointRecording(_FileRecording):
@@ -276,8 +277,13 @@ class PointRecording(_FileRecording):
         super().__init__(run, f"point-{index:05d}-{attempt:02d}", attempt)
         self.index = index
 
-    def finish(self, result: PointResult) -> None:
+    def finish(self, result: PointResult) -> bytes:
         """Keep the point with its result, durably: after this no interruption loses it.
+
+        Returns
+        -------
+        bytes
+            `message_of` the result.
 
         Raises
         ------
@@ -289,7 +295,7 @@ class PointRecording(_FileRecording):
             raise ValueError(
                 f"result: got point and attempt {got}; accepted is {(self.index, self.attempt)}"
             )
-        self._run._add(self._keep(result), result)
+        return self._keep(result, result)
 
 
 def expected_bytes(points: int, blocks: int, samples_per_block: int, lines: int) -> int:

@@ -119,8 +119,7 @@ class ScanRunner:
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
                 result = self._unmeasured(point, recording, Outcome.SKIPPED, SKIPPED, 0.0)
-                recording.finish(result)
-                self._publish(recording.message_of(result))
+                self._publish(recording.finish(result))
             return self._next()
         return point
 
@@ -210,8 +209,7 @@ class ScanRunner:
                 )
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
-            recording.finish(result)
-            self._publish(recording.message_of(result))
+            self._publish(recording.finish(result))
         self._durations_s.append(duration_s)
         if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
             raise ScanEnded(
@@ -280,14 +278,9 @@ class ScanRunner:
                     time_ns=time.time_ns(),
                     duration_s=self._hands.now_s() - begun_s,
                 )
-                result = replace(
-                    result,
-                    kind=Kind.AIR,
-                    repeats=disturbed.total,
-                    disturbances=str(disturbed),
-                )
-                recording.finish(result)
-                self._publish(recording.message_of(result))
+                result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
+                result = replace(result, kind=Kind.AIR)
+                self._publish(recording.finish(result))
                 return
 
     def _unmeasured(
