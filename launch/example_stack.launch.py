@@ -37,6 +37,7 @@ def _sensor(name):
         [
             # the stack's name for what this sensor finds; all other topics stay under the namespace
             SetRemap(src="poles", dst=f"/stack/tissue/{name}/poles"),
+            SetRemap(src="point_result", dst=f"/stack/tissue/{name}/point_result"),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(mock),
                 launch_arguments={

@@ -220,7 +220,7 @@ def test_markers_wait_for_their_frame(bench):
 
 def test_poles_in_the_robots_base_are_shown_on_the_table_of_the_namespace():
     given = {"frame_id": "left_table", "base_frame": "left_base", "table_in_base": TABLE_IN_BASE}
-    arguments = ["--ros-args", "-r", "__ns:=/left"]
+    arguments = [*OF_POLES, "-r", "__ns:=/left"]
     for name, value in given.items():
         arguments += ["-p", f"{name}:={value}"]
     places = np.array([[0.01, -0.01, 0.0], [0.0, 0.01, 0.001]])
@@ -368,7 +368,7 @@ def test_a_legend_of_many_lines_or_long_ones_is_no_larger(tmp_path, name, count)
     classes = {f"{name} {k}": {"f0_hz": 250.0 + 2 * k, **spread} for k in range(count)}
     path = tmp_path / "classes.yaml"
     path.write_text(yaml.safe_dump({"tissue_classes": classes}))
-    arguments = ["--ros-args", "-p", f"classes_file:={path}"]
+    arguments = [*OF_POLES, "-p", f"classes_file:={path}"]
     with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
         bench.send(
             *[poles(k, 0, 250.0 + 2 * k, place=(0.001 * k, 0, 0)) for k in range(count)],
@@ -520,7 +520,7 @@ def test_a_classes_file_that_is_wrong_is_refused(tmp_path):
     path = tmp_path / "classes.yaml"
     path.write_text("tissue_classes: {a: {f0_hz: 250.0}}\n")
     with initialised(
-        domain_id=free_domain_id(os.environ), args=["--ros-args", "-p", f"classes_file:={path}"]
+        domain_id=free_domain_id(os.environ), args=[*OF_POLES, "-p", f"classes_file:={path}"]
     ):
         node = PoleMapNode()
         node.trigger_configure()
