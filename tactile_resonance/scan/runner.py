@@ -28,7 +28,7 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import Outcome
-from tactile_resonance.scan.progress import Progress, Summary
+from tactile_resonance.scan.progress import Phase, Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
@@ -130,10 +130,10 @@ class ScanRunner:
         deadline = time.monotonic() + NODE_BACK_WITHIN_S
         while not self._controls.cancelled.is_set():
             if self._controls.paused.is_set():
-                self._say(None, "paused")
+                self._say(None, Phase.PAUSED)
                 deadline = time.monotonic() + NODE_BACK_WITHIN_S
             elif missing := self._hands.missing():
-                self._say(None, "waiting")
+                self._say(None, Phase.WAITING)
                 if time.monotonic() > deadline:
                     raise ScanEnded(f"{missing}, for {NODE_BACK_WITHIN_S:g} s")
             else:
@@ -148,7 +148,7 @@ class ScanRunner:
 
         def enough(poles: Poles, blocks: int) -> bool:
             decisions.append(self._decide(poles, blocks))
-            self._say(point, "measure", blocks, poles)
+            self._say(point, Phase.MEASURE, blocks, poles)
             return decisions[-1].stop
 
         def check() -> None:
@@ -162,9 +162,9 @@ class ScanRunner:
             seed = self._seed + point.index + recording.attempt * ATTEMPT_SEEDS
             self._hands.begin(self._seed, point.index, recording.attempt)
             try:
-                self._say(point, "contact")
+                self._say(point, Phase.CONTACT)
                 self._hands.touch(point, scene.force_n, scene.hold, check)
-                self._say(point, "measure")
+                self._say(point, Phase.MEASURE)
                 measured = self._hands.measure(
                     self._plan.measurement,
                     point.label,
@@ -185,7 +185,7 @@ class ScanRunner:
                     self._hands.retract()  # cancelled or to be repeated: nothing is kept of it
                     return
                 outcome, reason = Outcome.SKIPPED, SKIPPED
-            self._say(point, "retract")
+            self._say(point, Phase.RETRACT)
             self._hands.retract()
             duration_s = self._hands.now_s() - begun_s
             if measured is None:
@@ -245,7 +245,7 @@ class ScanRunner:
         disturbed = Disturbances()
         while True:
             self._wait()
-            self._say(None, "reference")
+            self._say(None, Phase.REFERENCE)
             self._hands.begin(self._seed, place, 0)
             with self._run.begin_reference(name) as recording:
                 try:
@@ -267,7 +267,7 @@ class ScanRunner:
                 return
 
     def _say(
-        self, point: ScanPoint | None, phase: str, blocks: int = 0, poles: Poles | None = None
+        self, point: ScanPoint | None, phase: Phase, blocks: int = 0, poles: Poles | None = None
     ) -> None:
         points, finished = len(self._plan.points), len(self._run.content.latest)
         each_s = self._plan.longest_s / points
