@@ -95,7 +95,7 @@ class KilledScan:
         self._known: dict[str, Finished] = {}
         self._run = folder / "run-0"
         self._runs = 0
-        self._phase, self._finished = "", 0
+        self._phase, self._finished, self._heard = "", 0, False
         self.kills: list[Kill] = []
 
     def __enter__(self) -> KilledScan:
@@ -184,13 +184,21 @@ class KilledScan:
         # a scan that was killed before it had a folder cannot be resumed
         goal: dict[str, Any] = {"scene": self._scene}
         if resume:
-            self._client.wait(self._result.done, LOST_WITHIN_S, "the loss of the scan to be noticed")
+            self._heard = False
+
+            def known() -> bool:
+                return self._heard or self._result.done()
+
+            self._client.wait(known, LOST_WITHIN_S, "the fate of the scan")
+            if self._heard:  # its goal was not accepted before the kill, and is now
+                return
             if (self._run / "run.json").exists():
                 goal = {"resume": True}
         scan = self._client.tactile.scan
         self._result = scan(**goal, run_directory=self._run, on_feedback=self._hear)
 
     def _hear(self, feedback) -> None:
+        self._heard = True
         self._phase, self._finished = feedback.phase, feedback.finished
 
     def _look(self) -> dict[str, Finished]:

@@ -176,6 +176,10 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
     assert not spin_until(stack.executor, future.done, 0.5)
     stack.scan_node.trigger_activate()
     assert "got 'camera'" in stack.ended(future).message
+    # what it had against the last goal is nothing against the next
+    stack.scan_node.trigger_deactivate()
+    outcome = stack.ended(stack.client.scan(**GOAL, wait_s=1.0))
+    assert outcome.message == "scan_node is not active, for 1 s"
 
 
 def test_a_scan_whose_node_goes_away_is_lost(stack):
