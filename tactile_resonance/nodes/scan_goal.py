@@ -72,6 +72,8 @@ class ScanGoal(ScanClient):
             del goal["scene"]  # that of the run
         self.wait_until_up(values(self._node, "start_within_s")[0])
         outcome = self.scan(**goal, on_feedback=self._tell)
+        if not outcome.points:
+            raise NoAnswer(f"{outcome.ending.value}: {outcome.message}")
         say = self._node.get_logger().info
         say(
             f"{outcome.message}: {outcome.done} of {outcome.points} points with poles, "

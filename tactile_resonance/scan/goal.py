@@ -98,10 +98,11 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     if len(poses):
         content.pop("surface", None)
         changes["positions"] = {"list": poses[:, :3].tolist()}
-    text = yaml.safe_dump({**content, **changes}, sort_keys=False, allow_unicode=True)
+    content = {**content, **changes}
+    scene = parse_scan_scene(content, path)
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     if goal.scene and not changes:
         text = path.read_text(encoding="utf-8")
-    scene = parse_scan_scene({**content, **changes}, path)
     if len(poses):
         plan: Plan | None = plan_points(scene, _points(poses, scene.name))
     else:
