@@ -15,7 +15,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Pose
 from rclpy.action.client import ClientGoalHandle
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -95,9 +95,9 @@ class _Asked:
 
 
 class TactileClient:
-    """Client of scan_node; callbacks and futures come in the executor that spins the node.
+    """Client of scan_node; futures and callbacks, one at a time, come in the executor that spins the node.
 
-    Everything may also be awaited in coroutines of that executor.
+    Futures may also be awaited in coroutines of that executor.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class TactileClient:
         self._node = node
         prefix = f"{namespace.rstrip('/')}/" if namespace else ""
         # of its own: a callback of the caller that awaits would keep all others of its group waiting
-        group = ReentrantCallbackGroup()
+        group = MutuallyExclusiveCallbackGroup()
         self._goals = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
         self._services = {
             name: node.create_client(Trigger, f"{prefix}scan/{name}", callback_group=group)
@@ -120,7 +120,7 @@ class TactileClient:
         self._points = node.create_subscription(
             PointResult, f"{prefix}point_result", self._on_point, RESULTS, callback_group=group
         )
-        self._begin = node.create_guard_condition(self._conduct, callback_group=group)
+        self._begin = node.create_guard_condition(self._conduct, ReentrantCallbackGroup())
         self._timer = node.create_timer(TICK_S, self._on_tick, callback_group=group, clock=STEADY)
         self._timer.cancel()
         self._tick = Future()

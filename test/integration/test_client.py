@@ -70,6 +70,7 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
         # the force of the goal, not of the bench's scene, at exactly the place of the pose
         assert result.force_n == pytest.approx(0.012, abs=1e-12)
         assert result.f0_std_hz < 0.1
+        assert result.blocks == 3  # without the precision of the goal they would be eight
         assert result.f0_hz == pytest.approx(254.3, abs=0.5)
     table_in_base = Pose.from_vector(np.array(TABLE_IN_BASE))
     places = {0.003 * result.index for result in done}

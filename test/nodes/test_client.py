@@ -3,6 +3,7 @@
 
 import math
 import os
+import time
 
 import pytest
 
@@ -134,18 +135,29 @@ def test_a_scan_is_followed_paused_and_cancelled_by_a_node_that_does_not_spin_it
 
 def test_results_of_points_come_while_a_scan_is_under_way(stack):
     stack.activate()
-    points = []
+    points, inside, most_inside = [], [], []
+
+    def on_point(point):
+        inside.append(point)
+        most_inside.append(len(inside))
+        time.sleep(0.02)
+        points.append(point.label)
+        inside.pop()
+
     publisher = stack.user.create_publisher(PointResult, "point_result", POLES)
     publisher.publish(PointResult(label="of a scan before"))
     spin_until(stack.executor, lambda: False, 0.5)
-    future = stack.begin([], on_point=points.append)
-    publisher.publish(PointResult(label="first"))
-    stack.until(lambda: points)
-    assert [point.label for point in points] == ["first"]
+    future = stack.begin([], on_point=on_point)
+    labels = [f"point {k}" for k in range(20)]
+    for label in labels:
+        publisher.publish(PointResult(label=label))
+    stack.until(lambda: len(points) == len(labels))
+    assert points == labels
+    assert max(most_inside) == 1  # whatever the executor
     stack.client.cancel()
     stack.ended(future)
     publisher.publish(PointResult(label="of a scan after"))
-    assert not spin_until(stack.executor, lambda: len(points) > 1, 0.5)
+    assert not spin_until(stack.executor, lambda: len(points) > len(labels), 0.5)
 
 
 def test_an_outcome_can_be_awaited(stack):
