@@ -123,6 +123,7 @@ def _nodes(context):
     simulated_cell = host if mock and given("force_config") == "can_simulated.yaml" else ""
     time_server = {"time_server": f"{host}:{TIME_PORT}" if simulated_time else ""}
     stalls = mock and not (simulated_time or may_take_priority(PRIORITY))
+    table = {"table_in_base": TABLE_IN_BASE} if mock and robot != "false" else {}
     own = {
         "fake_hardware_node": {
             "scene": given("scene"),
@@ -145,11 +146,15 @@ def _nodes(context):
             "simulated_stalls_s": STALLS_S if stalls else 0.0,
             **time_server,
         },
+        # where a real table stands, params_file says, if anything
+        "pole_map_node": {"frame_id": given("table_frame"), "base_frame": given("base_frame"), **table}
+        if mock
+        else {},
         "scan_node": {
             "contact": "none" if robot == "false" else "robot",
             "run_folder": given("run_folder"),
             "base_frame": given("base_frame"),
-            **({"table_in_base": TABLE_IN_BASE} if mock and robot != "false" else {}),
+            **table,
             **time_server,
         },
     }
@@ -188,7 +193,8 @@ def _nodes(context):
                 package="rviz2",
                 executable="rviz2",
                 namespace=LaunchConfiguration("namespace"),
-                arguments=["-d", view],
+                # the view's topics are relative: those of the namespace, which the title names
+                arguments=["-d", view, "-f", given("table_frame"), "-t", "Pole map of {NAMESPACE}"],
                 parameters=[{"use_sim_time": simulated_time}],
                 remappings=[("/clock", "clock")],
             )

@@ -105,11 +105,6 @@ class Excitation:
         """Length of one period [s]."""
         return self.samples_per_period / self.sample_rate_hz
 
-    def detection_harmonics(self) -> IntArray:
-        """Harmonics inside the excited band that are not excited."""
-        band = np.arange(self.harmonics[0], self.harmonics[-1] + 1)
-        return np.setdiff1d(band, self.harmonics, assume_unique=True)
-
     def spectrum(self) -> npt.NDArray[np.complex128]:
         """(N // 2 + 1,) one-sided spectrum [V], ``X[k] = (1/N) sum_n u[n] exp(-j 2 pi k n / N)``."""
         spectrum = np.zeros(self.samples_per_period // 2 + 1, complex)

@@ -78,11 +78,6 @@ def test_crest_factor_of_random_phases_is_near_four():
     assert 3.5 < np.mean(factors) < 4.6
 
 
-def test_detection_harmonics_are_those_left_out():
-    excitation = design_multisine(grid=Grid.ODD, band_hz=(10, 100))
-    np.testing.assert_array_equal(excitation.detection_harmonics() % 2, 0)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

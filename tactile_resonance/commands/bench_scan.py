@@ -143,7 +143,7 @@ def run_job(job: Job) -> int:
     if job.real_time and not priority:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
-    parameters = node_parameters(job, bool(content.tissue_classes), work)
+    parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
     computing = () if priority or not job.real_time else COMPUTING
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
@@ -186,7 +186,9 @@ class _Ended:
             os._exit(INTERRUPTED)
 
 
-def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, object]]:
+def node_parameters(
+    job: Job, classes: bool, work: Path, map_frame: str = "table"
+) -> dict[str, dict[str, object]]:
     """Parameters of each node that differ from their defaults."""
     waits_s = STALLS_S if job.real_time and not may_take_priority(PRIORITY) else 0.0
     table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
@@ -207,7 +209,11 @@ def node_parameters(job: Job, classes: bool, work: Path) -> dict[str, dict[str, 
             "simulated_stalls_s": waits_s,
             **time_server,
         },
-        "pole_map_node": {"classes_file": job.scene if classes else "''"},
+        "pole_map_node": {
+            "classes_file": job.scene if classes else "''",
+            "frame_id": map_frame,
+            "table_in_base": table,
+        },
         "scan_node": {"table_in_base": table, **time_server},
     }
     return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}
@@ -255,6 +261,7 @@ class _Bar:
 
         self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None)
         self._begun_s, self._finished = time.monotonic(), -1
+        self._waiting_for = ""
 
     def __enter__(self) -> _Bar:
         return self
@@ -265,8 +272,9 @@ class _Bar:
     def show(self, feedback: Scan.Feedback) -> None:
         """Take the feedback of the scan."""
         bar = self._bar
-        if feedback.waiting_for:
-            bar.write(f"waiting for {feedback.waiting_for}", file=sys.stdout)
+        if feedback.waiting_for and feedback.waiting_for != self._waiting_for:
+            bar.write(f"waiting: {feedback.waiting_for}", file=sys.stdout)
+        self._waiting_for = feedback.waiting_for
         if bar.disable:
             if feedback.finished != self._finished:
                 self._finished = feedback.finished

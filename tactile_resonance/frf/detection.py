@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, special
+from scipy import special
 
 from tactile_resonance.frf.result import ComplexArray, FloatArray
 from tactile_resonance.frf.spectra import IntArray
@@ -75,18 +75,6 @@ class DetectionLines:
         return decibel(self.power / self.linear_output_power)
 
     @property
-    def noise_level_db(self) -> FloatArray | None:
-        """(..., L) noise floor against the linear output around [dB]; None where unknown."""
-        noise = self.noise_power
-        return None if noise is None else decibel(noise / self.linear_output_power)
-
-    @property
-    def input_level_db(self) -> FloatArray:
-        """(..., L) input at these lines against the input at the excited lines around [dB]."""
-        power = np.mean(np.abs(self.input) ** 2, axis=-2)
-        return decibel(power / self.excited_input_power)
-
-    @property
     def rms_level_db(self) -> FloatArray:
         """(...) mean power per in-band line against the mean linear power per line there [dB]."""
         return _rms_ratio_db(self.power, self.linear_output_power, self.in_band)
@@ -132,12 +120,6 @@ class DetectionLines:
         quantile = special.fdtri(dof, dof * self.noise_dof, 1 - FALSE_ALARM)
         return np.asarray(self.power[..., inside].sum(axis=-1) > quantile * total)
 
-    def smoothed_level_db(self, lines: int = 21) -> FloatArray:
-        """(..., L) level of the power averaged over neighbouring lines [dB]."""
-        return decibel(
-            _running_mean(self.power, lines) / _running_mean(self.linear_output_power, lines)
-        )
-
 
 def decibel(power_ratio: npt.ArrayLike) -> FloatArray:
     """10 lg of a power ratio."""
@@ -151,11 +133,3 @@ def _rms_ratio_db(
     if not np.any(inside):
         return np.full(power.shape[:-1], np.nan)
     return decibel(power[..., inside].mean(axis=-1) / reference[..., inside].mean(axis=-1))
-
-
-def _running_mean(power: FloatArray, lines: int) -> FloatArray:
-    """Mean over up to `lines` neighbours, those outside the band left out."""
-    known = np.isfinite(power)
-    total = ndimage.uniform_filter1d(np.where(known, power, 0), lines, axis=-1, mode="constant")
-    weight = ndimage.uniform_filter1d(known.astype(float), lines, axis=-1, mode="constant")
-    return np.where(known, total / np.where(known, weight, 1), np.nan)

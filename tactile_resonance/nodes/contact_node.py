@@ -30,6 +30,7 @@ from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
+from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 PARAMETERS = (
@@ -72,7 +73,7 @@ DEAD_NS = 1_000_000_000
 
 
 class ContactNode(ManagedNode):
-    """Action `make_contact`, service `retract`; publishes `wrench`, `tcp_pose`, `contact_state`.
+    """Action `make_contact`, services `retract` and `stop`; publishes `wrench`, `tcp_pose`, `contact_state`.
 
     The executor's thread only takes requests; devices, law and envelope run in the loop's thread. When
     the node is deactivated or ends, the tip is drawn back first, where the link allows it.
@@ -82,13 +83,14 @@ class ContactNode(ManagedNode):
         super().__init__("contact_node", PARAMETERS)
         self._thread: ContactThread | None = None
         self._arm: UrArm | None = None
+        self._stop = StopInput(self, self._draw_back)
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def configure(self) -> None:
         """Connect arm and force source."""
         names = ("frame_id", "base_frame", "publish_rate_hz")
         frame_id, self._base_frame, rate_hz = values(self, *names)
-        self._topics = ContactTopics(self, frame_id, self._base_frame, rate_hz)
+        self._topics = ContactTopics(self, self._stop, frame_id, self._base_frame, rate_hz)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings, self._limits = self._read_parameters()
@@ -205,9 +207,11 @@ class ContactNode(ManagedNode):
         return parameters, limits
 
     def _refusal(self, _: MakeContact.Goal) -> str:
-        """Goals are taken one at a time, and only while both devices are well."""
+        """Goals are taken one at a time, while both devices are well and the tip is not stopped."""
         if self._goal is not None:
             return "a contact is under way"
+        if self._stop.stopped:
+            return "the tip is stopped"
         return "" if self._fault is None else str(self._fault)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
@@ -215,6 +219,8 @@ class ContactNode(ManagedNode):
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
+            if self._stop.stopped:
+                raise ValueError("goal: refused while the tip is stopped")
             limits = self._goal_limits(goal.request)
             asked = contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
             require_fit(self._force.info, asked.aim.force_n)
@@ -239,6 +245,10 @@ class ContactNode(ManagedNode):
         else:
             goal.abort()
         return result
+
+    def _draw_back(self) -> None:
+        if self._thread is not None:
+            self._thread.retract()
 
     def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._thread is None:

@@ -15,6 +15,7 @@ from tactile_resonance.nodes.contact_messages import pose_message, state_message
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import STREAM, RCLError
+from tactile_resonance.nodes.stop_input import StopInput
 
 SAID_AGAIN_S = 0.1
 """While simulated time stands the state is published again after so long, by this machine's clock [s]."""
@@ -27,13 +28,17 @@ class ContactTopics:
     ----------
     node : ManagedNode
         Whose publishers they are, until it is cleaned up.
+    stop : StopInput
     frame_id, base_frame : str
         Of the tip, of its poses.
     rate_hz : float
         By the loop's clock.
     """
 
-    def __init__(self, node: ManagedNode, frame_id: str, base_frame: str, rate_hz: float) -> None:
+    def __init__(
+        self, node: ManagedNode, stop: StopInput, frame_id: str, base_frame: str, rate_hz: float
+    ) -> None:
+        self._stop = stop
         self._node, self._period_ns = node, round(1e9 / rate_hz)
         self._frame_id, self._base_frame = frame_id, base_frame
         self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
@@ -80,5 +85,6 @@ class ContactTopics:
 
     def _say(self, state: msg.ContactState) -> None:
         self._newest, self._said_s = state, time.monotonic()
+        state.stopped = self._stop.stopped
         if self._state.get_subscription_count():
             self._state.publish(state)

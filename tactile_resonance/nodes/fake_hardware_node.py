@@ -31,6 +31,7 @@ from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
 from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import TruthTopic
 from tactile_resonance.record import Contact
 from tactile_resonance.simulation.acquisition import BenchEffects, Block
@@ -102,6 +103,9 @@ class FakeHardwareNode(ManagedNode):
         super().__init__("fake_hardware_node", PARAMETERS)
         self._player = BenchPlayer(self.time_server)
         self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
+        self._contact: IdealContact | None = None
+        (serves_contact,) = values(self, "serve_contact")
+        self._stop = StopInput(self, self._draw_back) if serves_contact else None
 
     def configure(self) -> None:
         """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
@@ -154,8 +158,16 @@ class FakeHardwareNode(ManagedNode):
     def _serve_ideal_contact(self, by_action: bool) -> None:
         if by_action:
             base_frame, frame_id = values(self, "base_frame", "frame_id")
-            IdealContact(
-                self, self._stays, self._found_at, self._placed, self._now_ns, base_frame, frame_id
+            assert self._stop is not None
+            self._contact = IdealContact(
+                self,
+                self._stays,
+                self._found_at,
+                self._placed,
+                self._now_ns,
+                self._stop,
+                base_frame,
+                frame_id,
             )
         else:
             self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
@@ -163,6 +175,10 @@ class FakeHardwareNode(ManagedNode):
             self.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
             self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         self.serve(ForceOver, "force_over", self._stays.serve)
+
+    def _draw_back(self) -> None:
+        if self._contact is not None:
+            self._contact.draw_back()
 
     def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
         """Depth that brings a force at a place in the base, and height of the surface above that place."""

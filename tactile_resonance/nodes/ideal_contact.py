@@ -27,6 +27,7 @@ from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.srv import ForceOver
 
 CONTACT_S = 0.5
@@ -93,7 +94,7 @@ class Stays:
 
 
 class IdealContact:
-    """Action `make_contact`, service `retract`; publishes `contact_state`, `tcp_pose`, `wrench`.
+    """Action `make_contact`, services `retract` and `stop`; publishes `contact_state`, `tcp_pose`, `wrench`.
 
     Parameters
     ----------
@@ -108,6 +109,7 @@ class IdealContact:
         Called when the tip is put somewhere.
     now_ns : callable
         ROS time now [ns].
+    stop : StopInput
     base_frame, frame_id : str
     """
 
@@ -118,6 +120,7 @@ class IdealContact:
         force_at: Callable[[np.ndarray, float], tuple[float, float] | None],
         placed: Callable[[], None],
         now_ns: Callable[[], int],
+        stop: StopInput,
         base_frame: str,
         frame_id: str,
     ) -> None:
@@ -128,17 +131,24 @@ class IdealContact:
         self._drawn_back = threading.Event()
         self._state, self._cause, self._message = State.IDLE, "", ""
         self._depth_m = math.nan
+        self._stop = stop
         self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
         self._poses = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
         node.serve(Trigger, "retract", self._on_retract)
         node.every(PUBLISH_S, self._publish)
-        node.act(MakeContact, "make_contact", self._on_goal, lambda _: self._draw_back())
+        node.act(
+            MakeContact,
+            "make_contact",
+            self._on_goal,
+            on_cancel=lambda _: self.draw_back(),
+            refusal=lambda _: "the tip is stopped" if stop.stopped else "",
+        )
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
         if goal.is_cancel_requested:
-            self._draw_back()  # for a cancellation before the work began
+            self.draw_back()  # for a cancellation before the work began
             goal.canceled()
         elif result.reached:
             goal.succeed()
@@ -180,7 +190,7 @@ class IdealContact:
             self._placed()
             self._say(State.HOLD, "none", "")
             if self._drawn_back.is_set():  # asked for after the wait
-                self._draw_back()
+                self.draw_back()
             result.reached, result.cause, result.depth_m = True, "none", self._depth_m
             result.force_n, result.force_std_n = request.force_n, 0.0
             result.peak_force_n, result.surface_std_m = request.force_n, 0.0
@@ -196,6 +206,8 @@ class IdealContact:
             return f"pose: in frame {frame!r}, accepted is {self._base_frame!r}"
         if not 0 < request.force_n < math.inf:
             return f"force_n: {request.force_n:g}, accepted is above 0"
+        if self._stop.stopped:
+            return "goal: refused while the tip is stopped"
         if self._state is not State.IDLE:
             return f"goal: refused in state {self._state.value}; accepted in idle"
         return ""
@@ -218,12 +230,13 @@ class IdealContact:
         return not self._drawn_back.is_set()
 
     def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._draw_back()
+        self.draw_back()
         response.success = True
         response.message = "asked; contact_state reports when it is idle"
         return response
 
-    def _draw_back(self) -> None:
+    def draw_back(self) -> None:
+        """Lift the tip off, also one that is on its way."""
         self._drawn_back.set()
         if self._state is State.HOLD:
             now_ns = self._now_ns()
@@ -241,6 +254,7 @@ class IdealContact:
         stay = self._stays.newest
         state = msg.ContactState(state=self._state.value, cause=self._cause, message=self._message)
         state.header.stamp, state.header.frame_id = now, self._frame_id
+        state.stopped = self._stop.stopped
         holds = self._state is State.HOLD
         state.force_n = stay.force_n if holds else math.nan
         state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan

@@ -64,6 +64,8 @@ class _Managed:
     client: Client | None = None
     deadline_s: float = 0.0
     refusals: int = 0
+    worked: bool = False  # it has been active since it was last brought up
+    held: bool = False  # somebody else has deactivated it
     next_try_s: float = field(default=0.0)
 
 
@@ -71,7 +73,9 @@ class ManagerNode(Node):
     """Asks each node for its state and moves it on; a node waits for those before it.
 
     A node that fails goes back to unconfigured, one that is started anew is unconfigured: both are
-    brought up again. Services `~/shut_down` (all nodes unconfigured, in reverse order) and `~/start`.
+    brought up again. A node that somebody else deactivates is held: it stays down, also where it is cleaned up
+    or started anew, until somebody activates it or calls `~/start`. Services `~/shut_down` (all nodes
+    unconfigured, in reverse order) and `~/start`.
     """
 
     def __init__(self) -> None:
@@ -105,6 +109,7 @@ class ManagerNode(Node):
         self._wanted_up = up
         for node in self._nodes:
             node.refusals, node.next_try_s = 0, 0.0
+            node.worked = node.held = False
         response.success = True
         response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
         return response
@@ -114,7 +119,7 @@ class ManagerNode(Node):
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
         for node in self._nodes if self._wanted_up else reversed(self._nodes):
-            self._advance(node, moves if clear else {})
+            self._advance(node, moves if clear and not node.held else {})
             clear = clear and node.state == ready
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
@@ -158,9 +163,15 @@ class ManagerNode(Node):
     def _take(self, node: _Managed, now_s: float) -> None:
         answer, node.pending = node.pending.result(), None
         if isinstance(answer, GetState.Response):
-            if node.state == State.PRIMARY_STATE_ACTIVE != answer.current_state.id:
-                self.health.error(f"{node.name} is {_NAMES.get(answer.current_state.id)} again")
             node.state = answer.current_state.id
+            if node.state == State.PRIMARY_STATE_ACTIVE:
+                node.worked, node.held = True, False
+            elif node.worked:
+                # a node that fails does not stay inactive
+                node.worked = False
+                node.held = self._wanted_up and node.state == State.PRIMARY_STATE_INACTIVE
+                said = "was deactivated, and is held" if node.held else "is not active any more"
+                self.health.error(f"{node.name} {said}")
             return
         node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:
@@ -183,6 +194,8 @@ class ManagerNode(Node):
         self.health.error(f"{node.name} does not answer")
 
     def _summary(self) -> str:
+        if held := [node.name for node in self._nodes if node.held]:
+            return f"held: {', '.join(held)}"
         return "active" if self._was_up else ("starting" if self._wanted_up else "shut down")
 
     def _details(self) -> dict[str, str]:

@@ -18,6 +18,8 @@ SILENT_S = 1.5
 SAID_AFTER_S = 5.0
 """A node that is waited for is named after this [s of this machine's clock]."""
 
+DOUBTED = "doubted"
+
 
 @dataclass(frozen=True)
 class _Sign:
@@ -77,6 +79,14 @@ class NodeWatch:
                 return f"{topic}: {' and '.join(filter(None, problems))}"
         return None
 
+    def held(self) -> bool:
+        """Whether all that is missing was deactivated: nodes that come up are so only for a moment."""
+        for topic in self._topics:
+            nodes = self._publishers(topic)
+            if all(map(self._problem, nodes)) and not any(map(self._deactivated, nodes)):
+                return False
+        return True
+
     def hung(self) -> str:
         """A node behind a topic that is silent for too long, as a sentence; empty: none is.
 
@@ -128,8 +138,13 @@ class NodeWatch:
         except error:
             with self._lock:
                 for name, sign in self._signs.items():
-                    self._signs[name] = _Sign("in doubt", sign.instance, sign.heard_s)
+                    self._signs[name] = _Sign(DOUBTED, sign.instance, sign.heard_s)
             raise
+
+    def _deactivated(self, node: str) -> bool:
+        with self._lock:
+            sign = self._signs.get(node)
+        return sign is not None and sign.state == "inactive" and not self._silence(node)
 
     def _problem(self, node: str) -> str:
         """Why a node is not at work; empty where it is."""
@@ -137,6 +152,8 @@ class NodeWatch:
             sign = self._signs.get(node)
         if sign is None or sign.state == "active":
             return self._silence(node)
+        if sign.state == DOUBTED:
+            return f"{node} has given no sign of life again yet"
         return self._silence(node) or f"{node} is {sign.state}, not active"
 
     def _silence(self, node: str) -> str:

@@ -13,7 +13,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from tactile_resonance.nodes.conversions import POLES_STATUS
 from tactile_resonance.scan.colour_scale import colours, shares
-from tactile_resonance.scan.pole_map import EllipseScale, MapSurface, PoleMap
+from tactile_resonance.scan.mesh import grid_faces
+from tactile_resonance.scan.pole_map import EllipseScale, PoleMap
 
 FloatArray = npt.NDArray[np.float64]
 NO_CLASS = 255  # of the field tissue_class: none called, or unknown
@@ -23,8 +24,13 @@ POINT = np.dtype(
     + [(name, "<f4") for name in ("damping_std", "force_n", "tissue_probability")]
     + [("tissue_class", "u1"), ("status", "u1"), ("_", "V2")]
 )
-SURFACE_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "f0_hz", "f0_std_hz")])
 _BAR_STEPS = 32
+_SURFACE_ALPHA = 0.35  # points and ellipses, of the same colours, stand out
+# In sizes of the map: widths of lines, of the bar and the gap beside it, of the legend's texts.
+_LINE = 0.004
+_GAP = 0.05
+_TEXTS = 0.6
+_CHARACTER = 0.45  # width over height in rviz's texts, mean: that of figures in Liberation Sans
 _WHITE = (1.0, 1.0, 1.0)
 _FAILED = (1.0, 0.15, 0.1)
 
@@ -52,15 +58,15 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Header) -> 
     return _cloud(table, header)
 
 
-def surface_message(surface: MapSurface | None, header: Header) -> PointCloud2:
-    """Cloud of the kriged surface; empty where there is none."""
+def surface_message(pole_map: PoleMap, cells: int, header: Header) -> MarkerArray:
+    """The kriged surface as triangles in the colours of the legend."""
+    surface = pole_map.surface(cells)
+    sheet = _marker(header, "surface", 0, Marker.TRIANGLE_LIST)
     if surface is None:
-        return _cloud(np.zeros(0, SURFACE_POINT), header)
-    table = np.zeros(surface.f0_hz.size, SURFACE_POINT)
-    for k, name in enumerate("xyz"):
-        table[name] = surface.position_m[..., k].ravel()
-    table["f0_hz"], table["f0_std_hz"] = surface.f0_hz.ravel(), surface.f0_std_hz.ravel()
-    return _cloud(table, header)
+        return MarkerArray(markers=[_deleted(sheet)])
+    below = surface.position_m - [0.0, 0.0, _LINE * pole_map.size_m]  # where it hides no ellipse
+    _lay(sheet, below, shares(surface.f0_hz, pole_map.f0_hz), _SURFACE_ALPHA)
+    return MarkerArray(markers=[sheet])
 
 
 def marker_message(
@@ -68,23 +74,21 @@ def marker_message(
 ) -> MarkerArray:
     """Two markers: the ellipses of all points, crosses where a point failed."""
     ellipses = _marker(header, "ellipses", 0, Marker.LINE_LIST)
-    width_m = _line_width(pole_map)
-    ellipses.scale.x = width_m
-    lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
-    ellipses.points = _points(lines.reshape(-1, 3))
-    if len(lines):
-        own = shares([point.estimate[0] for point in pole_map.with_ellipse], pole_map.f0_hz)
-        repeated = np.repeat(colours(own), lines[0].size // 3, axis=0)
-        ellipses.colors = [_colour(rgb) for rgb in repeated]
     crosses = _marker(header, "failures", 0, Marker.LINE_LIST)
-    crosses.scale.x = 2 * width_m
-    arm_m = 0.2 * _spacing(pole_map)
-    arms = arm_m * np.array([[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]])
-    ends = [point.position_m + arms for point in pole_map.failures]
-    crosses.points = _points(np.array(ends).reshape(-1, 3))
-    crosses.color = _colour(_FAILED)
-    markers = [m if m.points else _deleted(m) for m in (ellipses, crosses)]
-    return MarkerArray(markers=markers)
+    if pole_map.estimated:
+        ellipses.scale.x = _LINE * pole_map.size_m
+        lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
+        ellipses.points = _points(lines.reshape(-1, 3))
+        own = shares([point.estimate[0] for point in pole_map.with_ellipse], pole_map.f0_hz)
+        for rgb in colours(own):
+            ellipses.colors += [_colour(rgb)] * (lines[0].size // 3)
+    if pole_map.failures:
+        crosses.scale.x = 2 * _LINE * pole_map.size_m
+        arms = np.array([[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]])
+        ends = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
+        crosses.points = _points(np.array(ends).reshape(-1, 3))
+        crosses.color = _colour(_FAILED)
+    return MarkerArray(markers=[m if m.points else _deleted(m) for m in (ellipses, crosses)])
 
 
 def legend_message(
@@ -94,45 +98,55 @@ def legend_message(
     names: tuple[str, ...],
     header: Header,
 ) -> MarkerArray:
-    """Colour bar with its ends and middle, the scale of the ellipses, counts, beside the map."""
-    if not pole_map.estimated:
-        everything = _marker(header, "", 0, Marker.CUBE)
-        everything.action = Marker.DELETEALL
-        return MarkerArray(markers=[everything])
-    low, high = pole_map.positions_m.min(axis=0), pole_map.positions_m.max(axis=0)
-    size_m = max(float(np.max(high - low)), 4 * _spacing(pole_map))
-    corner = np.array(
-        [high[0] + 0.12 * size_m, (low[1] + high[1] - size_m) / 2, (low[2] + high[2]) / 2]
-    )
-    text_m = 0.05 * size_m
-    bar = _marker(header, "legend", 0, Marker.TRIANGLE_LIST)
-    bar.scale.x = bar.scale.y = bar.scale.z = 1.0
-    corners, rgb = _bar(corner, 0.06 * size_m, size_m)
-    bar.points, bar.colors = _points(corners), [_colour(c) for c in rgb]
-    f0 = pole_map.f0_hz
-    markers = [bar]
+    """Right of the map and as high as it is long: colour bar, its figures, and beside them the lines.
 
-    def write(text: str, right: float, up: float) -> None:
+    With the map it is little more than twice as wide as high. Each line is a marker: the distance at which
+    rviz sets the lines of one text does not follow their height.
+    """
+    everything = _marker(header, "", 0, Marker.CUBE)
+    everything.action = Marker.DELETEALL  # there may be fewer lines than before
+    if not pole_map.estimated:
+        return MarkerArray(markers=[everything])
+    f0, size_m = pole_map.f0_hz, pole_map.size_m
+    ticks = [f"{f0.min() + share * np.ptp(f0):.2f} Hz" for share in (0.0, 0.5, 1.0)]
+    lines = legend_lines(pole_map, scale, probability, names)
+    tick_width, line_width = (_CHARACTER * max(map(len, texts)) for texts in (ticks, lines))
+    text_m = size_m * min(_TEXTS / line_width, 0.6 / len(lines))
+    low, high = pole_map.positions_m.min(axis=0), pole_map.positions_m.max(axis=0)
+    # of the bar, beside the ellipses; points in free air, far above the tissue, do not lift it
+    x = float(high[0]) + 0.4 * pole_map.spacing_m + _GAP * size_m
+    y = float(low[1] + high[1] - size_m) / 2
+    z = float(np.median(pole_map.positions_m[:, 2]))
+
+    bar = _marker(header, "legend", 0, Marker.TRIANGLE_LIST)
+    across, up = np.meshgrid([0.0, _GAP], np.linspace(0, 1, _BAR_STEPS + 1))
+    corners = np.stack([x + size_m * across, y + size_m * up, np.full_like(up, z)], axis=-1)
+    _lay(bar, corners, up)  # (steps + 1, 2)
+    markers = [everything, bar]
+
+    def write(text: str, middle_m: float, height_m: float) -> None:
         marker = _marker(header, "legend", len(markers), Marker.TEXT_VIEW_FACING)
-        marker.text, marker.scale.z, marker.color = text, text_m, _colour(_WHITE)
-        at = corner + [right * size_m, up * size_m, 0.0]
-        marker.pose.position = Point(x=float(at[0]), y=float(at[1]), z=float(at[2]))
+        marker.text, marker.scale.z = text, text_m
+        marker.scale.x = 0.6 * text_m  # of spaces; rviz's own is for texts 1 m high
+        marker.pose.position = Point(x=middle_m, y=height_m, z=z)
         markers.append(marker)
 
-    for share in (0.0, 0.5, 1.0):
-        write(f"{f0.min() + share * np.ptp(f0):.2f} Hz", 0.17, share)
-    write("natural frequency f0", 0.12, 1.09)
-    text = legend_text(pole_map, scale, probability, names)
-    # a text hangs about its middle
-    write(text, 0.12, -0.06 - 0.03 * (text.count("\n") + 1))
+    # rviz hangs a text about its middle
+    left_m = x + 1.5 * _GAP * size_m
+    for k, text in enumerate(ticks):
+        write(text, left_m + tick_width * text_m / 2, y + k * size_m / 2)
+    left_m += tick_width * text_m + 0.5 * _GAP * size_m
+    for k, text in enumerate(lines):
+        write(text, left_m + line_width * text_m / 2, y + size_m - 1.6 * k * text_m)
     return MarkerArray(markers=markers)
 
 
-def legend_text(
+def legend_lines(
     pole_map: PoleMap, scale: EllipseScale, probability: float, names: tuple[str, ...]
-) -> str:
-    """What the lines mean, and how many points there are, by tissue class with its number in the cloud."""
+) -> list[str]:
+    """What is drawn, and how many points there are, by tissue class with its number in the cloud."""
     lines = [
+        "colour: natural frequency f0",
         f"ellipses: {100 * probability:g} %",
         f"x: 1 mm = {1e-3 / scale.m_per_hz:.2g} Hz of f0",
         f"y: 1 mm = {1e-3 / scale.m_per_damping:.2g} of damping ratio",
@@ -144,7 +158,13 @@ def legend_text(
         lines.append(f"class {number}, {name}: {count}")
     if pole_map.simulated:
         lines.append("simulated, not measured")
-    return "\n".join(lines)
+    return lines
+
+
+def restamp(message: PointCloud2 | MarkerArray, stamp: Time) -> None:
+    """Set all stamps of a message."""
+    for part in [message] if isinstance(message, PointCloud2) else message.markers:
+        part.header.stamp = stamp
 
 
 def header_message(frame_id: str, stamp: Time) -> Header:
@@ -172,7 +192,10 @@ def _cloud(table: np.ndarray, header: Header) -> PointCloud2:
 
 
 def _marker(header: Header, namespace: str, number: int, kind: int) -> Marker:
-    marker = Marker(header=header, ns=namespace, id=number, type=kind, action=Marker.ADD)
+    # locked: rviz tries again as soon as it knows the frame
+    marker = Marker(
+        header=header, ns=namespace, id=number, type=kind, action=Marker.ADD, frame_locked=True
+    )
     marker.pose.orientation.w = 1.0
     marker.color = _colour(_WHITE)
     return marker
@@ -184,29 +207,20 @@ def _deleted(marker: Marker) -> Marker:
     return marker
 
 
-def _bar(corner: FloatArray, width_m: float, height_m: float) -> tuple[FloatArray, FloatArray]:
-    """Corners (6 steps, 3) and colours of the triangles of an upright bar."""
-    edges = np.linspace(0, 1, _BAR_STEPS + 1)
-    corners, rgb = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        square = [(0, low), (1, low), (1, high), (0, low), (1, high), (0, high)]
-        corners += [corner + [x * width_m, y * height_m, 0.0] for x, y in square]
-        rgb += list(colours([y for _, y in square]))
-    return np.array(corners), np.array(rgb)
-
-
-def _spacing(pole_map: PoleMap) -> float:
-    return pole_map.spacing_m if np.isfinite(pole_map.spacing_m) else 0.005
-
-
-def _line_width(pole_map: PoleMap) -> float:
-    return 0.03 * _spacing(pole_map)
+def _lay(marker: Marker, positions_m: FloatArray, share: FloatArray, alpha: float = 1.0) -> None:
+    """Triangles between positions (r, c, 3), in the colours of shares (r, c)."""
+    faces = grid_faces(*share.shape).ravel()
+    marker.scale.x = marker.scale.y = marker.scale.z = 1.0
+    corners = _points(positions_m.reshape(-1, 3))
+    rgba = [_colour(rgb, alpha) for rgb in colours(share.ravel())]
+    marker.points = [corners[k] for k in faces]
+    marker.colors = [rgba[k] for k in faces]
 
 
 def _points(positions: FloatArray) -> list[Point]:
     return [Point(x=x, y=y, z=z) for x, y, z in positions.tolist()]
 
 
-def _colour(rgb: npt.ArrayLike) -> ColorRGBA:
+def _colour(rgb: npt.ArrayLike, alpha: float = 1.0) -> ColorRGBA:
     r, g, b = (float(v) for v in np.asarray(rgb))
-    return ColorRGBA(r=r, g=g, b=b, a=1.0)
+    return ColorRGBA(r=r, g=g, b=b, a=alpha)

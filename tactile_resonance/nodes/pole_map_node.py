@@ -13,12 +13,13 @@ from visualization_msgs.msg import MarkerArray
 from tactile_resonance import msg
 from tactile_resonance.nodes.conversions import poles_from_message
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.pole_map_messages import (
     cloud_message,
     header_message,
     legend_message,
     marker_message,
+    restamp,
     surface_message,
 )
 from tactile_resonance.nodes.running import LATCHED, POLES, run_node
@@ -30,7 +31,16 @@ PARAMETERS = (
     Parameter(
         "frame_id",
         "",
-        "Frame of the map; poles in another one are left out. Empty: that of the first poles.",
+        "Frame of the map; poles in another one than this and base_frame are left out. Empty: that of the "
+        "first poles.",
+        read_only=True,
+    ),
+    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    Parameter(
+        "table_in_base",
+        [0.0] * 6,
+        "Pose of frame_id in base_frame, position [m] and rotation vector [rad], that of scan_node: where "
+        "frame_id is given, poles in base_frame are shown in it.",
         read_only=True,
     ),
     Parameter(
@@ -72,14 +82,16 @@ PARAMETERS = (
 
 # Poles may come faster than anybody looks.
 PUBLISH_PERIOD_S = 0.2
+# rviz drops a cloud whose frame it does not know yet, and the markers of what is switched off.
+REPEAT_PERIOD_S = 1.5
 
 
 class PoleMapNode(ManagedNode):
     """Keeps the latest poles of every place, and shows them to whoever looks.
 
     `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses and failures), `pole_map/legend` and
-    `pole_map/surface` (PointCloud2) are latched; each is made when there is something new and somebody
-    subscribed, at the latest when somebody does.
+    `pole_map/surface` are latched; each is made when there is something new and somebody subscribed, at the
+    latest when somebody does, and repeated while somebody is.
     """
 
     # diagnostics ask for them from the beginning
@@ -92,14 +104,18 @@ class PoleMapNode(ManagedNode):
     def configure(self) -> None:
         """Topics, classes and an empty map."""
         (self._frame_id, classes_file) = values(self, "frame_id", "classes_file")
+        (base_frame, table) = values(self, "base_frame", "table_in_base")
+        self._table = pose_of(table, "table_in_base")
+        # poles in it are shown in frame_id
+        self._moved_frame = base_frame if self._frame_id not in ("", base_frame) else None
         self._classes: tuple[TissueClass, ...] = ()
         if classes_file:
             self._classes = read_classes(Path(classes_file))
         self._map = PoleMap()
         self._left_out = 0
-        kinds = {"": PointCloud2, "/markers": MarkerArray}
-        kinds |= {"/legend": MarkerArray, "/surface": PointCloud2}
+        kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
+        self._shown: dict[str, PointCloud2 | MarkerArray] = {}
         self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
         self._pause.cancel()
         self.resources.callback(self.destroy_timer, self._pause)
@@ -111,6 +127,7 @@ class PoleMapNode(ManagedNode):
         subscription = self.create_subscription(msg.Poles, "poles", self._on_poles, POLES)
         self.resources.callback(self.destroy_subscription, subscription)
         self.serve(Trigger, "pole_map/clear", self._on_clear)
+        self.every(REPEAT_PERIOD_S, self._repeat)
 
     def activate(self) -> None:
         """Soon show what was heard since the configuration."""
@@ -133,6 +150,9 @@ class PoleMapNode(ManagedNode):
             frame_id = origin.contact.frame_id
             if not self._frame_id:
                 self._frame_id = frame_id
+            if frame_id == self._moved_frame:
+                point = point.seen_from(self._table.position_m, self._table.rotation)
+                frame_id = self._frame_id
             if frame_id != self._frame_id:
                 raise ValueError(
                     f"frame of tip_pose: got {frame_id!r}; accepted is {self._frame_id!r}"
@@ -177,11 +197,20 @@ class PoleMapNode(ManagedNode):
             "": lambda: cloud_message(self._map, names, header),
             "/markers": lambda: marker_message(self._map, scale, probability, header),
             "/legend": lambda: legend_message(self._map, scale, probability, names, header),
-            "/surface": lambda: surface_message(self._map.surface(cells), header),
+            "/surface": lambda: surface_message(self._map, cells, header),
         }
         for name in wanted:
-            self._publishers_of[name].publish(makers[name]())
+            self._shown[name] = makers[name]()
+            self._publishers_of[name].publish(self._shown[name])
             self._old.discard(name)
+
+    def _repeat(self) -> None:
+        """Publish what is shown once more, dated now: the frame may be known from now on only."""
+        now = self.get_clock().now().to_msg()
+        for name, message in self._shown.items():
+            if name not in self._old and self._publishers_of[name].get_subscription_count() > 0:
+                restamp(message, now)
+                self._publishers_of[name].publish(message)
 
     def _scale(self, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")

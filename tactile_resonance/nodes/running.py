@@ -103,8 +103,9 @@ def initialised(**options: Any) -> Iterator[None]:
 def run_node(make: Callable[[], Node]) -> None:
     """Spin one node until it is interrupted or ROS shuts down.
 
-    An interrupt ends it even where a shell started it in the background, interrupts ignored. A node that
-    does not end in time, because something in it hangs, is ended all the same.
+    An interrupt ends it even where a shell started it in the background, interrupts ignored; further ones are
+    ignored, so that the node ends in order. A node that does not end in time, because something in it hangs, is
+    ended all the same.
     """
     interrupted = False
 
@@ -115,6 +116,8 @@ def run_node(make: Callable[[], Node]) -> None:
 
     def interrupt(*_: object) -> None:
         nonlocal interrupted
+        if interrupted:
+            return
         interrupted = True
         end_in_time()
         raise KeyboardInterrupt
@@ -133,7 +136,8 @@ def run_node(make: Callable[[], Node]) -> None:
             finally:
                 node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        # the interpreter, as it ends, takes handlers away
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     except (
         *(ValueError, OSError, DeviceError, ParameterException),
         *(InvalidParameterValueException, InvalidParameterTypeException, NameValidationException),

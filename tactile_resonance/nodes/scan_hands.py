@@ -35,6 +35,7 @@ from tactile_resonance.scan.hands import (
     PointFailed,
     Recording,
     ScanEnded,
+    Stopped,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -140,7 +141,13 @@ class NodeHands:
     def missing(self) -> str | None:
         """A node that points need and that is not at work, as a sentence; None: all are at work."""
         self._end_if_hung()
+        if self._is_stopped():
+            return str(Stopped())
         return self._nodes.missing()
+
+    def held(self) -> bool:
+        """Whether somebody has stopped the tip, or deactivated what is missing, as a supervisor does."""
+        return self._is_stopped() or self._nodes.held()
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
@@ -210,10 +217,15 @@ class NodeHands:
 
     # helpers
 
+    def _is_stopped(self) -> bool:
+        return self._tip is not None and self._tip.stopped
+
     def _record(
         self, goal: Measure.Goal, enough: Callable[[Poles, int], bool], check: Check
     ) -> list[msg.Poles]:
         """The poles of a measurement, all of whose messages have come."""
+        if self._is_stopped():
+            raise Stopped
         if missing := self.missing():
             raise NodeAway(missing, "node away")
         touching = self._tip is not None and self._tip.touching
@@ -289,6 +301,8 @@ class NodeHands:
                 self._waited_for = who
                 self._tell_waiting(waited_for)
             self._end_if_hung()
+            if self._is_stopped():
+                raise Stopped
             problem = self._nodes.changed(instances)
             if problem is not None:
                 raise NodeAway(problem, "node away")

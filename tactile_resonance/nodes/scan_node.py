@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -278,17 +279,19 @@ class ScanNode(ManagedNode):
         goal, progress = self._goal, self._progress
         if waited_for and goal is not None and progress is not None:
             self.get_logger().warning(f"the scan waits for {waited_for}")
-            goal.publish_feedback(feedback_message(progress, waited_for))
+            goal.publish_feedback(feedback_message(replace(progress, waiting_for=waited_for)))
 
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
-        last = [("", -math.inf)]
+        last = [("", "", -math.inf)]
 
         def tell(progress: Progress) -> None:
             self._progress = progress
-            now_s = time.monotonic()
-            if progress.phase == last[0][0] and now_s - last[0][1] < FEEDBACK_EVERY_S:
+            now_s, news = time.monotonic(), (progress.phase, progress.waiting_for)
+            if news == last[0][:2] and now_s - last[0][2] < FEEDBACK_EVERY_S:
                 return
-            last[0] = (progress.phase, now_s)
+            if progress.waiting_for and news != last[0][:2]:
+                self.get_logger().warning(f"the scan waits: {progress.waiting_for}")
+            last[0] = (*news, now_s)
             goal.publish_feedback(feedback_message(progress))
 
         return tell

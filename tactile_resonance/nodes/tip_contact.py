@@ -30,12 +30,12 @@ from tactile_resonance.scan.scene import Hold
 STATE_TOPIC = "contact_state"
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
-# Faults of the devices, not of the point: it is repeated.
-DEVICE_CAUSES = frozenset(
+# Faults of the devices, and what somebody else asked for, say nothing of the point: it is repeated.
+FOREIGN_CAUSES = frozenset(
     cause.value
     for cause in (
         *(Cause.FORCE_SOURCE, Cause.FORCE_STALE, Cause.FORCE_INVALID),
-        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
+        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK, Cause.CANCELLED),
     )
 )
 
@@ -54,6 +54,8 @@ class TipContact:
     ----------
     touching : bool
         The tip is on the tissue, or may be.
+    stopped : bool
+        Somebody keeps it out, and contact_node refuses goals.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class TipContact:
     def listen(self) -> None:
         """Hear of contacts, for one scan; where the tip is now nobody knows."""
         self.touching = True  # a scan that was killed may have left it there
+        self.stopped = False
         self._state: msg.ContactState | None = None
         # the newest only: the recorder's may have to wait behind what else is recorded
         self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
@@ -80,11 +83,10 @@ class TipContact:
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         self._make(goal, check, poll)
         while (state := self._state) is None or state.state != state.STATE_HOLD:
-            ended = state is not None and state.cause not in ("", Cause.NONE.value)
-            if state is not None and ended:
-                raise _failure(state)
             poll()
             check()
+            if state is not None and state.cause not in ("", Cause.NONE.value):
+                raise _failure(state)
             time.sleep(POLL_S)
 
     def touch(
@@ -162,12 +164,12 @@ class TipContact:
         return False
 
     def _on_state(self, message: msg.ContactState) -> None:
-        self._state = message
+        self._state, self.stopped = message, message.stopped
 
 
 def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:
     """What a contact that was not reached, or that ended, means for the point."""
     text = f"contact: {ended.cause}: {ended.message}"
-    if ended.cause in DEVICE_CAUSES:
+    if ended.cause in FOREIGN_CAUSES:
         return PointDisturbed(text, ended.cause)
     return PointFailed(text)

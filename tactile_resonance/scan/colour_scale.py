@@ -15,10 +15,13 @@ HIGH_RGB = (255, 210, 50)
 
 
 def shares(values: npt.ArrayLike, over: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(...) place of each value between the least of `over`, 0, and the largest, 1; 0 if these are equal."""
+    """(...) place of each value between the least of `over`, 0, and the largest, 1; 0 if these are equal.
+
+    Values beyond them have the place of the nearer one.
+    """
     low, span = np.min(over), np.ptp(over)
     v = np.asarray(values, float)
-    return np.zeros_like(v) if span == 0 else np.asarray((v - low) / span)
+    return np.zeros_like(v) if span == 0 else np.clip((v - low) / span, 0.0, 1.0)
 
 
 def colours(share: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -54,6 +54,15 @@ class NodeAway(PointDisturbed):
     attempts = ATTEMPTS_WITHOUT_NODE
 
 
+class Stopped(PointDisturbed):
+    """Somebody keeps the tip out of the tissue until further notice."""
+
+    attempts = ATTEMPTS_WITHOUT_NODE
+
+    def __init__(self) -> None:
+        super().__init__("contact: the tip is stopped (service or topic stop)", "stopped")
+
+
 class ScanEnded(Exception):
     """The scan cannot or shall not go on; the message says why."""
 
@@ -102,6 +111,10 @@ class Hands(Protocol):
 
     def missing(self) -> str | None:
         """What points need and is not there now, for people; None: nothing. Asked with the tip free."""
+        ...
+
+    def held(self) -> bool:
+        """Whether somebody keeps what is missing from its work, and will let it go on."""
         ...
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:

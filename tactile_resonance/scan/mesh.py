@@ -137,6 +137,14 @@ def read_stl(path: Path) -> FloatArray:
     return corners
 
 
+def grid_faces(rows: int, columns: int) -> IntArray:
+    """(t, 3) indices of the triangles between the corners of a grid, which are counted row by row."""
+    corner = np.arange(rows * columns).reshape(rows, columns)
+    a, b = corner[:-1, :-1], corner[:-1, 1:]  # of each cell, round about it
+    c, d = corner[1:, 1:], corner[1:, :-1]
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+
+
 def _check_winding(faces: IntArray) -> None:
     """Neighbours run along their common edge in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

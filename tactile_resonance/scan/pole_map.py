@@ -22,6 +22,8 @@ from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 
 FloatArray = npt.NDArray[np.float64]
 SAME_PLACE_M = 1e-4
+LONE_SPACING_M = 0.005
+"""What a single point is taken to be apart from others where it is drawn [m]."""
 _SEGMENTS = 36  # of an ellipse
 
 
@@ -73,6 +75,11 @@ class MapPoint:
     def std(self) -> FloatArray:
         """(2,) of f0 [Hz] and damping ratio."""
         return np.sqrt(np.diag(self.covariance))
+
+    def seen_from(self, origin_m: FloatArray, rotation: Rotation) -> MapPoint:
+        """The same in a frame whose origin (3,) and rotation in the present one are given."""
+        place = rotation.inv().apply(self.position_m - origin_m)
+        return replace(self, position_m=place, normal=rotation.inv().apply(self.normal))
 
 
 def map_point(
@@ -146,6 +153,7 @@ class MapSurface:
     Attributes
     ----------
     position_m : (r, c, 3) float
+        Rows and columns from the least x and y of the points to the largest.
     f0_hz, f0_std_hz : (r, c) float
     """
 
@@ -192,11 +200,16 @@ class PoleMap:
 
     @cached_property
     def spacing_m(self) -> float:
-        """Typical distance to the next point [m]; NaN with fewer than two points."""
+        """Typical distance to the next point [m]; `LONE_SPACING_M` with fewer than two points."""
         if len(self.points) < 2:
-            return float("nan")
+            return LONE_SPACING_M
         distances, _ = cKDTree(self.positions_m).query(self.positions_m, k=2)
         return float(np.median(distances[:, 1]))
+
+    @cached_property
+    def size_m(self) -> float:
+        """Longer side seen along z, at least four spacings [m]: what is drawn refers to it."""
+        return max(float(np.max(np.ptp(self.positions_m[:, :2], axis=0))), 4 * self.spacing_m)
 
     @property
     def simulated(self) -> bool:
@@ -211,11 +224,10 @@ class PoleMap:
     def ellipse_scale(self, probability: float = 0.95) -> EllipseScale:
         """Scale at which nine of ten ellipses stay within 0.4 of the spacing, rounded to 1, 2 or 5."""
         stds = np.array([p.std for p in self.estimated if np.all(np.isfinite(p.std))])
-        spacing_m = self.spacing_m if np.isfinite(self.spacing_m) else 0.005
         if not len(stds):
-            return EllipseScale(spacing_m, spacing_m)
+            return EllipseScale(self.spacing_m, self.spacing_m)
         largest = _radius(probability) * np.quantile(stds, 0.9, axis=0)
-        wanted = 0.4 * spacing_m / np.maximum(largest, 1e-12)
+        wanted = 0.4 * self.spacing_m / np.maximum(largest, 1e-12)
         return EllipseScale(_round_down(wanted[0]), _round_down(wanted[1]))
 
     def ellipses(self, scale: EllipseScale, probability: float = 0.95) -> FloatArray:
@@ -261,8 +273,8 @@ class PoleMap:
         if kriged is None:
             return None
         low, high = kriged.xy_m.min(axis=0), kriged.xy_m.max(axis=0)
-        step = float(np.max(high - low)) / cells
-        x, y = (np.arange(low[k], high[k] + 1e-9 + step / 2, step) for k in range(2))
+        counts = np.maximum(np.rint(cells * (high - low) / np.max(high - low)), 1).astype(int)
+        x, y = (np.linspace(low[k], high[k], counts[k] + 1) for k in range(2))
         xy = np.stack(np.meshgrid(x, y), axis=-1)  # (r, c, 2)
         value, std = kriged.predict(xy)
         heights = np.array([p.position_m[2] for p in self.with_ellipse])

@@ -41,6 +41,8 @@ class Progress:
         Estimated from the points so far, or the plan.
     repeats : int
         Attempts so far that were disturbed and repeated.
+    waiting_for : str
+        What keeps the scan waiting, for people; empty: nothing.
     """
 
     point: ScanPoint | None
@@ -51,6 +53,7 @@ class Progress:
     poles: Poles | None = None
     time_left_s: float = float("nan")
     repeats: int = 0
+    waiting_for: str = ""
 
 
 @dataclass(frozen=True)

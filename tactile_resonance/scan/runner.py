@@ -126,15 +126,17 @@ class ScanRunner:
         return point
 
     def _wait(self) -> None:
-        """With the tip free, while the scan is paused and until all is there that points need."""
+        """With the tip free, while the scan is paused or a node is held, and until all are at work."""
         deadline = time.monotonic() + NODE_BACK_WITHIN_S
         while not self._controls.cancelled.is_set():
             if self._controls.paused.is_set():
                 self._say(None, Phase.PAUSED)
                 deadline = time.monotonic() + NODE_BACK_WITHIN_S
             elif missing := self._hands.missing():
-                self._say(None, Phase.WAITING)
-                if time.monotonic() > deadline:
+                self._say(None, Phase.WAITING, waiting_for=missing)
+                if self._hands.held():
+                    deadline = time.monotonic() + NODE_BACK_WITHIN_S
+                elif time.monotonic() > deadline:
                     raise ScanEnded(f"{missing}, for {NODE_BACK_WITHIN_S:g} s")
             else:
                 return
@@ -267,7 +269,12 @@ class ScanRunner:
                 return
 
     def _say(
-        self, point: ScanPoint | None, phase: Phase, blocks: int = 0, poles: Poles | None = None
+        self,
+        point: ScanPoint | None,
+        phase: Phase,
+        blocks: int = 0,
+        poles: Poles | None = None,
+        waiting_for: str = "",
     ) -> None:
         points, finished = len(self._plan.points), len(self._run.content.latest)
         each_s = self._plan.longest_s / points
@@ -275,7 +282,9 @@ class ScanRunner:
             each_s = sum(self._durations_s) / len(self._durations_s)
         left_s = each_s * (points - finished)
         repeats = self._repeats()
-        self._tell(Progress(point, phase, finished, points, blocks, poles, left_s, repeats))
+        self._tell(
+            Progress(point, phase, finished, points, blocks, poles, left_s, repeats, waiting_for)
+        )
 
     def _repeats(self) -> int:
         """Of the points that are finished and of the one under way."""

@@ -64,12 +64,6 @@ class TouchedSurface:
         basis, _, _ = self._basis(xy_m)
         return np.sqrt(np.einsum("...i,ij,...j->...", basis, self.covariance_m2, basis))
 
-    def slope_covariance(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 2, 2) covariance of the slopes dz/dx, dz/dy."""
-        _, by_x, by_y = self._basis(xy_m)
-        slopes = np.stack([by_x, by_y], axis=-2)  # (..., 2, terms)
-        return np.asarray(slopes @ self.covariance_m2 @ np.swapaxes(slopes, -1, -2))
-
     def _basis(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Terms (..., k) and their derivatives by x and y [1/m]."""
         x, y = np.moveaxis((np.asarray(xy_m, float) - self.center_m) / self.scale_m, -1, 0)

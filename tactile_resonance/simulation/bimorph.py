@@ -230,25 +230,3 @@ def couple(sensor: SensorParameters, contact: Contact | None) -> CoupledBimorph:
     return CoupledBimorph(
         sensor_modes(sensor), electric.input_resistance_ohm, electric.feedthrough, contact
     )
-
-
-def refine_pole(
-    sensor: CoupledBimorph, start_rad_s: complex, *, tolerance: float = 1e-13
-) -> complex:
-    """Return the root of the characteristic function next to a start value (secant method).
-
-    Independent of the eigenvalues of the state matrix, hence a check of them.
-
-    Raises
-    ------
-    RuntimeError
-        If the search does not converge.
-    """
-    s0, s1 = start_rad_s, start_rad_s * (1 + 1e-6)
-    f0, f1 = (complex(sensor.characteristic(s)) for s in (s0, s1))
-    for _ in range(100):
-        if f1 == f0 or abs(s1 - s0) <= tolerance * abs(s1):
-            return s1
-        s0, s1, f0 = s1, s1 - f1 * (s1 - s0) / (f1 - f0), f1
-        f1 = complex(sensor.characteristic(s1))
-    raise RuntimeError(f"no pole found from {start_rad_s!r} in 100 steps")

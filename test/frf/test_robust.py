@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust method and smoothing over lines: noise and stochastic nonlinear distortion apart."""
+"""Robust method: noise and stochastic nonlinear distortion apart."""
 
 import numpy as np
 import pytest
 from scipy import signal
 
 from tactile_resonance.frf.estimate import estimate_frf
-from tactile_resonance.frf.fast import fast_frf
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.robust import TRANSIENT_SCORE, robust_frf, transient_score
-from tactile_resonance.frf.smoothing import smoothed_frf
 from tactile_resonance.frf.spectra import averaged_spectra
 
 SIGMAS = 4.0
@@ -34,17 +32,6 @@ def test_equals_the_reference_implementation(shared_data):
         ):
             assert np.max(np.abs(mine / data[f"robust_{theirs}"] - 1)) < 1e-6, theirs
     assert (result.frf.noise_dof, result.frf.total_dof) == (4 * 3, 3)
-
-
-def test_smoothing_equals_the_reference_implementation(shared_data):
-    with np.load(shared_data / "oracle" / "lpm_full.npz") as data:
-        plan = LocalPolynomialPlan(data["harm"], 20000, 8)
-        spectra = plan(data["u"].reshape(8, 20000), data["y"].reshape(8, 20000))
-        frf = smoothed_frf(spectra, sample_rate_hz=50e3)
-        assert np.max(np.abs(frf.g / data["G"] - 1)) < 1e-9
-        assert np.max(np.abs(frf.variance_noise / data["varG_n"] - 1)) < 1e-7
-        assert np.max(np.abs(frf.variance_total / data["varG_NL"] - 1)) < 1e-7
-        assert frf.total_dof == data["dof_NL"]
 
 
 def cubic_records(rng, multisine, runs, realisations, periods, noise):
@@ -150,21 +137,6 @@ def test_single_periods_tell_the_total_only(multisine):
     assert "cannot be told" in result.frf.message
 
 
-def test_smoothed_variances(multisine, deviation_from_one):
-    """One realisation: the scatter over neighbouring lines is noise and distortion together."""
-    rng = np.random.default_rng(6)
-    runs = 150
-    y, u = cubic_records(rng, multisine, runs, 1, 3, 0.02)
-    spectra = LocalPolynomialPlan(LINES, SAMPLES, 3)(u[:, 0], y[:, 0])
-    frf = smoothed_frf(spectra, sample_rate_hz=1.0)
-    error = np.abs(frf.g - frf.g.mean(axis=0)) ** 2 * runs / (runs - 1)
-    inner = slice(10, -10)
-    ratio, _ = deviation_from_one(frf.variance_total[:, inner], error[:, inner])
-    assert ratio == pytest.approx(1, abs=0.15)
-    assert np.all(frf.variance_noise < np.median(frf.variance_total))
-    assert np.mean(error) < 0.5 * np.mean(np.var(fast_frf(spectra, sample_rate_hz=1.0).g, axis=0))
-
-
 def test_refusals(multisine):
     rng = np.random.default_rng(7)
     u = multisine(LINES, SAMPLES, rng, records=(2, 2))  # (M, P, N)
@@ -175,9 +147,6 @@ def test_refusals(multisine):
         robust_frf(spectra, sample_rate_hz=1.0, reference=np.ones(3))
     with pytest.raises(ValueError, match="reference: zero"):
         robust_frf(spectra, sample_rate_hz=1.0, reference=np.zeros((2, 60)))
-    few = averaged_spectra(u[0], u[0], LINES[:8])
-    with pytest.raises(ValueError, match="order, dof: 2, 6 need 9 excited lines, there are 8"):
-        smoothed_frf(few, sample_rate_hz=1.0)
 
 
 def test_single_periods_from_rest_are_told_from_settled_ones():

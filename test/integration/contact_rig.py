@@ -22,7 +22,8 @@ from rclpy.action import ActionClient
 from rclpy.time import Time
 from robot_at_hand import RobotAtHand, own_host
 from scipy.spatial.transform import Rotation
-from std_srvs.srv import Trigger
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
 from tactile_resonance.action import MakeContact
 
 from tactile_resonance import msg
@@ -50,6 +51,8 @@ class ContactClient(NodeClient):
     def join(self):
         self._action = ActionClient(self._node, MakeContact, "make_contact")
         self._retract = self._node.create_client(Trigger, "retract")
+        self._stop = self._node.create_client(SetBool, "stop")
+        self._stops = self._node.create_publisher(Bool, "stop", 10)
         self._change = self._node.create_client(ChangeState, "contact_node/change_state")
         self._set = self._node.create_client(
             SetParametersAtomically, "contact_node/set_parameters_atomically"
@@ -136,6 +139,15 @@ class ContactClient(NodeClient):
             request.parameters.append(Parameter(name=name.replace("__", "."), value=given))
         result = self._answer(self._set, request, "parameters").result
         return "" if result.successful else result.reason
+
+    def stop(self, stopped):
+        """By the service."""
+        return self._answer(self._stop, SetBool.Request(data=stopped), "stop")
+
+    def publish_stop(self, stopped):
+        """By the topic."""
+        self.wait(self._stops.get_subscription_count, HANGS_S, "who listens to stop")
+        self._stops.publish(Bool(data=stopped))
 
     def retract(self, timeout_s=HANGS_S):
         return self._answer(self._retract, Trigger.Request(), "retract", timeout_s)

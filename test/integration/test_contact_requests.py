@@ -69,6 +69,34 @@ def test_a_held_contact_takes_no_goal_and_no_parameters_and_is_drawn_back_when_t
     assert client.set(contact__approach_speed_m_s=PARAMETERS.approach_speed_m_s) == ""
 
 
+@pytest.mark.parametrize("by_topic", [False, True])
+def test_a_stop_draws_the_tip_back_and_keeps_it_out_until_it_is_released(bench, client, by_topic):
+    ask = client.publish_stop if by_topic else client.stop
+    result = client.result(client.start())
+    assert result.reached, result.message
+    at_s = bench.order("truth")["time_s"]
+    ask(True)
+    client.wait(lambda: client.state.stopped and client.state.state == "idle", HANGS_S, "idle")
+    time_s, _, force_n = bench.history(at_s)
+    assert time_s[np.flatnonzero(force_n)[-1]] - at_s < 2.0
+    drawn_back(bench, client)
+    assert not client.send(goal_message()).accepted
+    # a retraction, and any time that passes, change nothing
+    assert client.retract().success
+    bench.let_pass(1.0)
+    client.idle()
+    assert client.state.stopped
+    at_s = bench.order("truth")["time_s"]
+    ask(False)
+    client.wait(lambda: not client.state.stopped, HANGS_S, "the release")
+    bench.let_pass(0.5)
+    _, tip_m, _ = bench.history(at_s)
+    assert np.ptp(tip_m[:, 2]) < 1e-4  # nothing moves by that
+    assert client.result(client.start()).reached
+    assert client.retract().success
+    drawn_back(bench, client)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("state", ["travel", "tare", "approach", "contact", "settle"])
 def test_a_goal_that_is_cancelled_in_any_state_is_drawn_back(bench, client, state):

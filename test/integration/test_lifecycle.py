@@ -94,16 +94,19 @@ def test_a_transition_that_the_state_does_not_have_is_refused(running):
     assert watcher.state("frf_node") == "active"
 
 
-def test_a_node_that_was_deactivated_or_cleaned_up_comes_back(running):
+def test_a_node_that_was_deactivated_is_held_until_start(running):
     _, watcher = running
-    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
-        request = ChangeState.Request(transition=Transition(id=transition))
-        # the manager may already be bringing it back when the second is asked for
-        watcher.call(ChangeState, "frf_node/change_state", request)
+    told = watcher.heard
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert watcher.call(ChangeState, "frf_node/change_state", request).success
+    watcher.wait(lambda: told["/manager_node"]["message"] == "held: frf_node")
+    assert told["/manager_node"]["last error"] == "frf_node was deactivated, and is held"
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CLEANUP))
+    assert watcher.call(ChangeState, "frf_node/change_state", request).success
+    watcher.wait(lambda: told["/manager_node"]["frf_node"] == "unconfigured")
+    assert watcher.state("frf_node") == "unconfigured"
+    assert watcher.call(Trigger, "manager_node/start", Trigger.Request()).success
     watcher.wait(lambda: watcher.all_are("active"))
-    watcher.wait(
-        lambda: watcher.heard["/manager_node"].get("last error", "").startswith("frf_node")
-    )
 
 
 def test_a_killed_node_that_is_started_again_is_brought_up(running):

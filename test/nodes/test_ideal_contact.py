@@ -19,7 +19,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from spinning import spin_until
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from tactile_resonance.action import MakeContact
 from tactile_resonance.msg import ContactState
 from tactile_resonance.srv import ForceOver
@@ -115,6 +115,7 @@ def bench(**parameters):
         node.create_subscription(WrenchStamped, "wrench", wrenches.append, STREAM)
         contact = ActionClient(node, MakeContact, "make_contact")
         retract = node.create_client(Trigger, "retract")
+        stop = node.create_client(SetBool, "stop")
         force = node.create_client(ForceOver, "force_over")
 
         def wait(holds):
@@ -138,8 +139,9 @@ def bench(**parameters):
             return answer(force.call_async(request))
 
         wait(lambda: contact.server_is_ready() and retract.service_is_ready())
-        wait(lambda: force.service_is_ready() and states and wrenches)
+        wait(lambda: force.service_is_ready() and stop.service_is_ready() and states and wrenches)
         made = SimpleNamespace(node=node, make=make, answer=answer, wait=wait, state=state)
+        made.stop = lambda on: answer(stop.call_async(SetBool.Request(data=on)))
         made.retract = lambda: answer(retract.call_async(Trigger.Request()))
         made.contact, made.force_over = contact, force_over
         made.states, made.poses, made.wrenches = states, poses, wrenches
@@ -230,6 +232,33 @@ def test_a_goal_in_another_frame_or_beside_another_contact_is_refused(ideal):
     _, future = ideal.make(goal_at())
     assert "goal: refused in state hold" in ideal.answer(future).result.message
     assert ideal.state() == "hold"
+
+
+@pytest.mark.parametrize("under_way", [False, True])
+def test_a_stop_draws_the_tip_back_and_keeps_it_out_until_it_is_released(
+    ideal, monkeypatch, under_way
+):
+    if under_way:
+        monkeypatch.setattr(ideal_contact, "CONTACT_S", WITHIN_S)
+    _, future = ideal.make(goal_at())
+    ideal.wait(lambda: ideal.state() == ("approach" if under_way else "hold"))
+    assert ideal.stop(True).success
+    assert ideal.answer(future).result.reached == (not under_way)
+    assert ideal.state() == "idle"
+    assert ideal.states[-1].stopped
+    assert ideal.node._stays.newest.force_n == 0.0
+    assert not ideal.answer(ideal.contact.send_goal_async(goal_at())).accepted
+    # it is remembered while the node is made anew
+    ideal.node.trigger_deactivate()
+    ideal.node.trigger_cleanup()
+    ideal.node.trigger_configure()
+    ideal.node.trigger_activate()
+    assert not ideal.answer(ideal.contact.send_goal_async(goal_at())).accepted
+    assert ideal.stop(False).success
+    assert ideal.state() == "idle"
+    assert not ideal.states[-1].stopped
+    monkeypatch.setattr(ideal_contact, "CONTACT_S", 0.05)
+    assert ideal.answer(ideal.make(goal_at())[1]).result.reached
 
 
 def test_no_goal_is_accepted_while_the_node_is_not_active(ideal):

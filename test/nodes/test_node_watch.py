@@ -94,7 +94,12 @@ def test_a_node_that_was_deactivated_is_said_to_be_so_and_not_to_hang(watch):
         watch.clock.now_s += BEAT_S
         watch.graph.beat(SOURCE, "inactive")
         assert watch.nodes.changed(watch.instances) == f"{SOURCE} is inactive, not active"
+        assert watch.nodes.held()
     assert watch.nodes.waited_for(watch.instances) == ""
+    watch.clock.now_s += SILENT_S + 0.1  # it was deactivated, and has ended since
+    assert not watch.nodes.held()
+    watch.graph.beat(SOURCE, "unconfigured")
+    assert not watch.nodes.held()
     watch.graph.beat(SOURCE)
     assert watch.nodes.changed(watch.instances) is None
 
@@ -142,7 +147,7 @@ def test_one_publisher_at_work_is_enough_and_all_others_are_named(watch):
 def test_after_an_error_only_what_is_told_from_then_on_is_believed(watch):
     with pytest.raises(NodeAway), watch.nodes.doubted_after(NodeAway):
         raise NodeAway("it is another")
-    assert watch.nodes.missing() == f"poles: {SOURCE} is in doubt, not active"
+    assert watch.nodes.missing() == f"poles: {SOURCE} has given no sign of life again yet"
     watch.graph.beat(SOURCE)
     assert watch.nodes.missing() is None
     with pytest.raises(ValueError, match="else"), watch.nodes.doubted_after(NodeAway):

@@ -3,6 +3,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -83,3 +85,39 @@ def test_an_interrupt_shuts_ros_down_each_time_it_is_initialised(node):
             while rclpy.ok() and time.monotonic() < deadline:
                 time.sleep(0.01)
             assert not rclpy.ok()
+
+
+def test_further_interrupts_do_not_end_a_node_half_way(tmp_path):
+    """Until the process has ended, they come again and again: people press Ctrl-C more than once."""
+    ended = tmp_path / "ended"
+    program = f"""
+import time
+from pathlib import Path
+from rclpy.node import Node
+from tactile_resonance.nodes.running import run_node
+
+class Slow(Node):
+    def __init__(self):
+        super().__init__("slow")
+        self.up = self.create_timer(0.01, self.say)
+
+    def say(self):
+        self.up.cancel()
+        print("up", flush=True)
+
+    def destroy_node(self):
+        time.sleep(0.5)
+        super().destroy_node()
+        Path({str(ended)!r}).touch()
+
+run_node(Slow)
+"""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(free_domain_id(os.environ))}
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout.readline() == "up\n"
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.01)
+    assert process.returncode == 0
+    assert ended.exists()

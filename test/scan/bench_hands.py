@@ -46,6 +46,9 @@ class Bench:
     def missing(self):
         return None
 
+    def held(self):
+        return False
+
     def touch(self, point, force_n, hold, check):
         check()
         assert not self.holding, "the tip was not drawn back before the next point"

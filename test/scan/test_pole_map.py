@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -131,6 +132,28 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
     assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
 
 
+def test_what_is_drawn_refers_to_the_size_seen_from_above():
+    row = PoleMap(tuple(p for p in grid_map().points if p.position_m[1] == 0))
+    assert row.size_m == pytest.approx(0.016)
+    in_air = replace(row.points[0], position_m=np.array([0.0, 0.0, 0.06]), measurement_id=99)
+    assert row.with_point(in_air).size_m == pytest.approx(0.016)
+    assert PoleMap(row.points[:2]).size_m == pytest.approx(4 * 0.004)
+    assert PoleMap(row.points[:1]).size_m == pytest.approx(4 * 0.005)
+
+
+def test_a_point_is_seen_from_another_frame():
+    normal = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    here = map_point(poles(), origin(0.01, 0.02, 0.03, normal=normal))
+    turn, place = Rotation.from_rotvec([0.1, 0.2, -1.5]), np.array([-0.5, 0.1, 0.2])
+    there = replace(
+        here, position_m=place + turn.apply(here.position_m), normal=turn.apply(here.normal)
+    )
+    again = there.seen_from(place, turn)
+    np.testing.assert_allclose(again.position_m, here.position_m, atol=1e-15)
+    np.testing.assert_allclose(again.normal, here.normal, atol=1e-15)
+    np.testing.assert_array_equal(again.estimate, here.estimate)
+
+
 def test_surface_follows_the_points_and_their_plane():
     found = grid_map(f0=lambda x, y: 250 + 300 * x - 100 * y)
     surface = found.surface(16)
@@ -141,6 +164,10 @@ def test_surface_follows_the_points_and_their_plane():
     error = surface.f0_hz - (250 + 300 * x - 100 * y)
     assert np.max(np.abs(error)) < 0.05
     assert surface.f0_std_hz.max() < 0.2
+    # it ends at the points whatever the ratio of its sides
+    other = PoleMap(tuple(p for p in found.points if p.position_m[1] < 0.006)).surface(7)
+    assert np.max(other.position_m[..., 0]) == pytest.approx(0.016)
+    assert np.max(other.position_m[..., 1]) == pytest.approx(0.004)
     assert grid_map(2).surface() is None  # too few
     line = PoleMap(tuple(p for p in found.points if p.position_m[1] == 0))
     assert line.surface() is None  # on one line

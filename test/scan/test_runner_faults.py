@@ -139,6 +139,20 @@ def test_a_scan_whose_node_stays_away_ends_with_its_name_and_can_go_on(tmp_path,
     assert run.next_point.index == 2
 
 
+def test_a_scan_waits_for_a_node_that_is_held_for_as_long_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "NODE_BACK_WITHIN_S", 0.2)
+    monkeypatch.setattr(runner, "POLL_S", 0.01)
+
+    class Held(Leaving):
+        def held(self):
+            return self.away > 1
+
+    summary, _, told = scan(tmp_path / "run", scene(), Held(away=50))
+    assert (summary.complete, summary.done) == (True, 4)
+    waiting = [progress.waiting_for for progress in told if progress.phase == "waiting"]
+    assert set(waiting) == {"frf: /frf_node is not active"}
+
+
 def test_a_scan_that_waits_for_a_node_can_be_cancelled(tmp_path):
     controls = Controls()
     bench = Leaving(away=10**6)

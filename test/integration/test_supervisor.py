@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A supervisor deactivates a node, or stops the tip, in the middle of a scan: the scan waits for it."""
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.qos import qos_profile_sensor_data
+from robot_at_hand import own_time
+from std_srvs.srv import SetBool
+from tactile_resonance.action import Scan
+from tactile_resonance.msg import ContactState
+
+from tactile_resonance.client import Ending
+from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+
+NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "scan_node")
+SCENE = """
+name: two points
+force_n: 0.01
+regions:
+  - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.0, 0.0], radius_m: 0.025}}
+positions:
+  list: [[0.0, 0.0], [0.004, 0.0]]
+blocks: {least: 3, most: 3}
+"""
+TIME = own_time(17)
+WITHIN_S = 60.0
+
+
+class Supervisor(ScanClient):
+    """Changes the life of nodes, and watches the contact."""
+
+    def join(self):
+        super().join()
+        self.contact = ""
+        self._node.create_subscription(
+            ContactState, "contact_state", self._on_contact, qos_profile_sensor_data
+        )
+
+    def _on_contact(self, message):
+        self.contact = message.state
+
+    def begin(self, **goal):
+        """Ask for a scan, and wait until it measures."""
+        self.heard = []
+        self.outcome = self.tactile.scan(**goal, on_feedback=self.heard.append)
+        measures = Scan.Feedback.PHASE_MEASURE
+        self.wait(
+            lambda: self.heard and self.heard[-1].phase == measures, WITHIN_S, "a measurement"
+        )
+
+    def see_it_wait(self, reason):
+        """It tells the reason, and waits on with the tip free."""
+        self.wait(lambda: self.heard[-1].waiting_for == reason, WITHIN_S, "the scan to wait")
+        self.wait(lambda: self.contact == "idle", WITHIN_S, "the tip to leave")
+        # for many periods of the manager nothing changes
+        said = len(self.heard)
+        self.wait(lambda: len(self.heard) > said + 10, WITHIN_S, "the scan to wait on")
+        assert {feedback.waiting_for for feedback in self.heard[said:]} == {reason}
+        assert self.contact == "idle"
+
+    def see_it_complete(self):
+        """It goes on, and repeats the point."""
+        self.wait(self.outcome.done, 180.0, "the scan")
+        result = self.outcome.result()
+        assert result.ending is Ending.COMPLETE, result.message
+        assert (result.done, result.failed, result.repeats) == (2, 0, 1)
+
+    def call(self, kind, name, request):
+        client = self._node.create_client(kind, name)
+        self.wait(client.service_is_ready, WITHIN_S, name)
+        future = client.call_async(request)
+        self.wait(future.done, WITHIN_S, name)
+        return future.result()
+
+    def change(self, node, transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert self.call(ChangeState, f"{node}/change_state", request).success
+
+    def state(self, node):
+        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+
+
+@pytest.fixture
+def supervisor(domain, tmp_path):
+    """A scan in its first measurement, and who supervises it."""
+    scene = tmp_path / "two.yaml"
+    scene.write_text(SCENE)
+    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
+    parameters = {
+        "fake_hardware_node": {"scene": scene, "serve_contact": True, "time_server": TIME},
+        "excitation_node": {"record_folder": tmp_path / "records", "time_server": TIME},
+        "scan_node": {"table_in_base": table, "time_server": TIME},
+    }
+    with NodeProcesses(tmp_path / "log") as nodes, Supervisor(nodes.check) as supervisor:
+        nodes.bring_up(NODES, parameters)
+        supervisor.wait_until_up(90.0)
+        supervisor.begin(scene=scene, run_directory=tmp_path / "run")
+        yield supervisor
+
+
+def test_a_scan_waits_for_a_node_that_a_supervisor_holds(supervisor, tmp_path):
+    def held():
+        return supervisor.states.get("manager_node", "").startswith("held: poles_node")
+
+    supervisor.change("poles_node", Transition.TRANSITION_DEACTIVATE)
+    supervisor.see_it_wait("poles: /poles_node is inactive, not active")
+    supervisor.wait(held, WITHIN_S, "the manager to report it")
+    assert supervisor.state("poles_node") == "inactive"
+    supervisor.change("poles_node", Transition.TRANSITION_ACTIVATE)
+    supervisor.see_it_complete()
+    supervisor.wait(lambda: not held(), WITHIN_S, "the manager to report it")
+    assert [r.disturbances for r in read_run(tmp_path / "run").results] == ["node away 1", ""]
+
+
+def test_a_scan_waits_while_the_tip_is_stopped(supervisor):
+    assert supervisor.call(SetBool, "stop", SetBool.Request(data=True)).success
+    supervisor.see_it_wait("contact: the tip is stopped (service or topic stop)")
+    assert supervisor.call(SetBool, "stop", SetBool.Request(data=False)).success
+    supervisor.see_it_complete()
