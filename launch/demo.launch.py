@@ -39,19 +39,16 @@ def generate_launch_description():
             description="Of the session, as YAML: {temperature_c: 21.5, tip_wetness: wet, adhesion: none}.",
         ),
     ]
-    # whatever else bring-up can be told goes through to it: namespace, robot_ip, rviz, record ...
-    bringup = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "bringup.launch.py"])),
-        launch_arguments={
-            "use_mock_hardware": "true",
-            "scene": LaunchConfiguration("scene"),
-        }.items(),
+    # the scene, and whatever else the mock can be told, go through to it: namespace, robot_ip, rviz ...
+    mock = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "mock.launch.py"]))
     )
     goal = Node(
         package=PACKAGE,
         executable="scan_goal",
         name="scan_goal",
-        namespace=LaunchConfiguration("namespace"),  # that of bring-up
+        namespace=LaunchConfiguration("namespace"),  # that of bring-up, as the range of discovery
+        additional_env={"ROS_AUTOMATIC_DISCOVERY_RANGE": LaunchConfiguration("discovery")},
         parameters=[
             {
                 name: ParameterValue(LaunchConfiguration(name), value_type=str)
@@ -61,4 +58,4 @@ def generate_launch_description():
         output="screen",
     )
     end = OnProcessExit(target_action=goal, on_exit=[Shutdown(reason="the scan has ended")])
-    return LaunchDescription([*arguments, bringup, goal, RegisterEventHandler(end)])
+    return LaunchDescription([*arguments, mock, goal, RegisterEventHandler(end)])

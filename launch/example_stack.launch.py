@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a surgery stack takes in two sensors: bring-up twice, in two namespaces, a topic remapped.
+"""How a surgery stack takes in two sensors: mock.launch.py twice, in two namespaces, a topic remapped.
 
-Copy it into the stack. Here both sensors are simulated, each with a robot of its own in a time of its own.
+Copy it into the stack. Here both sensors are simulated, each with a robot of its own in a time of its own;
+ur.launch.py is included in the same way.
 """
 
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
@@ -19,7 +20,7 @@ SENSORS = {"left": "127.0.1.2", "right": "127.0.1.3"}
 def generate_launch_description():
     """Arguments of the stack, and each sensor in a group of its own: what is set there stays there.
 
-    Whatever else bring-up can be told holds for both: use_mock_hardware, scene, rviz ...
+    Whatever else mock.launch.py can be told holds for both: scene, discovery, rviz ...
     """
     arguments = [
         DeclareLaunchArgument(
@@ -31,13 +32,13 @@ def generate_launch_description():
 
 
 def _sensor(name):
-    bringup = PathJoinSubstitution([FindPackageShare(PACKAGE), "launch", "bringup.launch.py"])
+    mock = PathJoinSubstitution([FindPackageShare(PACKAGE), "launch", "mock.launch.py"])
     return GroupAction(
         [
             # the stack's name for what this sensor finds; all other topics stay under the namespace
             SetRemap(src="poles", dst=f"/stack/tissue/{name}/poles"),
             IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(bringup),
+                PythonLaunchDescriptionSource(mock),
                 launch_arguments={
                     "namespace": name,
                     "robot_ip": LaunchConfiguration(f"{name}_robot_ip"),

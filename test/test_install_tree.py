@@ -31,6 +31,8 @@ def test_index_executables_config_and_launch(prefix):
         "config/nodes.yaml",
         "config/tissues.yaml",
         "launch/bringup.launch.py",
+        "launch/mock.launch.py",
+        "launch/ur.launch.py",
     ):
         assert (share / name).is_file(), name
     for kind in ("msg/FRF.msg", "msg/Poles.msg", "srv/Play.srv", "action/Measure.action"):

@@ -29,7 +29,7 @@ from tactile_resonance import msg
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.processes import free_domain_id
 
-BRINGUP = Path(__file__).resolve().parents[2] / "launch" / "bringup.launch.py"
+MOCK = Path(__file__).resolve().parents[2] / "launch" / "mock.launch.py"
 DOMAIN_ID = free_domain_id({})
 NAMESPACE = "left"
 HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
@@ -39,8 +39,8 @@ HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.7"
 def generate_test_description():
     os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_ID)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    bringup = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(BRINGUP)),
+    mock = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(str(MOCK)),
         launch_arguments={"namespace": NAMESPACE, "robot_ip": HOST}.items(),
     )
     return LaunchDescription(
@@ -48,7 +48,7 @@ def generate_test_description():
             SetEnvironmentVariable("ROS_DOMAIN_ID", str(DOMAIN_ID)),
             SetEnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
             SetEnvironmentVariable("ROS_HOME", tempfile.mkdtemp()),  # records go there
-            bringup,
+            mock,
             launch_testing.actions.ReadyToTest(),
         ]
     )

@@ -27,7 +27,7 @@ from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import read_run
 
-BRINGUP = Path(__file__).resolve().parents[2] / "launch" / "bringup.launch.py"
+MOCK = Path(__file__).resolve().parents[2] / "launch" / "mock.launch.py"
 DOMAIN_ID = free_domain_id({})
 HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.6"
 FOLDER = Path(tempfile.mkdtemp())
@@ -48,16 +48,16 @@ def generate_test_description():
     os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_ID)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     (FOLDER / "scene.yaml").write_text(SCENE)
-    arguments = {"scene": str(FOLDER / "scene.yaml"), "robot_ip": HOST, "patient": "true"}
-    bringup = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(BRINGUP)), launch_arguments=arguments.items()
+    arguments = {"scene": str(FOLDER / "scene.yaml"), "robot_ip": HOST}
+    mock = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(str(MOCK)), launch_arguments=arguments.items()
     )
     return LaunchDescription(
         [
             SetEnvironmentVariable("ROS_DOMAIN_ID", str(DOMAIN_ID)),
             SetEnvironmentVariable("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
             SetEnvironmentVariable("ROS_HOME", str(FOLDER)),  # records go there
-            bringup,
+            mock,
             launch_testing.actions.ReadyToTest(),
         ]
     )

@@ -2,6 +2,7 @@
 """The configuration file and the declarations agree; what is out of range is refused with a reason."""
 
 import os
+import re
 
 import pytest
 import yaml
@@ -57,7 +58,9 @@ def ros():
 
 
 def test_file_holds_every_declared_parameter_at_its_default():
-    content = yaml.safe_load(share_path("config/nodes.yaml").read_text())
+    text = share_path("config/nodes.yaml").read_text()
+    # those that the launch files decide stand there as comments
+    content = yaml.safe_load(re.sub(r"^    # (\w+: )", r"    \1", text, flags=re.MULTILINE))
     for node, parameters in DECLARED.items():
         assert content[f"/**/{node}"]["ros__parameters"] == {p.name: p.default for p in parameters}
 

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which nodes the launch files start, and what they tell each beyond the user's parameter file.
+
+An argument that is given wins over the file, the file wins over the defaults that the simulated bench needs.
+Everything else is left to the nodes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import require
+from tactile_resonance.simulation.plant_defaults import HOST, STALLS_S, TABLE_IN_BASE
+
+NODES = (
+    "fake_hardware_node",
+    "excitation_node",
+    "frf_node",
+    "poles_node",
+    "contact_node",
+    "pole_map_node",
+    "scan_node",
+    "manager_node",
+)
+"""All nodes, in the order in which the manager, the last, brings them up."""
+
+ARGUMENTS = {
+    "robot_ip": ("robot_host", "contact_node"),
+    "robot_config": ("robot_config", "contact_node"),
+    "force_config": ("force_config", "contact_node"),
+    "base_frame": ("base_frame", "contact_node", "scan_node", "fake_hardware_node"),
+    "run_folder": ("run_folder", "scan_node"),
+    "scene": ("scene", "fake_hardware_node"),
+}
+"""Arguments that are parameters as they stand: the parameter's name, and the nodes that have it."""
+
+IN_BENCH_TIME = ("fake_hardware_node", "excitation_node", "contact_node", "scan_node")
+SIMULATED_CELL = "can_simulated.yaml"
+SCENE = "config/scenes/inclusion_scan.yaml"
+
+Parameters = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Bringup:
+    """What is started.
+
+    Attributes
+    ----------
+    nodes : dict of str to dict
+        The nodes to start, and the parameters that each is passed after the file.
+    simulated_time : bool
+        Whether they live in the time of the simulated bench.
+    table : Pose or None
+        Where the simulated table stands in the robot's base; None where there is none.
+    base_frame : str
+    """
+
+    nodes: dict[str, Parameters]
+    simulated_time: bool
+    table: Pose | None
+    base_frame: str
+
+
+def read_parameter_file(path: str | Path) -> dict[str, Parameters]:
+    """Parameters of each section of a ROS 2 parameter file; what was begun twice is one section, as for ROS.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or is no parameter file.
+    """
+    sections: dict[str, Parameters] = {}
+    try:
+        loader = yaml.SafeLoader(Path(path).read_text(encoding="utf-8"))
+        for name, parameters in _sections(loader, loader.get_single_node(), ""):
+            sections.setdefault(name, {}).update(parameters)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"params_file: {path}: {error}") from error
+    return sections
+
+
+def _sections(loader: yaml.SafeLoader, node: Any, name: str) -> Iterator[tuple[str, Parameters]]:
+    mapping = isinstance(node, yaml.MappingNode)
+    require(mapping, name or "file", getattr(node, "value", None), "NODE: {ros__parameters: {...}}")
+    for key, value in node.value:
+        if key.value == "ros__parameters":
+            yield name, loader.construct_mapping(value, deep=True)
+        else:
+            joined = f"{name}/{key.value}" if name else key.value
+            yield from _sections(loader, value, joined)
+
+
+def stated_for(name: str, sections: Mapping[str, Parameters]) -> Parameters:
+    """What a parameter file says to the node of a full name.
+
+    As rclpy has it: each section whose pattern matches counts, the later over the earlier, whatever
+    the patterns are.
+    """
+    stated: Parameters = {}
+    for pattern, parameters in sections.items():
+        absolute = pattern if pattern.startswith("/") else f"/{pattern}"
+        expression = absolute.replace("/*", r"(/\w+)")  # so `/**` is (/\w+)*
+        if re.fullmatch(expression, name):
+            stated.update(parameters)
+    return stated
+
+
+class _Decisions:
+    """What each node is told beyond the file."""
+
+    def __init__(
+        self, arguments: Mapping[str, str], sections: Mapping[str, Parameters], namespace: str
+    ) -> None:
+        self.given = {name: value for name, value in arguments.items() if value != ""}
+        self._sections = sections
+        self._names = {node: re.sub("/+", "/", f"/{namespace}/{node}") for node in NODES}
+        self.stated = {node: stated_for(name, sections) for node, name in self._names.items()}
+        self.told: dict[str, Parameters] = {node: {} for node in NODES}
+
+    def tell(self, node: str, by: str, **parameters: object) -> None:
+        """Tell a node what one of the arguments `by` says; where none is given, what the file does not say."""
+        given = any(argument in self.given for argument in by.split())
+        for name, value in parameters.items():
+            if given or name not in {**self.stated[node], **self.told[node]}:
+                self.told[node][name] = value
+
+    def value(self, node: str, name: str) -> Any:
+        """What a node is told; None where neither arguments nor file nor a default here say it."""
+        return {**self.stated[node], **self.told[node]}.get(name)
+
+    def check(self, node: str) -> None:
+        """``ValueError`` where a later section of the file would win over what a node is told."""
+        told, name = self.told[node], self._names[node]
+        # ROS puts what it is told into the section of that name, if there is one, and keeps its place
+        merged = {**self._sections, name: {**self._sections.get(name, {}), **told}}
+        heard = stated_for(name, merged)
+        for parameter, value in told.items():
+            by_file, place = heard[parameter], f"{value!r}: put the section {name} last"
+            require(by_file == value, f"params_file: {parameter} of {node}", by_file, place)
+
+
+def plan_bringup(
+    arguments: Mapping[str, str],
+    sections: Mapping[str, Parameters],
+    namespace: str = "",
+    priority: bool = False,
+) -> Bringup:
+    """Decide what is started.
+
+    Parameters
+    ----------
+    arguments : mapping of str to str
+        Of the launch file; one that is empty is not given.
+    sections : mapping
+        Of the user's parameter file.
+    namespace : str
+        Of the nodes, absolute.
+    priority : bool
+        Whether a simulated robot may run with real-time priority.
+
+    Raises
+    ------
+    ValueError
+        If arguments and file contradict each other, or a robot lacks what has no safe default.
+    """
+    plan = _Decisions(arguments, sections, namespace)
+    given, tell, value = plan.given, plan.tell, plan.value
+    hardware = given.get("use_mock_hardware")
+    accepted = "true, as mock.launch.py says, or false, as ur.launch.py"
+    require(hardware in ("true", "false"), "use_mock_hardware", hardware, accepted)
+    mock = hardware == "true"
+    robot = given.get("robot") or _robot(plan.stated, mock)
+    require(mock or robot != "ideal", "robot", robot, "true or false without the simulated bench")
+    for argument, (name, *its_nodes) in ARGUMENTS.items():
+        for node in its_nodes if argument in given else ():
+            tell(node, argument, **{name: given[argument]})
+    if "table_in_base" in given:
+        told = _table(given["table_in_base"])
+        tell("scan_node", "table_in_base", table_in_base=told)
+    tell("scan_node", "robot", contact="none" if robot == "false" else "robot")
+    # without robot and bench nobody measures the force
+    source = "force_over" if mock or robot == "true" else "tcp_pose"
+    tell("excitation_node", "robot", contact_source=source)
+    left_out = {
+        *(() if mock else ("fake_hardware_node",)),
+        *(() if robot == "true" else ("contact_node",)),
+    }
+    nodes = [node for node in NODES if node not in left_out]
+    tell("manager_node", "", nodes=nodes[:-1])
+    simulated_time, table = False, None
+    if mock:
+        simulated_time = _tell_mock(plan, robot, priority)
+        if robot != "false":
+            table = _table(value("scan_node", "table_in_base"))
+    elif robot == "true":
+        for node, name in (("contact_node", "force_config"), ("scan_node", "table_in_base")):
+            accepted = "one that argument or params_file states: a robot must not move by a default"
+            require(value(node, name) is not None, name, None, accepted)
+    for node in nodes:
+        plan.check(node)
+    return Bringup(
+        nodes={node: plan.told[node] for node in nodes},
+        simulated_time=simulated_time,
+        table=None if table is None else Pose.from_vector(np.array(table)),
+        base_frame=value("scan_node", "base_frame") or "base",
+    )
+
+
+def _tell_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
+    """Tell the nodes what the simulated bench needs; return whether they live in its time."""
+    given, tell, value = plan.given, plan.tell, plan.value
+    host = value("contact_node", "robot_host") or value("fake_hardware_node", "robot_host") or HOST
+    accepted = "127.x.y.z, of a simulated robot; ur.launch.py is for real ones"
+    require(str(host).startswith("127."), "robot_host", host, accepted)
+    tell("contact_node", "", robot_host=host)
+    tell(
+        "fake_hardware_node",
+        "robot robot_ip",
+        robot_host=host if robot == "true" else "",
+        serve_contact=robot == "ideal",
+    )
+    tell("fake_hardware_node", "", scene=SCENE)
+    table = value("scan_node", "table_in_base") or value("fake_hardware_node", "table_in_base")
+    for node in ("scan_node", "fake_hardware_node"):
+        tell(node, "table_in_base", table_in_base=_table(table or TABLE_IN_BASE))
+    if value("contact_node", "force_config") in (None, SIMULATED_CELL):
+        tell("contact_node", "", force_host=host)
+    clock = plan.stated["fake_hardware_node"].get("use_sim_time", True)
+    simulated_time = given.get("real_time", "false" if clock else "true") == "false"
+    for node in NODES:
+        tell(node, "real_time", use_sim_time=simulated_time)
+    for node in IN_BENCH_TIME:
+        tell(node, "real_time", time_server=f"{host}:{TIME_PORT}" if simulated_time else "")
+    if not (simulated_time or priority):
+        tell("contact_node", "", simulated_stalls_s=STALLS_S)
+    return simulated_time
+
+
+def _robot(stated: Mapping[str, Parameters], mock: bool) -> str:
+    """What brings the tip to the tissue, by the file alone."""
+    if stated["scan_node"].get("contact") == "none":
+        return "false"
+    return "ideal" if mock and stated["fake_hardware_node"].get("serve_contact") else "true"
+
+
+def _table(value: object) -> list[float]:
+    """Six finite numbers."""
+    try:
+        table = np.array(yaml.safe_load(value) if isinstance(value, str) else value, dtype=float)
+    except (TypeError, ValueError, yaml.YAMLError):
+        table = np.empty(0)
+    good = table.shape == (6,) and bool(np.all(np.isfinite(table)))
+    require(good, "table_in_base", value, "[x, y, z, rx, ry, rz] in m and rad")
+    return [float(number) for number in table]

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes that the launch files start are told, by the real launch and the real rclpy."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("launch_ros", reason="launch_ros is not here: it comes with a full ROS 2")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+import rclpy
+from launch.actions import IncludeLaunchDescription, PushLaunchConfigurations
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_ros.actions import Node, PushRosNamespace
+
+from launch import LaunchContext
+from tactile_resonance.processes import free_domain_id
+
+LAUNCH = Path(__file__).resolve().parents[2] / "launch"
+DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+REAL = {"force_config": "can_rft40.yaml", "table_in_base": "[0.4, 0, 0.1, 0, 0, 1]"}
+TABLE = [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]
+
+
+@dataclass
+class Started:
+    """A process as launch would start it."""
+
+    command: list[str]
+    discovery: str | None
+
+    def hears(self):
+        """The parameters of a node, as rclpy resolves them."""
+        arguments = self.command[self.command.index("--ros-args") :]
+        context = rclpy.Context()
+        rclpy.init(context=context, args=arguments, domain_id=free_domain_id({}))
+        node = rclpy.create_node(
+            "unnamed", context=context, automatically_declare_parameters_from_overrides=True
+        )
+        try:
+            return {key: value.value for key, value in node.get_parameters_by_prefix("").items()}
+        finally:
+            node.destroy_node()
+            rclpy.shutdown(context=context)
+
+
+def start(file, *before, **given):
+    """The processes that a launch file starts, by the full names of the nodes."""
+    context = LaunchContext()
+    source = PythonLaunchDescriptionSource(str(LAUNCH / file))
+    started = {}
+
+    def visit(entity):
+        if isinstance(entity, Node):
+            entity._perform_substitutions(context)
+            name = entity.node_name.rpartition("/")[2]
+            names = {"name": f"__node:={name}", "ns": f"__ns:={entity.expanded_node_namespace}"}
+            context.extend_locals({"ros_specific_arguments": names})
+            entity.prepare(context)
+            process = entity.process_description
+            discovery = (process.final_env or os.environ).get(DISCOVERY)
+            started[entity.node_name] = Started(process.final_cmd, discovery)
+            return
+        for inner in entity.visit(context) or ():
+            visit(inner)
+
+    for entity in (*before, IncludeLaunchDescription(source, launch_arguments=given.items())):
+        visit(entity)
+    return started
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch, tmp_path):
+    monkeypatch.setenv(DISCOVERY, "LOCALHOST")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # launch leaves a file for each node
+
+
+@pytest.mark.parametrize(
+    ("file", "argument", "given", "parameter", "heard", "by_file", "node"),
+    [
+        (
+            "mock",
+            "robot_ip",
+            "127.0.91.1",
+            "robot_host",
+            "127.0.91.1",
+            "127.0.91.2",
+            "contact_node",
+        ),
+        (
+            "mock",
+            "robot_ip",
+            "127.0.91.1",
+            "robot_host",
+            "127.0.91.1",
+            "127.0.91.2",
+            "fake_hardware_node",
+        ),
+        ("mock", "scene", "a.yaml", "scene", "a.yaml", "b.yaml", "fake_hardware_node"),
+        ("mock", "table_in_base", str(TABLE), "table_in_base", TABLE, [0.5] * 6, "scan_node"),
+        ("mock", "robot", "ideal", "serve_contact", True, False, "fake_hardware_node"),
+        ("mock", "robot", "false", "contact", "none", "robot", "scan_node"),
+        ("mock", "real_time", "true", "use_sim_time", False, True, "frf_node"),
+        ("ur", "robot_ip", "192.0.2.1", "robot_host", "192.0.2.1", "192.0.2.2", "contact_node"),
+        ("ur", "robot_config", "a.yaml", "robot_config", "a.yaml", "b.yaml", "contact_node"),
+        ("ur", "force_config", "a.yaml", "force_config", "a.yaml", "b.yaml", "contact_node"),
+        ("ur", "base_frame", "arm", "base_frame", "arm", "other", "scan_node"),
+        ("ur", "table_in_base", str(TABLE), "table_in_base", TABLE, [0.5] * 6, "scan_node"),
+        ("ur", "run_folder", "a", "run_folder", "a", "b", "scan_node"),
+        ("ur", "robot", "false", "contact", "none", "robot", "scan_node"),
+    ],
+)
+@pytest.mark.parametrize("section", ["/**", "/left/{node}", "left/{node}", "/**/{node}"])
+def test_an_argument_wins_over_the_file_and_one_that_is_not_given_leaves_it_alone(
+    tmp_path, file, argument, given, parameter, heard, by_file, node, section
+):
+    path = tmp_path / "file.yaml"
+    path.write_text(
+        f"{section.format(node=node)}: {{ros__parameters: {{{parameter}: {by_file}}}}}\n"
+    )
+    options = {"namespace": "left", "params_file": str(path)}
+    if file == "ur":
+        options |= {key: value for key, value in REAL.items() if key != argument}
+    name = f"/left/{node}"
+    with_argument = start(f"{file}.launch.py", **options, **{argument: given})
+    assert with_argument[name].hears()[parameter] == heard
+    without = start(f"{file}.launch.py", **options)
+    assert without[name].hears()[parameter] == by_file
+
+
+def test_the_file_holds_in_the_namespace_of_the_stack(tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_text(
+        "/stack/left/scan_node: {ros__parameters: {table_in_base: [1.0, 2.0, 3.0, 4.0, 5.0, 6.5]}}"
+    )
+    stack = PushLaunchConfigurations(), PushRosNamespace("stack")
+    nodes = start("mock.launch.py", *stack, namespace="left", params_file=str(path))
+    assert nodes["/stack/left/scan_node"].hears()["table_in_base"] == [1, 2, 3, 4, 5, 6.5]
+
+
+def test_the_mock_by_default():
+    nodes = start("mock.launch.py")
+    assert list(nodes)[:8] == [
+        "/fake_hardware_node",
+        "/excitation_node",
+        "/frf_node",
+        "/poles_node",
+        "/contact_node",
+        "/pole_map_node",
+        "/scan_node",
+        "/manager_node",
+    ]
+    assert nodes["/manager_node"].hears()["nodes"] == [name[1:] for name in list(nodes)[:7]]
+    scan, contact = nodes["/scan_node"].hears(), nodes["/contact_node"].hears()
+    assert scan["time_server"] == contact["time_server"] == "127.0.1.1:30021"
+    assert scan["use_sim_time"]
+    assert contact["force_host"] == contact["robot_host"] == "127.0.1.1"
+
+
+def test_a_robot_must_be_told_its_cell_and_its_table():
+    for name in REAL:
+        with pytest.raises(ValueError, match=f"{name}: got None"):
+            start("ur.launch.py", **(REAL | {name: ""}))
+
+
+@pytest.mark.parametrize("file", ["mock", "ur", "demo", "example_stack"])
+@pytest.mark.parametrize(
+    ("by_user", "given", "discovery"),
+    [
+        (None, {}, "LOCALHOST"),
+        ("SUBNET", {}, "SUBNET"),
+        (None, {"discovery": "SUBNET"}, "SUBNET"),
+        ("SUBNET", {"discovery": "OFF"}, "OFF"),
+    ],
+)
+def test_nodes_are_found_on_this_machine_only_unless_asked(
+    monkeypatch, file, by_user, given, discovery
+):
+    monkeypatch.delenv(DISCOVERY)
+    if by_user:
+        monkeypatch.setenv(DISCOVERY, by_user)
+    nodes = start(f"{file}.launch.py", **(REAL if file == "ur" else {}), **given)
+    assert len(nodes) >= 7
+    assert {node.discovery for node in nodes.values()} == {discovery}
+    assert os.environ.get(DISCOVERY) == by_user  # what else a stack starts keeps its own
+
+
+@pytest.fixture
+def tf2_ros(tmp_path, monkeypatch):
+    (tmp_path / "share/ament_index/resource_index/packages").mkdir(parents=True)
+    (tmp_path / "share/ament_index/resource_index/packages/tf2_ros").touch()
+    executable = tmp_path / "lib/tf2_ros/static_transform_publisher"
+    executable.parent.mkdir(parents=True)
+    executable.touch(0o755)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ['AMENT_PREFIX_PATH']}")
+
+
+def test_the_transform_is_that_of_the_table(tf2_ros):
+    from scipy.spatial.transform import Rotation
+
+    given = {
+        "table_in_base": "[1, 2, 3, 0.3, -0.2, 0.5]",
+        "base_frame": "arm",
+        "table_frame": "bed",
+    }
+    nodes = start("mock.launch.py", **given)
+    command = nodes["/table_in_base"].command[1:19]
+    values = dict(zip(command[::2], command[1::2], strict=True))
+    turn = Rotation.from_quat([float(values[f"--q{axis}"]) for axis in "xyzw"])
+    assert turn.as_rotvec() == pytest.approx([0.3, -0.2, 0.5])
+    assert [float(values[f"--{axis}"]) for axis in "xyz"] == [1, 2, 3]
+    assert (values["--frame-id"], values["--child-frame-id"]) == ("arm", "bed")
+    assert "/table_in_base" not in start("mock.launch.py", static_transforms="false")
+    assert "/table_in_base" not in start("mock.launch.py", robot="false")
+    assert "/table_in_base" not in start("ur.launch.py", **REAL)
+
+
+def test_the_demo_scans_what_lies_on_the_table():
+    nodes = start("demo.launch.py", namespace="left", scene="/a/scene.yaml")
+    assert nodes["/left/scan_goal"].hears()["scene"] == "/a/scene.yaml"
+    assert nodes["/left/fake_hardware_node"].hears()["scene"] == "/a/scene.yaml"
+
+
+def test_the_stack_has_two_robots():
+    nodes = start("example_stack.launch.py", right_robot_ip="127.0.91.9")
+    assert nodes["/left/contact_node"].hears()["robot_host"] == "127.0.1.2"
+    assert nodes["/right/contact_node"].hears()["robot_host"] == "127.0.91.9"
+    assert "poles:=/stack/tissue/right/poles" in nodes["/right/poles_node"].command

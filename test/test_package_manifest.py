@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""package.xml names all that is imported and launched, or says that it comes by pip."""
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+KEYS = {name: f"python3-{name}" for name in ("matplotlib", "numpy", "scipy", "tqdm", "yaml")}
+BY_PIP = {"can": "python-can", "numba": "numba", "rosbags": "rosbags", "nidaqmx": "nidaqmx"}
+BY_PIP |= dict.fromkeys(("dashboard_client", "rtde_control"), "ur-rtde")
+TYPES_ONLY = {"typing_extensions"}
+
+
+def imported(folder):
+    """Top-level names of all imports in a folder that are neither the standard library's nor our own."""
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                names = [node.module] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                top = name.partition(".")[0]
+                if top not in {*sys.stdlib_module_names, "tactile_resonance", *TYPES_ONLY}:
+                    yield top
+
+
+@pytest.fixture(scope="module")
+def manifest():
+    return (ROOT / "package.xml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("folder", ["tactile_resonance", "launch"])
+def test_what_is_imported_is_named(manifest, folder):
+    (by_pip,) = re.findall(r"<!-- By pip.*?-->", manifest, re.DOTALL)
+    named = set(re.findall(r"<(?:exec_)?depend>(.*?)<", manifest))
+    for name in sorted(set(imported(folder))):
+        if name in BY_PIP:
+            assert BY_PIP[name] in by_pip, name
+        else:
+            assert KEYS.get(name, name) in named, name
+
+
+def test_what_is_launched_is_named(manifest):
+    launched = {"tf2_ros", "rviz2", "ros2bag", "rosbag2_storage_mcap", "ros2launch"}
+    for path in (ROOT / "launch").glob("*.launch.py"):
+        launched |= set(re.findall(r'\bpackage="(\w+)"', path.read_text(encoding="utf-8")))
+    assert launched <= set(re.findall(r"<exec_depend>(.*?)<", manifest))
