@@ -206,6 +206,11 @@ def plan_bringup(
         for node, name in (("contact_node", "force_config"), ("scan_node", "table_in_base")):
             accepted = "one that argument or params_file states: a robot must not move by a default"
             require(value(node, name) is not None, name, None, accepted)
+    if (stands := value("scan_node", "table_in_base")) is not None:
+        base_frame = value("scan_node", "base_frame") or "base"
+        tell("pole_map_node", "base_frame", base_frame=base_frame)
+        tell("pole_map_node", "table_in_base", table_in_base=_table(stands))
+        tell("pole_map_node", "", frame_id=given.get("table_frame", "table"))
     for node in nodes:
         plan.check(node)
     return Bringup(

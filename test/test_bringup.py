@@ -303,3 +303,16 @@ def test_what_is_no_parameter_file_is_refused_by_name(tmp_path, text):
         read_parameter_file(path)
     with pytest.raises(ValueError, match="params_file: absent.yaml: "):
         read_parameter_file("absent.yaml")
+
+
+@pytest.mark.parametrize("own", [MOCK, REAL])
+def test_the_map_lies_on_the_table_where_the_scan_has_it(own):
+    given = own | {"table_frame": "left_table", "base_frame": "left_base"}
+    _, nodes = heard(given, namespace="/left")
+    told = nodes["pole_map_node"]
+    assert (told["frame_id"], told["base_frame"]) == ("left_table", "left_base")
+    assert told["table_in_base"] == nodes["scan_node"]["table_in_base"]
+    _, nodes = heard(given, {"/left/pole_map_node": {"frame_id": "bed"}}, "/left")
+    assert nodes["pole_map_node"]["frame_id"] == "bed"
+    _, nodes = heard({"use_mock_hardware": "false", "robot": "false"})
+    assert "frame_id" not in nodes["pole_map_node"]

@@ -30,8 +30,9 @@ class Palpation(Node):
     def repeat(self):  # the last point, for the scan is paused
         self.tactile.repeat().add_done_callback(lambda _: self.tactile.resume())
 
-    def on_point(self, point):
-        print(f"{point.label}: {point.f0_hz:.2f} +- {point.f0_std_hz:.2f} Hz")
+    def on_point(self, point):  # also references in air, and what is skipped or discarded
+        if point.kind == point.KIND_TISSUE and point.outcome == point.OUTCOME_DONE:
+            print(f"{point.label}: {point.f0_hz:.2f} +- {point.f0_std_hz:.2f} Hz")
 
 
 rclpy.init()

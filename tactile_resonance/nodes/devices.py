@@ -83,9 +83,25 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
     raise ValueError(f"device: {device!r}, accepted are bench, replay, nidaqmx")
 
 
+def replayed_results(node: ManagedNode) -> tuple[bytes, ...]:
+    """Serialised point results of the run that is played again; of any other device none."""
+    device, config = values(node, "device", "device_config")
+    path = Path(config).expanduser().absolute()
+    if device != "replay" or not _is_run(path):
+        return ()
+    from tactile_resonance.scan.recorded import recorded_results
+    from tactile_resonance.scan.run_content import read_run
+
+    return tuple(recorded_results(read_run(path)))
+
+
+def _is_run(path: Path) -> bool:
+    return (path / "run.json").is_file()
+
+
 def _source_of(path: Path) -> MeasurementSource | None:
     """The measurements of a scan's run; None for what the device reads by itself."""
-    if not (path / "run.json").is_file():
+    if not _is_run(path):
         return None
     try:
         # only here: everything else works without the library for recordings

@@ -18,7 +18,7 @@ from tactile_resonance.nodes.conversions import excitation_to_message, record_to
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
+from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
@@ -46,7 +46,7 @@ class Cancelled(Exception):
 
 
 class ExcitationNode(ManagedNode):
-    """Action `measure`; publishes `excitation` (latched) and `record`.
+    """Action `measure`; publishes `excitation` (latched), `record`; of a run it replays `point_result`.
 
     Every record is on disk before it is published. Records carry the place of the tip and the mean force
     over the block, where the device is no replay; they never wait long for it. The device is read in a
@@ -64,6 +64,9 @@ class ExcitationNode(ManagedNode):
         self._records = self.publish_on(msg.Record, "record", RESULTS)
         self._device: AcquisitionDevice = devices.make_device(self)
         self.resources.callback(self._device.close)
+        self._replayed = devices.replayed_results(self)
+        if self._replayed:
+            self._results = self.publish_on(msg.PointResult, "point_result", POINT_RESULTS)
         self._store: RecordStore | None = None
         self._has_store = False
         self._contact = contact_source.make_contact_source(self)
@@ -73,6 +76,11 @@ class ExcitationNode(ManagedNode):
         self._measurements = 0
         self._read_by_s = float("inf")  # when a device that is read must have shown life
         self.act(Measure, "measure", self._on_goal, self._on_cancel)
+
+    def activate(self) -> None:
+        """Tell what became of the points of a run that is played again."""
+        for result in self._replayed:
+            self._results.publish(result)
 
     def _on_cancel(self, goal: ServerGoalHandle) -> None:
         """At once where the device can, for a block under way is of no use to anybody."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poles -> map for rviz."""
+"""Results of points, or poles -> map for rviz."""
 
 from __future__ import annotations
 
@@ -22,12 +22,27 @@ from tactile_resonance.nodes.pole_map_messages import (
     restamp,
     surface_message,
 )
-from tactile_resonance.nodes.running import LATCHED, POLES, run_node
-from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, map_point
+from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.scan.point_result import Kind, Outcome, from_message
+from tactile_resonance.scan.pole_map import (
+    EllipseScale,
+    MapPoint,
+    PoleMap,
+    accepted_point,
+    map_point,
+)
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.references import read_classes
 
 PARAMETERS = (
+    Parameter(
+        "source",
+        "point_result",
+        "What is on the map: the points of tissue that a scan accepts (point_result), or the latest poles "
+        "of every place, whoever measured them and whatever for (poles).",
+        choices=("point_result", "poles"),
+        read_only=True,
+    ),
     Parameter(
         "frame_id",
         "",
@@ -87,7 +102,7 @@ REPEAT_PERIOD_S = 1.5
 
 
 class PoleMapNode(ManagedNode):
-    """Keeps the latest poles of every place, and shows them to whoever looks.
+    """Keeps the latest result or poles of every place, and shows them to whoever looks.
 
     `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses and failures), `pole_map/legend` and
     `pole_map/surface` are latched; each is made when there is something new and somebody subscribed, at the
@@ -124,7 +139,12 @@ class PoleMapNode(ManagedNode):
             for name, kind in kinds.items()
         }
         # heard from the configuration on: what came before comes right after it, and only then
-        subscription = self.create_subscription(msg.Poles, "poles", self._on_poles, POLES)
+        (source,) = values(self, "source")
+        kind, callback, qos = {
+            "point_result": (msg.PointResult, self._on_result, POINT_RESULTS),
+            "poles": (msg.Poles, self._on_poles, POLES),
+        }[source]
+        subscription = self.create_subscription(kind, source, callback, qos)
         self.resources.callback(self.destroy_subscription, subscription)
         self.serve(Trigger, "pole_map/clear", self._on_clear)
         self.every(REPEAT_PERIOD_S, self._repeat)
@@ -143,6 +163,25 @@ class PoleMapNode(ManagedNode):
 
     def _on_poles(self, message: msg.Poles) -> None:
         self.health.saw("poles")
+        point = self._point(message)
+        if point is not None:
+            self._set(self._map.with_point(point))
+
+    def _on_result(self, message: msg.PointResult) -> None:
+        """The latest result of a point of tissue that is not discarded replaces what was there before."""
+        self.health.saw("point_result")
+        result = from_message(message)
+        if result.kind is not Kind.TISSUE or result.outcome is Outcome.DISCARDED:
+            return
+        now = self._map.without(result.position_m)
+        if result.outcome is not Outcome.SKIPPED and message.poles:
+            point = self._point(message.poles[0])
+            if point is not None:
+                now = now.with_point(accepted_point(result, point))
+        self._set(now)
+
+    def _point(self, message: msg.Poles) -> MapPoint | None:
+        """Where poles lie on the map; None where they do not, with the reason in the diagnostics."""
         try:
             poles, origin = poles_from_message(message)
             (level,) = values(self, "unknown_level")
@@ -160,18 +199,19 @@ class PoleMapNode(ManagedNode):
         except ValueError as error:
             self._left_out += 1
             self.health.error(f"poles of measurement {message.measurement_id}: {error}")
-            return
-        self._map = self._map.with_point(point)
-        self._old = set(self._publishers_of)
-        self._show()
+            return None
+        return point
 
     def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.message = f"{len(self._map.points)} points cleared"
         response.success = True
-        self._map = PoleMap()
+        self._set(PoleMap())
+        return response
+
+    def _set(self, pole_map: PoleMap) -> None:
+        self._map = pole_map
         self._old = set(self._publishers_of)
         self._show()
-        return response
 
     def _show(self) -> None:
         """Publish what is new and read, at once; after the pause where something was just published."""

@@ -179,8 +179,9 @@ class NodeHands:
     ) -> Measured:
         """Measure until it is enough or the design's end; all messages go into the recording."""
         # its own id: another measurement may be under way, begun by a scan that was killed
+        recording.measurement_id = time.time_ns() // 1000
         goal = Measure.Goal(
-            measurement_id=time.time_ns() // 1000,
+            measurement_id=recording.measurement_id,
             label=label,
             grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
             level_v=design.level_v,

@@ -14,12 +14,13 @@ from typing import Any
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
+from tactile_resonance import msg
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
-from tactile_resonance.nodes.running import run_node
+from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
@@ -29,7 +30,9 @@ from tactile_resonance.scan.goal import Frames, ScanGoal, WantedScan, read_goal,
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.progress import Phase, Progress
+from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -77,7 +80,10 @@ RUNNING = "a scan is running, cancel it or wait for its result"
 
 
 class ScanNode(ManagedNode):
-    """Action `scan`; services `pause`, `resume`, `skip_point`, `repeat_point` and `rejection` of `scan/`."""
+    """Action `scan`; services `pause`, `resume`, `skip_point`, `repeat_point` and `rejection` of `scan/`.
+
+    Publishes `point_result` (latched).
+    """
 
     def __init__(self) -> None:
         super().__init__("scan_node", PARAMETERS)
@@ -93,6 +99,7 @@ class ScanNode(ManagedNode):
         )
         self._frames = Frames(table_frame, base_frame, table_in_base)
         self._rejection = ""
+        self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
         self._progress: Progress | None = None
@@ -184,7 +191,11 @@ class ScanNode(ManagedNode):
             result.outcome = Scan.Result.ENDED
             self.get_logger().info(f"run goes to {run.path}")
             with run:
-                runner = ScanRunner(scene, plan, run, self._hands, self._controls, tell, seed)
+                for cdr in recorded_results(run.content):  # of a run that is gone on with
+                    self._publish(cdr)
+                runner = ScanRunner(
+                    *(scene, plan, run, self._hands, self._controls, tell, seed, self._publish)
+                )
                 fill_result(result, runner.run())
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
@@ -193,6 +204,10 @@ class ScanNode(ManagedNode):
             self._time.end()
             self._controls = self._progress = None
         return result
+
+    def _publish(self, result: bytes) -> None:
+        if self.active:  # a scan that the node's end interrupts ends after its publishers
+            self._results.publish(result)
 
     def _prepare(
         self, request: Scan.Goal, tell: Callable[[Progress], None]

@@ -11,36 +11,38 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, SERIES, TRUTHS
+from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.scan.hands import Recording
+from tactile_resonance.scan.point_file import offered_qos
 
 
 @dataclass(frozen=True)
 class Recorded:
     """A topic that is recorded.
 
-    `measured` where its messages belong to a measurement: only those of the scan's own are kept. `counted`
-    where the scan needs to know how many came.
+    `qos` is asked for; `offered`, by its publisher, is recorded where it is more than that. `measured` where
+    its messages belong to a measurement: only those of the scan's own are kept. `counted` where the scan needs
+    to know how many came.
     """
 
     kind: type
     qos: QoSProfile
-    latched: bool = False
     measured: bool = False
     counted: bool = False
+    offered: QoSProfile | None = None
 
 
 TOPICS = {
-    "excitation": Recorded(msg.Excitation, EXCITATIONS, latched=True, measured=True),
+    "excitation": Recorded(msg.Excitation, EXCITATIONS, measured=True),
     "record": Recorded(msg.Record, RESULTS, measured=True, counted=True),
     "frf": Recorded(msg.FRF, RESULTS, measured=True, counted=True),
-    "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True),
-    "bench/truth": Recorded(msg.Poles, TRUTHS, latched=True, measured=True),
+    "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True, offered=POLES),
+    "bench/truth": Recorded(msg.Poles, TRUTHS, measured=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
     "contact_state": Recorded(msg.ContactState, SERIES),
@@ -90,6 +92,12 @@ class ScanRecorder:
 
     def _listen(self, node: ManagedNode, topic: str, recorded: Recorded) -> None:
         full = node.resolve_topic_name(topic)
+        offered = recorded.offered or recorded.qos
+        qos = offered_qos(
+            offered.depth,
+            reliable=offered.reliability is ReliabilityPolicy.RELIABLE,
+            latched=offered.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+        )
         name = f"{recorded.kind.__module__.split('.')[0]}/msg/{recorded.kind.__name__}"
 
         def heard(cdr: bytes) -> None:
@@ -100,7 +108,7 @@ class ScanRecorder:
                     message = deserialize_message(cdr, recorded.kind)
                     if message.measurement_id != self._measurement_id:
                         return
-                self._recording.write(full, name, time.time_ns(), cdr, recorded.latched)
+                self._recording.write(full, name, time.time_ns(), cdr, qos)
                 self._counts[topic] += 1
                 if topic == "poles":
                     self.poles.put(message)

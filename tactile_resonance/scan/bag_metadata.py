@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
-from tactile_resonance.scan.point_file import BAG_VERSION, LATCHED, FileContent, TopicContent
+from tactile_resonance.scan.point_file import BAG_VERSION, FileContent, TopicContent
 
 # the compiled one, where there is one: a run of a thousand points has ten thousand lines
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -65,12 +66,13 @@ def bag_metadata(files: Sequence[FileContent]) -> dict[str, Any]:
 
 def _topics(files: Sequence[FileContent]) -> list[TopicContent]:
     """Topics of all files together, by name."""
-    merged: dict[tuple[str, str, str, bool], int] = {}
+    merged: dict[str, TopicContent] = {}
     for file in files:
         for topic in file.topics:
-            key = (topic.name, topic.type_name, topic.type_hash, topic.latched)
-            merged[key] = merged.get(key, 0) + topic.count
-    return [TopicContent(*key, count) for key, count in sorted(merged.items())]
+            before = merged.get(topic.name)
+            count = topic.count + (before.count if before else 0)
+            merged[topic.name] = replace(topic, count=count)
+    return [topic for _, topic in sorted(merged.items())]
 
 
 def _topic(topic: TopicContent) -> dict[str, Any]:
@@ -79,7 +81,7 @@ def _topic(topic: TopicContent) -> dict[str, Any]:
             "name": topic.name,
             "type": topic.type_name,
             "serialization_format": "cdr",
-            "offered_qos_profiles": dump_qos_v9([LATCHED] if topic.latched else []),
+            "offered_qos_profiles": dump_qos_v9([] if topic.qos is None else [topic.qos]),
             "type_description_hash": topic.type_hash,
         },
         "message_count": topic.count,

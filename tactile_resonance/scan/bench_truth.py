@@ -12,9 +12,8 @@ import numpy.typing as npt
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.recording.from_messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import POLES_TYPE, Outcome, PointResult
 from tactile_resonance.scan.recorded import file_of
-from tactile_resonance.scan.references import POLES
 from tactile_resonance.scan.run_content import RunContent
 
 SAME_MIDDLE_NS = 50_000_000  # a quarter of what one block more makes
@@ -70,7 +69,7 @@ def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
 def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
     """The bench's truth over the blocks that the last poles rest on; its mode nearest to the estimate."""
     told, middle_ns = [], 0
-    for _, _, message in read_messages_of_type(file_of(run.path, result), POLES):
+    for _, _, message in read_messages_of_type(file_of(run.path, result), POLES_TYPE):
         poles, origin = poles_from_message(message)
         if origin.measurement_id != result.measurement_id:
             continue

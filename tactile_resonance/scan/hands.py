@@ -130,7 +130,7 @@ class Hands(Protocol):
         recording: Recording,
         check: Check,
     ) -> Measured:
-        """Measure; every message of it goes into the recording.
+        """Measure; every message of it, and its id, goes into the recording.
 
         After each block `enough` is asked with the poles of all blocks so far and their number.
         """

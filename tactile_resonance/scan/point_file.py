@@ -33,25 +33,31 @@ from tactile_resonance.scan.messages import (
 )
 
 BAG_VERSION: Literal[9] = 9
-_FOREVER = QosTime(9223372036, 854775807)
-# So that a replay of the recording offers late readers what the node did.
-LATCHED = Qos(
-    QosHistory.KEEP_LAST,
-    64,
-    QosReliability.RELIABLE,
-    QosDurability.TRANSIENT_LOCAL,
-    *(_FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, False),
-)
+_FOREVER = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+
+
+def offered_qos(depth: int, *, reliable: bool = True, latched: bool = False) -> Qos:
+    """What a node offers on a topic: ``ros2 bag play`` offers the same, else it offers volatile."""
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        *(_FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, False),
+    )
 
 
 @dataclass(frozen=True)
 class TopicContent:
-    """One topic of a file; `type_hash` (REP-2011) is that of the definition in the file."""
+    """One topic of a file; `type_hash` (REP-2011) is that of the definition in the file.
+
+    `qos` is what its publisher offered; None: not recorded.
+    """
 
     name: str
     type_name: str
     type_hash: str
-    latched: bool
+    qos: Qos | None
     count: int
 
 
@@ -102,7 +108,7 @@ class PointFileWriter:
         self._writer.open()
         self._connections: dict[str, Connection] = {}
         self._counts: dict[str, int] = {}
-        self._latched: set[str] = set()
+        self._qos: dict[str, Qos | None] = {}
         self._start_ns, self._end_ns = 2**63 - 1, 0
         self._open = True
 
@@ -112,7 +118,7 @@ class PointFileWriter:
         type_name: str,
         time_ns: int,
         cdr: bytes | memoryview,
-        latched: bool = False,
+        qos: Qos | None = None,
     ) -> None:
         """Append one message.
 
@@ -126,8 +132,8 @@ class PointFileWriter:
             When it was received (UNIX time) [ns].
         cdr : bytes
             Serialised, with the encapsulation header, as ``rclpy.serialization`` and rosbags make it.
-        latched : bool
-            Offered to late readers; the topic's first message decides.
+        qos : Qos, optional
+            Offered by its publisher, see `offered_qos`; that of the topic's first message is kept.
 
         Raises
         ------
@@ -144,12 +150,11 @@ class PointFileWriter:
                 type_name,
                 msgdef=definition,
                 rihs01=type_hash,
-                offered_qos_profiles=[LATCHED] if latched else [],
+                offered_qos_profiles=[] if qos is None else [qos],
             )
             self._connections[topic] = connection
             self._counts[topic] = 0
-            if latched:
-                self._latched.add(topic)
+            self._qos[topic] = qos
         if connection.msgtype != type_name:
             raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
         self._writer.write(connection, time_ns, cdr)
@@ -182,7 +187,7 @@ class PointFileWriter:
         topics = tuple(
             TopicContent(
                 *(topic, connection.msgtype, connection.digest),
-                *(topic in self._latched, self._counts[topic]),
+                *(self._qos[topic], self._counts[topic]),
             )
             for topic, connection in self._connections.items()
         )
@@ -210,12 +215,12 @@ def read_content(path: Path) -> FileContent:
             for connection in reader.connections:
                 extension = connection.ext
                 assert isinstance(extension, ConnectionExtRosbag2)
-                latched = LATCHED in extension.offered_qos_profiles
+                qos = next(iter(extension.offered_qos_profiles), None)
                 topics.append(
                     TopicContent(
                         *(connection.topic, connection.msgtype),
                         hash_of(connection.msgtype, connection.msgdef),
-                        *(latched, connection.msgcount),
+                        *(qos, connection.msgcount),
                     )
                 )
             return FileContent(path.name, reader.start_time, reader.end_time - 1, tuple(topics))

@@ -9,11 +9,17 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.main_mode import main_mode
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import NAN, Outcome, PointResult
 from tactile_resonance.scan.pole_map import map_point
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
+
+
+def air_point(index: int) -> ScanPoint:
+    """What is attempted for a reference in free air: at no place of the surface."""
+    nowhere = (NAN, NAN, NAN)
+    return ScanPoint(index, nowhere, nowhere, (0.0, 0.0, 0.0, 1.0), "air")
 
 
 def measured_result(
@@ -94,7 +100,7 @@ def unmeasured_result(
     duration_s: float,
     notes: str = "",
 ) -> PointResult:
-    """Result of a point that failed before it had poles, or was skipped."""
+    """Result of an attempt without poles that count: it failed, was skipped or is discarded."""
     x_m, y_m, z_m = point.position_m
     normal_x, normal_y, normal_z = point.normal
     return PointResult(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of one scan point: one message in the recording, one row of ``results.csv``."""
+"""What became of one scan point: one message, published and in the recording, one row of ``results.csv``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import csv
 import io
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from tactile_resonance.scan.messages import message_types
 
 TOPIC = "point_result"
 TYPE = "tactile_resonance/msg/PointResult"
+POLES_TYPE = "tactile_resonance/msg/Poles"
+RESULTS_DEPTH = 4096  # of the nodes that publish them
 NAN = float("nan")
 
 
@@ -26,13 +28,21 @@ class Outcome(IntEnum):
     DONE = 0
     FAILED = 1
     SKIPPED = 2
+    DISCARDED = 3
+
+
+class Kind(str, Enum):
+    """What was measured."""
+
+    TISSUE = "tissue"
+    AIR = "air"
 
 
 @dataclass(frozen=True)
 class PointResult:
     """One attempt at one scan point; ``msg/PointResult.msg`` gives unit and meaning of each field.
 
-    ``time_ns`` and ``frame_id`` stand for the message's header.
+    ``time_ns`` and ``frame_id`` stand for the message's header; its ``poles`` are not part of it.
     """
 
     index: int
@@ -76,6 +86,7 @@ class PointResult:
     repeats: int = 0
     disturbances: str = ""
     notes: str = ""
+    kind: Kind = Kind.TISSUE
     time_ns: int = 0
     frame_id: str = ""
 
@@ -101,15 +112,27 @@ COLUMNS = tuple(field.name for field in fields(PointResult))
 _HEADER = ("time_ns", "frame_id")
 
 
-def to_message(result: PointResult) -> Any:
-    """Message as rosbags knows it, ready for ``message_types().serialize_cdr``."""
+def to_message(result: PointResult, poles: Any = None) -> Any:
+    """Message as rosbags knows it, ready for ``message_types().serialize_cdr``.
+
+    Parameters
+    ----------
+    poles : message or None
+        The last one of the attempt, as rosbags knows it; None where none came.
+    """
     types = message_types().types
     time = types["builtin_interfaces/msg/Time"](
         sec=result.time_ns // 10**9, nanosec=result.time_ns % 10**9
     )
     header = types["std_msgs/msg/Header"](stamp=time, frame_id=result.frame_id)
     content = {name: getattr(result, name) for name in COLUMNS if name not in _HEADER}
-    return types[TYPE](header=header, **content)
+    content["kind"] = result.kind.value
+    return types[TYPE](header=header, poles=[] if poles is None else [poles], **content)
+
+
+def serialised(result: PointResult, poles: Any = None) -> bytes:
+    """The message of `to_message` as it travels (CDR)."""
+    return bytes(message_types().serialize_cdr(to_message(result, poles), TYPE))
 
 
 def from_message(message: Any) -> PointResult:
@@ -117,7 +140,11 @@ def from_message(message: Any) -> PointResult:
     content = {name: getattr(message, name) for name in COLUMNS if name not in _HEADER}
     stamp = message.header.stamp
     return PointResult(
-        **{**content, "outcome": Outcome(message.outcome)},
+        **{
+            **content,
+            "outcome": Outcome(message.outcome),
+            "kind": Kind(message.kind or Kind.TISSUE),
+        },
         time_ns=stamp.sec * 10**9 + stamp.nanosec,
         frame_id=message.header.frame_id,
     )
@@ -136,4 +163,6 @@ def as_csv(results: Iterable[PointResult]) -> str:
 def _write(value: object) -> str:
     if isinstance(value, Outcome):
         return value.name.lower()
+    if isinstance(value, Kind):
+        return value.value
     return repr(float(value)) if isinstance(value, float) else str(value)

@@ -51,6 +51,8 @@ class MapPoint:
     label : str
     measurement_id : int
     simulated : bool
+    place_m : (3,) float, optional
+        What identifies the place, a point as it was planned; None: `position_m` does.
     """
 
     position_m: FloatArray
@@ -65,6 +67,12 @@ class MapPoint:
     label: str = ""
     measurement_id: int = 0
     simulated: bool = False
+    place_m: FloatArray | None = None
+
+    @property
+    def place(self) -> FloatArray:
+        """(3,) by which it is told from other points [m]."""
+        return self.position_m if self.place_m is None else self.place_m
 
     @property
     def failed(self) -> bool:
@@ -116,6 +124,14 @@ def map_point(
         measurement_id=origin.measurement_id,
         simulated=origin.simulated,
     )
+
+
+def accepted_point(result: PointResult, point: MapPoint) -> MapPoint:
+    """Point of a result and of the poles that came with it; without a pole where the result says it failed."""
+    point = replace(point, place_m=result.position_m)
+    if result.outcome is Outcome.DONE:
+        return point
+    return replace(point, estimate=np.full(2, np.nan), reason=result.reason)
 
 
 def point_of_result(result: PointResult) -> MapPoint:
@@ -170,13 +186,15 @@ class PoleMap:
 
     def with_point(self, point: MapPoint) -> PoleMap:
         """The same with one point more; it replaces what its own measurement or place had before."""
-        kept = tuple(
-            p
-            for p in self.points
-            if p.measurement_id != point.measurement_id
-            and np.linalg.norm(p.position_m - point.position_m) > SAME_PLACE_M
+        kept = (
+            p for p in self.without(point.place).points if p.measurement_id != point.measurement_id
         )
         return replace(self, points=(*kept, point))
+
+    def without(self, place_m: FloatArray) -> PoleMap:
+        """The same with nothing at a place (3,) [m]."""
+        kept = (p for p in self.points if np.linalg.norm(p.place - place_m) > SAME_PLACE_M)
+        return replace(self, points=tuple(kept))
 
     @cached_property
     def estimated(self) -> tuple[MapPoint, ...]:

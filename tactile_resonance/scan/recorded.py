@@ -12,8 +12,14 @@ from tactile_resonance.record import Record
 from tactile_resonance.recording.from_messages import excitation_from_message, record_from_message
 from tactile_resonance.recording.store import StoredMeasurement, gaps_of
 from tactile_resonance.scan.point_file import read_messages_of_type
-from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.run_content import RECORDING, read_run
+from tactile_resonance.scan.point_result import (
+    POLES_TYPE,
+    TYPE,
+    PointResult,
+    from_message,
+    serialised,
+)
+from tactile_resonance.scan.run_content import RECORDING, RunContent, read_run
 
 EXCITATION = "tactile_resonance/msg/Excitation"
 RECORD = "tactile_resonance/msg/Record"
@@ -74,14 +80,11 @@ class RunSource:
 
     def __init__(self, run: Path) -> None:
         content = read_run(run)
-        points = {file_of(run, result): result.measurement_id for result in content.results}
+        points = {file_of(run, result) for result in content.results}
         self.entries: list[RecordedEntry] = []
-        for file in sorted(content.files, key=lambda file: (file.start_ns, file.name)):
-            path = Path(run) / RECORDING / file.name
-            if path not in points:
-                self.entries += [RecordedEntry(key, path, True) for key in _ids_of(path)]
-            elif points[path]:
-                self.entries.append(RecordedEntry(points[path], path))
+        for path in _in_order(content):
+            reference = path not in points
+            self.entries += [RecordedEntry(key, path, reference) for key in _ids_of(path)]
 
     def read(self, entry: RecordedEntry) -> StoredMeasurement:
         """One of `entries`.
@@ -97,6 +100,20 @@ class RunSource:
         raise ValueError(
             f"measurement_id: {entry.measurement_id}, {entry.path.name} has no record of it"
         )
+
+
+def recorded_results(run: RunContent) -> Iterator[bytes]:
+    """``msg/PointResult`` (CDR) of every attempt that is kept, references included, as it was published.
+
+    In runs of earlier versions references have none, and poles are the last ones in the file of the point.
+    """
+    for path in _in_order(run):
+        for _, _, message in read_messages_of_type(path, TYPE):
+            poles = None
+            for _, topic, poles_message in read_messages_of_type(path, POLES_TYPE):
+                if topic.rsplit("/", 1)[-1] == "poles":
+                    poles = poles_message
+            yield serialised(from_message(message), poles)
 
 
 def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
@@ -132,6 +149,12 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
             tuple(gaps_of(played, taken)),
             tuple(problems.get(key, [])),
         )
+
+
+def _in_order(run: RunContent) -> list[Path]:
+    """Files of a run, in the order in which they were recorded."""
+    files = sorted(run.files, key=lambda file: (file.start_ns, file.name))
+    return [run.path / RECORDING / file.name for file in files]
 
 
 def _ids_of(path: Path) -> list[int]:

@@ -13,12 +13,12 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.recording.from_messages import poles_from_message
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_result import POLES_TYPE
 from tactile_resonance.scan.run_content import RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits
 
 FloatArray = npt.NDArray[np.float64]
 BEFORE, AFTER = "air-before", "air-after"
-POLES = "tactile_resonance/msg/Poles"
 # A difference beyond so many of its standard deviations is no noise: once in 16 000.
 _SIGNIFICANT = 4.0
 
@@ -150,7 +150,7 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
     for file in run.files:
         if not file.name.endswith(f"-{name}.mcap"):
             continue
-        for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES):
+        for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES_TYPE):
             if topic.rsplit("/", 1)[-1] == "poles":
                 poles, _ = poles_from_message(message)
                 found = reference_of(poles)

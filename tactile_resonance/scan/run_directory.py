@@ -25,12 +25,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rosbags.interfaces import Qos
+
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.bag_metadata import write_bag_metadata
 from tactile_resonance.scan.messages import definition_and_hash, message_types
-from tactile_resonance.scan.point_file import FileContent, PointFileWriter
-from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, as_csv, to_message
+from tactile_resonance.scan.point_file import FileContent, PointFileWriter, offered_qos
+from tactile_resonance.scan.point_result import (
+    POLES_TYPE,
+    RESULTS_DEPTH,
+    TOPIC,
+    TYPE,
+    PointResult,
+    as_csv,
+    serialised,
+)
 from tactile_resonance.scan.run_content import FORMAT, RECORDING, RunContent, read_run
 from tactile_resonance.scan.scan_point import ScanPoint
 
@@ -200,10 +210,19 @@ class RunDirectory:
 
 
 class _FileRecording:
-    """Receives the messages of one file; a context that abandons what was not finished."""
+    """Receives the messages of one file; a context that abandons what was not finished.
 
-    def __init__(self, run: RunDirectory, stem: str) -> None:
-        self._run = run
+    Attributes
+    ----------
+    attempt : int
+    measurement_id : int
+        Of the measurement that is recorded; 0: none was begun.
+    """
+
+    def __init__(self, run: RunDirectory, stem: str, attempt: int = 0) -> None:
+        self._run, self.attempt = run, attempt
+        self.measurement_id = 0
+        self._poles: bytes | memoryview = b""
         self._writer = PointFileWriter(run.path / HIDDEN, run.path / RECORDING / f"{stem}.mcap")
 
     def __enter__(self) -> Self:
@@ -218,18 +237,32 @@ class _FileRecording:
         type_name: str,
         time_ns: int,
         cdr: bytes | memoryview,
-        latched: bool = False,
+        qos: Qos | None = None,
     ) -> None:
         """Append one message; see `PointFileWriter.write`."""
-        self._writer.write(topic, type_name, time_ns, cdr, latched)
+        self._writer.write(topic, type_name, time_ns, cdr, qos)
+        if type_name == POLES_TYPE and topic.rsplit("/", 1)[-1] == "poles":  # no truths
+            self._poles = cdr
+
+    def message_of(self, result: PointResult) -> bytes:
+        """The result as it is published (CDR), with the last poles recorded."""
+        types = message_types()
+        poles = types.deserialize_cdr(self._poles, POLES_TYPE) if self._poles else None
+        return serialised(result, poles)
+
+    def _keep(self, result: PointResult, of_point: PointResult | None) -> bytes:
+        cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
+        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
+        self._run._add(self._writer.finish(), of_point)
+        return cdr
 
 
 class ReferenceRecording(_FileRecording):
     """Receives the messages of one reference."""
 
-    def finish(self) -> None:
-        """Keep it, durably."""
-        self._run._add(self._writer.finish(), None)
+    def finish(self, result: PointResult) -> bytes:
+        """Keep it with its result, durably; returns `message_of` it."""
+        return self._keep(result, None)
 
 
 class PointRecording(_FileRecording):
@@ -237,15 +270,20 @@ class PointRecording(_FileRecording):
 
     Attributes
     ----------
-    index, attempt : int
+    index : int
     """
 
     def __init__(self, run: RunDirectory, index: int, attempt: int) -> None:
-        super().__init__(run, f"point-{index:05d}-{attempt:02d}")
-        self.index, self.attempt = index, attempt
+        super().__init__(run, f"point-{index:05d}-{attempt:02d}", attempt)
+        self.index = index
 
-    def finish(self, result: PointResult) -> None:
+    def finish(self, result: PointResult) -> bytes:
         """Keep the point with its result, durably: after this no interruption loses it.
+
+        Returns
+        -------
+        bytes
+            `message_of` the result.
 
         Raises
         ------
@@ -257,9 +295,7 @@ class PointRecording(_FileRecording):
             raise ValueError(
                 f"result: got point and attempt {got}; accepted is {(self.index, self.attempt)}"
             )
-        cdr = message_types().serialize_cdr(to_message(result), TYPE)
-        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr)
-        self._run._add(self._writer.finish(), result)
+        return self._keep(result, result)
 
 
 def expected_bytes(points: int, blocks: int, samples_per_block: int, lines: int) -> int:

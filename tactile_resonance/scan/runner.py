@@ -15,7 +15,7 @@ import numpy as np
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.controls import Controls, Request
-from tactile_resonance.scan.decision import Decision, decide
+from tactile_resonance.scan.decision import Decision, Verdict, decide
 from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -23,11 +23,12 @@ from tactile_resonance.scan.hands import (
     Interrupted,
     PointDisturbed,
     PointFailed,
+    Recording,
     ScanEnded,
 )
 from tactile_resonance.scan.plan import Plan
-from tactile_resonance.scan.point_outcome import measured_result, unmeasured_result
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
+from tactile_resonance.scan.point_result import NAN, Kind, Outcome, PointResult
 from tactile_resonance.scan.progress import Phase, Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
@@ -44,6 +45,7 @@ POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
 """Between the seeds of two attempts at a point: beyond the points of a scan."""
 SKIPPED = "skipped on request"
+LEFT = "left on request"
 
 
 class ScanRunner:
@@ -60,6 +62,9 @@ class ScanRunner:
         Receives `Progress`.
     seed : int
         Of the first point's phases; each point has its own.
+    publish : callable
+        Receives the serialised ``msg/PointResult`` (CDR) of each attempt that has ended, references and what is
+        discarded included; of those that are kept once they are on disk.
     """
 
     def __init__(
@@ -71,9 +76,11 @@ class ScanRunner:
         controls: Controls,
         tell: Callable[[Progress], None],
         seed: int = 1,
+        publish: Callable[[bytes], None] = lambda cdr: None,
     ) -> None:
         self._scene, self._plan, self._run = scene, plan, run
         self._hands, self._controls, self._tell = hands, controls, tell
+        self._publish = publish
         self._seed = seed
         self._durations_s: list[float] = []
         self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
@@ -111,17 +118,8 @@ class ScanRunner:
             return self._run.content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
-                recording.finish(
-                    unmeasured_result(
-                        point,
-                        recording.attempt,
-                        self._scene,
-                        Outcome.SKIPPED,
-                        SKIPPED,
-                        time_ns=time.time_ns(),
-                        duration_s=0.0,
-                    )
-                )
+                result = self._unmeasured(point, recording, Outcome.SKIPPED, SKIPPED, 0.0)
+                self._publish(recording.finish(result))
             return self._next()
         return point
 
@@ -176,30 +174,27 @@ class ScanRunner:
                     check,
                 )
             except PointDisturbed as error:
-                if self._disturbed[point.index].again(error):
-                    self._hands.retract()  # nothing is kept of it, and the point is repeated
-                    return
                 reason = str(error)
+                if self._disturbed[point.index].again(error):
+                    outcome = Outcome.DISCARDED
             except PointFailed as error:
                 reason = str(error)
             except Interrupted:
-                if self._controls.take() is not Request.SKIP:
-                    self._hands.retract()  # cancelled or to be repeated: nothing is kept of it
-                    return
                 outcome, reason = Outcome.SKIPPED, SKIPPED
+                if self._controls.take() is not Request.SKIP:  # cancelled or to be repeated
+                    outcome, reason = Outcome.DISCARDED, LEFT
+            except ScanEnded as error:
+                self._discard(point, recording, str(error))
+                raise
+            if outcome is Outcome.DISCARDED:
+                self._hands.retract()
+                self._discard(point, recording, reason)
+                return
             self._say(point, Phase.RETRACT)
             self._hands.retract()
             duration_s = self._hands.now_s() - begun_s
             if measured is None:
-                result = unmeasured_result(
-                    point,
-                    recording.attempt,
-                    scene,
-                    outcome,
-                    reason,
-                    time_ns=time.time_ns(),
-                    duration_s=duration_s,
-                )
+                result = self._unmeasured(point, recording, outcome, reason, duration_s)
             else:
                 result = measured_result(
                     point,
@@ -214,7 +209,7 @@ class ScanRunner:
                 )
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
-            recording.finish(result)
+            self._publish(recording.finish(result))
         self._durations_s.append(duration_s)
         if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
             raise ScanEnded(
@@ -239,34 +234,80 @@ class ScanRunner:
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
-        place = len(self._plan.points) + (name == AFTER)
+        point = air_point(len(self._plan.points) + (name == AFTER))
+        told = 0
 
         def all_blocks(poles: Poles, blocks: int) -> bool:
+            nonlocal told
+            told = blocks
             return False
 
         disturbed = Disturbances()
         while True:
             self._wait()
             self._say(None, Phase.REFERENCE)
-            self._hands.begin(self._seed, place, 0)
+            self._hands.begin(self._seed, point.index, 0)
             with self._run.begin_reference(name) as recording:
+                begun_s = self._hands.now_s()
                 try:
-                    self._hands.measure(
+                    measured = self._hands.measure(
                         replace(self._plan.measurement, periods=self._scene.blocks.least),
-                        "air",
-                        self._seed + place,
+                        point.label,
+                        self._seed + point.index,
                         all_blocks,
                         recording,
                         self._controls.check,
                     )
-                except PointDisturbed as error:
-                    if disturbed.again(error):
+                except PointFailed as error:
+                    if isinstance(error, PointDisturbed) and disturbed.again(error):
+                        self._discard(point, recording, str(error))
                         continue
+                    failed = self._unmeasured(point, recording, Outcome.FAILED, str(error))
+                    self._publish(recording.message_of(failed))
                     return
-                except PointFailed:
-                    return
-                recording.finish()
+                except (Interrupted, ScanEnded) as error:
+                    self._discard(point, recording, str(error) or LEFT)
+                    raise
+                result = measured_result(
+                    point,
+                    recording.attempt,
+                    replace(self._scene, tissue_classes=()),
+                    measured.poles,
+                    measured.origin,
+                    Decision(Verdict.MOST_BLOCKS, "", told),
+                    time_ns=time.time_ns(),
+                    duration_s=self._hands.now_s() - begun_s,
+                )
+                result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
+                result = replace(result, kind=Kind.AIR)
+                self._publish(recording.finish(result))
                 return
+
+    def _unmeasured(
+        self,
+        point: ScanPoint,
+        recording: Recording,
+        outcome: Outcome,
+        reason: str,
+        duration_s: float = NAN,
+    ) -> PointResult:
+        """Result of an attempt without poles that count."""
+        result = unmeasured_result(
+            point,
+            recording.attempt,
+            self._scene,
+            outcome,
+            reason,
+            time_ns=time.time_ns(),
+            duration_s=duration_s,
+        )
+        kind = Kind.AIR if point.index >= len(self._plan.points) else Kind.TISSUE
+        return replace(result, kind=kind, measurement_id=recording.measurement_id)
+
+    def _discard(self, point: ScanPoint, recording: Recording, reason: str) -> None:
+        """Tell that nothing is kept of an attempt."""
+        result = self._unmeasured(point, recording, Outcome.DISCARDED, reason)
+        self._publish(recording.message_of(result))
 
     def _say(
         self,

@@ -55,7 +55,7 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
             [sys.executable, EXAMPLE], capture_output=True, text=True, timeout=240
         )
     assert answer.returncode == 0, answer.stderr
-    *_, last = answer.stdout.splitlines()
+    *told, last = answer.stdout.splitlines()
     assert last == "cancelled: 3 of 6 points; cancelled"
     (path,) = (tmp_path / "runs").iterdir()
     assert answer.stderr.splitlines()[-1] == str(path)
@@ -65,6 +65,7 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
     assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)]
     outcomes = [*[Outcome.DONE] * 4, Outcome.SKIPPED]
     assert [result.outcome for result in run.results] == outcomes
+    assert [line[:14] for line in told] == [f"poses, point {k}" for k in (1, 2, 2, 3)]
     done = [result for result in run.results if result.outcome is Outcome.DONE]
     for result in done:
         # the force of the goal, not of the bench's scene, at exactly the place of the pose

@@ -1,23 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the bench to the map, all nodes as processes, and a reader who comes late."""
+"""From the bench to the map, all nodes as processes, and readers who come late."""
 
 import time
 
 import numpy as np
+import pytest
 import rclpy
+from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from robot_at_hand import own_time
+from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import PointCloud2
 from tactile_resonance.action import Measure
 
+from tactile_resonance import msg
 from tactile_resonance.configuration import share_path
-from tactile_resonance.nodes.running import LATCHED
+from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, POINT_RESULTS, POLES, RESULTS
+from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.nodes.scan_session import ScanSession
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.scan.point_result import Kind, Outcome
+from tactile_resonance.scan.run_content import read_run
 
-NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "pole_map_node")
+STREAM = ("excitation_node", "frf_node", "poles_node", "pole_map_node")
+NODES = ("fake_hardware_node", *STREAM)
 TIME = own_time(16)
 PLACES = ((-0.01, -0.01, 0.0), (0.002, -0.001, 0.0), (0.01, 0.01, 0.0))
+SCENE = """
+name: with a hole
+force_n: 0.01
+regions:
+  - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.00, 0.0], radius_m: 0.025}}
+positions:
+  list: [[0.0, 0.0], [0.004, 0.0], [0.04, 0.0], [0.0, 0.008]]  # the third beside the gelatine
+blocks: {least: 24, most: 24}
+"""
+ACCEPTED = (0, 1, 3)
 
 
 def test_measured_points_are_on_the_map(domain, tmp_path):
@@ -25,7 +44,7 @@ def test_measured_points_are_on_the_map(domain, tmp_path):
     parameters = {
         "fake_hardware_node": {"scene": scene, "time_server": TIME},
         "excitation_node": {"record_folder": tmp_path / "records", "time_server": TIME},
-        "pole_map_node": {"classes_file": scene},
+        "pole_map_node": {"classes_file": scene, "source": "poles"},  # nobody scans
     }
     with NodeProcesses(tmp_path / "log") as nodes, ScanSession(nodes.check) as session:
         nodes.bring_up(NODES, parameters)
@@ -35,7 +54,7 @@ def test_measured_points_are_on_the_map(domain, tmp_path):
             session.measure(place, Measure.Goal(periods=4, seed=5), lambda *_: None)
             for place in PLACES
         ]
-        rows = late_reader(len(PLACES))
+        rows = rows_of(late_map(len(PLACES)))
     expected = [result.poles.f0_hz[0] for result in found]
     order = np.argsort(rows["x"])
     np.testing.assert_allclose(rows["f0_hz"][order], expected, rtol=1e-6)
@@ -46,24 +65,180 @@ def test_measured_points_are_on_the_map(domain, tmp_path):
     assert np.all(rows["force_n"] == np.float32(0.01))
 
 
-def late_reader(count, timeout_s=20.0):
-    """Rows of the latched cloud, once it has `count` points."""
+class Client(ScanClient):
+    """Asks for a scan and has a point repeated while it is measured, or asks for measurements."""
+
+    def join(self):
+        super().join()
+        self._measure = ActionClient(self._node, Measure, "measure")
+        self._asked = None
+
+    def repeat_once(self, feedback):
+        if self._asked is None and feedback.point == 1 and feedback.blocks:
+            self._asked = self.tactile.repeat()
+
+    def measure(self):
+        self.wait(self._measure.server_is_ready, 30.0, "the action measure")
+        answer = self._measure.send_goal_async(Measure.Goal())
+        self.wait(answer.done, 10.0, "the goal to be taken")
+        result = answer.result().get_result_async()
+        self.wait(result.done, 60.0, "the measurement")
+        return result.result().result
+
+
+@pytest.fixture(scope="module")
+def scanned(module_domain, tmp_path_factory):
+    """The run of a scan with references, a retry and a failed point, and what late readers got of it."""
+    folder = tmp_path_factory.mktemp("scanned")
+    scene, run = folder / "scene.yaml", folder / "run"
+    scene.write_text(SCENE)
+    time_server = {"time_server": TIME}
+    ideal = {"serve_contact": True, "table_in_base": str([0.0] * 6)}
+    parameters = {
+        "fake_hardware_node": {"scene": scene, **ideal, **time_server},
+        "excitation_node": {"record_folder": folder / "records", **time_server},
+        "scan_node": time_server,
+    }
+    with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
+        nodes.bring_up((*NODES, "scan_node"), parameters)
+        client.wait_until_up(60.0)
+        result = client.scan(
+            120.0, scene=scene, run_directory=run, on_feedback=client.repeat_once
+        )
+        assert (result.done, result.failed, result.skipped) == (3, 1, 0), result.message
+        cloud = late_map(len(ACCEPTED))
+        told = late_reader(msg.PointResult, "point_result", POINT_RESULTS, lambda m: len(m) == 7)
+        poles = late_reader(msg.Poles, "poles", POLES, lambda m: len(m) > 0)
+    return run, cloud, told, poles
+
+
+def test_the_map_of_a_scan_holds_the_accepted_points_of_tissue(scanned):
+    run, cloud, _, poles = scanned
+    rows, results = rows_of(cloud), read_run(run).latest
+    expected = np.array([(results[k].x_m, results[k].y_m, results[k].f0_hz) for k in ACCEPTED])
+    found = np.stack([rows["x"], rows["y"], rows["f0_hz"]], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
+    # there were others, in air among them
+    assert len({message.measurement_id for message in poles}) == 3 + 2 + 1
+    assert min(message.f0_hz[0] for message in poles) < 250 < rows["f0_hz"].min()
+
+
+def test_a_late_reader_of_results_knows_what_counts(scanned):
+    run, _, told, poles = scanned
+    assert [(m.kind, m.index, m.outcome) for m in told] == [
+        (Kind.AIR.value, 4, Outcome.FAILED),
+        (Kind.TISSUE.value, 0, Outcome.DONE),
+        (Kind.TISSUE.value, 1, Outcome.DISCARDED),
+        (Kind.TISSUE.value, 1, Outcome.DONE),
+        (Kind.TISSUE.value, 2, Outcome.FAILED),
+        (Kind.TISSUE.value, 3, Outcome.DONE),
+        (Kind.AIR.value, 5, Outcome.DONE),
+    ]
+    # ideal contact does not know where the tip is before it has touched
+    assert "the place of the tip is unknown" in told[0].reason
+    assert told[2].reason == "left on request"
+    assert "nothing to touch there" in told[4].reason
+    # every measurement is accounted for, the one that was left too
+    assert {m.measurement_id for m in told} - {0} == {m.measurement_id for m in poles}
+    last = {message.measurement_id: message for message in poles}
+    for message in told:
+        if message.outcome == Outcome.DONE:
+            assert message.poles == [last[message.measurement_id]]
+            assert message.f0_hz == message.poles[0].f0_hz[0]
+            assert len(message.poles[0].total_covariance or message.poles[0].covariance) == 4
+    assert told[4].poles == []
+    assert [m.measurement_id for m in told if m.index in ACCEPTED and m.outcome == Outcome.DONE] == [
+        read_run(run).latest[k].measurement_id for k in ACCEPTED
+    ]
+
+
+def test_a_replay_of_the_run_draws_the_same_map(scanned, domain, tmp_path):
+    run, cloud, told, _ = scanned
+    replay = {"device": "replay", "device_config": run, "replay_speed": 0.0}
+    with NodeProcesses(tmp_path / "log") as nodes, Client(nodes.check) as client:
+        nodes.bring_up(STREAM, {"excitation_node": replay})
+        client.wait_until_up(60.0)
+        played = []
+        while (result := client.measure()).outcome == Measure.Result.DONE:
+            played.append(result.measurement_id)
+        assert len(played) == 3 + 1
+        again = late_map(len(ACCEPTED))
+        kept = late_reader(msg.PointResult, "point_result", POINT_RESULTS, lambda m: len(m) == 5)
+    assert again.data == cloud.data
+    assert list(map(str, kept)) == list(map(str, [told[1], *told[3:]]))  # NaN is equal to NaN
+
+
+def test_a_recording_that_is_played_draws_the_same_map(scanned, domain, tmp_path):
+    """As `ros2 bag play` does: publishers with the recorded quality of service, ten messages of history."""
+    run, cloud, _, _ = scanned
+    context = rclpy.Context()
+    with NodeProcesses(tmp_path / "log") as nodes, Client(nodes.check) as client:
+        nodes.bring_up(["pole_map_node"], {})
+        client.wait_until_up(60.0)
+        rclpy.init(context=context)
+        player = rclpy.create_node("player", context=context)
+        with Reader(run / "recording") as reader:
+            profiles = {c.topic: qos_of(c) for c in reader.connections}
+            publisher = player.create_publisher(
+                msg.PointResult, "point_result", profiles["/point_result"]
+            )
+            for connection, _, cdr in reader.messages():
+                if connection.topic == "/point_result":
+                    publisher.publish(cdr)
+        try:
+            again = late_map(len(ACCEPTED))
+        finally:
+            player.destroy_node()
+            rclpy.shutdown(context=context)
+    assert again.data == cloud.data
+    for topic, kind in (("/poles", POLES), ("/excitation", EXCITATIONS), ("/record", RESULTS)):
+        assert profiles[topic].durability == kind.durability
+        assert profiles[topic].reliability == kind.reliability
+
+
+def qos_of(connection):
+    (offered,) = connection.ext.offered_qos_profiles or [None]
+    durability = offered.durability.name if offered else "VOLATILE"
+    reliability = offered.reliability.name if offered else "RELIABLE"
+    return QoSProfile(
+        depth=10,
+        durability=DurabilityPolicy[durability],
+        reliability=ReliabilityPolicy[reliability],
+    )
+
+
+def late_reader(kind, topic, qos, enough, timeout_s=20.0):
+    """What a reader gets who comes now, until it is enough and some time for more has passed."""
     context, heard = rclpy.Context(), []
     rclpy.init(context=context)
     node = rclpy.create_node("late_reader", context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     try:
-        node.create_subscription(PointCloud2, "pole_map", heard.append, LATCHED)
+        node.create_subscription(kind, topic, heard.append, qos)
         deadline = time.monotonic() + timeout_s
-        while not (heard and heard[-1].width == count) and time.monotonic() < deadline:
+        while not enough(heard) and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.05)
+        deadline = time.monotonic() + 0.5
+        while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
     finally:
         executor.shutdown()
         node.destroy_node()
         rclpy.shutdown(context=context)
-    assert [m.width for m in heard][-1:] == [count]
-    cloud = heard[-1]
+    return heard
+
+
+def late_map(count):
+    """The latched cloud, which has `count` points."""
+    clouds = late_reader(
+        PointCloud2, "pole_map", LATCHED, lambda heard: heard and heard[-1].width == count
+    )
+    assert [cloud.width for cloud in clouds][-1:] == [count]
+    return clouds[-1]
+
+
+def rows_of(cloud):
     kinds = ["<f4" if f.datatype == f.FLOAT32 else "u1" for f in cloud.fields]
     names, offsets = [f.name for f in cloud.fields], [f.offset for f in cloud.fields]
     dtype = {"names": names, "formats": kinds, "offsets": offsets, "itemsize": cloud.point_step}

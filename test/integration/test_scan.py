@@ -15,10 +15,13 @@ from robot_at_hand import own_host, own_time
 from rosbags.rosbag2 import Reader
 from tactile_resonance.action import Scan
 
+from tactile_resonance import msg
 from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
+from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
@@ -73,6 +76,11 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         client.wait(killed.done, 60.0, "the loss of the scan to be noticed")
         assert killed.result().ending is Ending.LOST
         result = client.scan(180.0, run_directory=run_path, resume=True)
+        told = []
+        client._node.create_subscription(
+            msg.PointResult, "point_result", told.append, POINT_RESULTS
+        )
+        client.wait(lambda: len(told) == 5, 20.0, "all results")
     assert result.ending is Ending.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (3, 0, 0)
     run = read_run(run_path)
@@ -95,6 +103,14 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     air = 2 * 3
     blocks = sum(point.blocks for point in run.results) + air
     assert counts["/record"] == counts["/frf"] == counts["/poles"] == blocks
-    assert counts["/point_result"] == 3
+    assert counts["/point_result"] == 3 + 2
+    # a late reader gets those of the node that was killed too
+    assert [(r.kind, r.index, r.outcome) for r in told] == [
+        *[("air", 3, Outcome.DONE), *[("tissue", k, Outcome.DONE) for k in range(3)]],
+        ("air", 4, Outcome.DONE),
+    ]
+    assert max(r.f0_hz for r in told if r.kind == "air") < min(
+        r.f0_hz for r in told if r.kind == "tissue"
+    )
     assert counts["/wrench"] > 100
     assert np.isfinite([point.force_std_n for point in run.results]).any()

@@ -24,10 +24,11 @@ from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes import pole_map_node
 from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.pole_map_node import PoleMapNode
-from tactile_resonance.nodes.running import LATCHED, POLES, initialised
+from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB, shares
+from tactile_resonance.scan.point_result import Kind, Outcome
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 NUMPY = {PointField.FLOAT32: "<f4", PointField.UINT8: "u1"}
@@ -57,16 +58,25 @@ def poles(key, x, f0_hz, damping=0.0336, frame="table", status=PolesStatus.OK, p
     return poles_to_message(result, Origin(measurement_id=key, simulated=True, contact=contact))
 
 
-class Bench:
-    """The node, a publisher of poles, and readers that come when the test says."""
+def point_result(key, x, f0_hz, outcome=Outcome.DONE, kind=Kind.TISSUE, **values):
+    """Result of a point planned at x [m] on the surface, 2 mm below the tip."""
+    message = msg.PointResult(
+        outcome=int(outcome), kind=kind.value, measurement_id=key, x_m=x, y_m=0.001, z_m=-0.002
+    )
+    message.poles = [poles(key, x + values.get("off", 0.0), f0_hz)] if f0_hz else []
+    return message
 
-    def __init__(self):
+
+class Bench:
+    """The node, a publisher of what it hears, and readers that come when the test says."""
+
+    def __init__(self, kind=msg.Poles, topic="poles", qos=POLES):
         self.map_node = PoleMapNode()
         self.user = rclpy.create_node("user")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.map_node)
         self.executor.add_node(self.user)
-        self.publisher = self.user.create_publisher(msg.Poles, "poles", POLES)
+        self.publisher = self.user.create_publisher(kind, topic, qos)
         self.map_node.trigger_configure()
         self.map_node.trigger_activate()
         self.until(lambda: self.publisher.get_subscription_count() == 1)
@@ -104,9 +114,22 @@ class Bench:
         return heard
 
 
+OF_POLES = ["--ros-args", "-p", "source:=poles"]
+
+
 @pytest.fixture
 def bench():
-    with initialised(domain_id=free_domain_id(os.environ)), Bench() as made:
+    """A map of whatever poles there are."""
+    domain = free_domain_id(os.environ)
+    with initialised(domain_id=domain, args=OF_POLES), Bench() as made:
+        yield made
+
+
+@pytest.fixture
+def scanned():
+    """A map of what a scan accepts, as it is without parameters."""
+    given = (msg.PointResult, "point_result", POINT_RESULTS)
+    with initialised(domain_id=free_domain_id(os.environ)), Bench(*given) as made:
         yield made
 
 
@@ -423,9 +446,64 @@ def test_clear_empties_every_output(bench):
     bench.until(lambda: heard["pole_map/legend"][-1].markers[0].action == Marker.DELETEALL)
 
 
+def test_only_what_a_scan_accepts_is_on_the_map(scanned):
+    others = scanned.user.create_publisher(msg.Poles, "poles", POLES)
+    others.publish(poles(9, 0.1, 300.0))
+    for message in (
+        point_result(1, 0.0, 246.6, kind=Kind.AIR),
+        point_result(2, 0.004, 300.0, Outcome.DISCARDED),
+        point_result(3, 0.008, 300.0, Outcome.SKIPPED),
+        point_result(4, 0.012, 300.0, Outcome.FAILED),
+        point_result(5, 0.016, None, Outcome.FAILED),  # before it had poles: where the tip was nobody knows
+        point_result(6, 0.020, 256.0),
+    ):
+        scanned.publisher.publish(message)
+    scanned.until(lambda: scanned.map_node._map.estimated)
+    rows = table(scanned.read(PointCloud2, "pole_map")[0])
+    assert list(rows["f0_hz"]) == [256.0]
+    (markers,) = scanned.read(MarkerArray, "pole_map/markers")
+    (crosses,) = [m.points for m in markers.markers if m.ns == "failures"]
+    assert len(crosses) == 4
+    assert np.mean([(p.x, p.y) for p in crosses], axis=0) == pytest.approx([0.012, 0.004])
+    assert scanned.map_node.details()["left out"] == "0"
+
+
+@pytest.mark.parametrize(
+    ("outcome", "f0_hz", "left"),
+    [
+        (Outcome.DONE, 251.0, [255.0, 251.0]),
+        (Outcome.FAILED, 251.0, [255.0]),
+        (Outcome.FAILED, None, [255.0]),
+        (Outcome.SKIPPED, None, [255.0]),
+        (Outcome.DISCARDED, 251.0, [250.0, 255.0]),
+    ],
+)
+def test_a_point_that_is_repeated_replaces_its_former_result(scanned, outcome, f0_hz, left):
+    scanned.publisher.publish(point_result(1, 0.0, 250.0))
+    scanned.publisher.publish(point_result(2, 0.004, 255.0))
+    # the tip comes down a millimetre beside: it is the same point
+    scanned.publisher.publish(point_result(3, 0.0, f0_hz, outcome, off=0.001))
+    scanned.publisher.publish(point_result(4, 0.1, 260.0))
+    scanned.until(lambda: 260.0 in [p.estimate[0] for p in scanned.map_node._map.points])
+    found = [point.estimate[0] for point in scanned.map_node._map.estimated]
+    assert found == [*left, 260.0]
+
+
+def test_late_readers_get_the_results_of_a_whole_scan(scanned):
+    count = 4000  # a thousand points, each discarded three times
+    for k in range(count):
+        scanned.publisher.publish(msg.PointResult(index=k))
+    heard = []
+    scanned.user.create_subscription(
+        msg.PointResult, "point_result", lambda m: heard.append(m.index), POINT_RESULTS
+    )
+    scanned.until(lambda: len(heard) == count, 60.0)
+    assert heard == list(range(count))
+
+
 def test_tissue_is_called_from_a_scene():
     scene = share_path("config/scenes/inclusion_scan.yaml")
-    arguments = ["--ros-args", "-p", f"classes_file:={scene}"]
+    arguments = [*OF_POLES, "-p", f"classes_file:={scene}"]
     with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
         bench.send(
             poles(1, 0.0, 253.8, 0.0336), poles(2, 0.004, 258.0, 0.0379), poles(3, 0.008, 240.0)

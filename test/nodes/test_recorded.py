@@ -26,7 +26,7 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording import from_messages
 from tactile_resonance.recording.store_recording import recording_of
-from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.point_result import Kind, PointResult
 from tactile_resonance.scan.recorded import EXCITATION, RECORD, read_recorded
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -90,7 +90,7 @@ def run(tmp_path_factory):
             excitation, records = measurement(key)
             with run.begin_point(index) as recording:
                 cdr = serialize_message(excitation_to_message(excitation, START_NS, "tip"))
-                recording.write("/left/excitation", EXCITATION, START_NS, cdr, latched=True)
+                recording.write("/left/excitation", EXCITATION, START_NS, cdr)
                 for k, record in enumerate(records):
                     cdr = serialize_message(record_to_message(record))
                     recording.write("/left/record", RECORD, START_NS + k, cdr)
@@ -101,12 +101,12 @@ def run(tmp_path_factory):
         with run.begin_reference("air-before") as recording:
             times_ns = START_NS - 10**9 + np.arange(4)
             cdr = serialize_message(excitation_to_message(excitation, START_NS, "tip"))
-            recording.write("/left/excitation", EXCITATION, int(times_ns[3]), cdr, latched=True)
+            recording.write("/left/excitation", EXCITATION, int(times_ns[3]), cdr)
             for time_ns, record in zip(times_ns.tolist(), records, strict=False):
                 recording.write(
                     "/left/record", RECORD, time_ns, serialize_message(record_to_message(record))
                 )
-            recording.finish()
+            recording.finish(PointResult(2, kind=Kind.AIR, measurement_id=13))
     return folder
 
 

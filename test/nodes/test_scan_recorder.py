@@ -20,9 +20,8 @@ from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.from_messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
-from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.recorded import file_of
-from tactile_resonance.scan.references import POLES
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.simulation.bench_tip import BenchTip
@@ -89,6 +88,6 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
             recorder.stop()
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
-        messages = read_messages_of_type(file_of(run.path, result), POLES)
+        messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message)[1] for _, _, message in messages]
     assert [origin.time_ns for origin in told] == [1000 + k for k in range(TRUTHS)]

@@ -60,6 +60,7 @@ class Bench:
 
     def measure(self, design, label, seed, enough, recording, check):
         blocks = 0
+        recording.measurement_id = 1000 + seed
         recording.write("/note", "std_msgs/msg/String", time.time_ns(), note(label))
         while blocks < design.periods:
             check()

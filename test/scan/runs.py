@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 import numpy as np
 
 from tactile_resonance.scan.messages import message_types
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
 from tactile_resonance.scan.scan_point import ScanPoint
 
 POLES = "tactile_resonance/msg/Poles"
@@ -21,6 +21,7 @@ VALUES = {
     "float": float,
     "str": str,
     "bool": {"True": True, "False": False}.__getitem__,
+    "Kind": Kind,
     "Outcome": lambda text: Outcome[text.upper()],
 }
 

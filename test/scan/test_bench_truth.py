@@ -10,6 +10,7 @@ import pytest
 from tactile_resonance.report.point_table import point_table, repeats_sentence, table_notes
 from tactile_resonance.scan.bench_truth import deviations, truths_of
 from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -37,7 +38,7 @@ def poles(recording, topic, status, measurement_id, middle_ns, f0_hz):
         **{name: np.array(value) for name, value in values.items()},
     )
     cdr = message_types().serialize_cdr(message, POLES)
-    recording.write(topic, POLES, stamp_ns, cdr, topic.endswith("truth"))
+    recording.write(topic, POLES, stamp_ns, cdr)
 
 
 @pytest.fixture
@@ -53,7 +54,11 @@ def run(tmp_path):
             measured = {"f0_hz": 250.05, "f0_std_hz": 0.01, "damping_ratio": 0.0301}
             measured |= {"damping_ratio_std": 1e-4, "repeats": 3}
             measured |= {"disturbances": "arm_stale 1, force_stale 2", "force_n": 0.01}
-            recording.finish(result(0, measurement_id=7, simulated=True, **measured))
+            of_point = result(0, measurement_id=7, simulated=True, **measured)
+            recording.finish(of_point)
+            (told,) = message_types().deserialize_cdr(recording.message_of(of_point), RESULT).poles
+            # the last poles, and no truth
+            assert (told.header.stamp.nanosec, told.status, told.f0_hz[0]) == (400_000_000, 0, 250.5)
         with run.begin_point(1) as recording:  # of hardware: nobody knows the truth
             poles(recording, "/poles", 0, 8, 400_000_000, 251.0)
             recording.finish(result(1, measurement_id=8))

@@ -16,7 +16,7 @@ from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import to_message
-from tactile_resonance.scan.recorded import EXCITATION, read_recorded
+from tactile_resonance.scan.recorded import EXCITATION, read_recorded, recorded_results
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -138,6 +138,13 @@ def test_numbers_and_texts_of_a_result_that_were_not_recorded_are_unknown(tmp_pa
     assert math.isnan(read.f0_shift_hz)
     assert (read.disturbances, read.repeats, read.notes) == ("", 2, "x")
     assert (read.index, read.f0_hz, read.damping_ratio) == (0, 250.0, 0.03)
+
+
+def test_results_of_runs_without_kinds_and_poles_can_be_told(tmp_path):
+    version = older(RESULT, ("kind", "poles"))
+    (cdr,) = recorded_results(read_run(old_run(tmp_path / "run", PointResult=version)))
+    told = message_types().deserialize_cdr(cdr, RESULT)
+    assert (told.kind, told.poles, told.f0_hz, told.notes) == ("tissue", [], 250.0, "x")
 
 
 @pytest.mark.parametrize(

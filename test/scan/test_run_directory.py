@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -10,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.messages import message_types
-from tactile_resonance.scan.point_result import COLUMNS, Outcome, as_csv
+from tactile_resonance.scan.point_file import offered_qos
+from tactile_resonance.scan.point_result import COLUMNS, Kind, Outcome, as_csv
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 
@@ -25,6 +28,7 @@ from runs import (
     RECORD,
     START_NS,
     assert_same,
+    blank,
     plan,
     record_cdr,
     record_point,
@@ -45,11 +49,11 @@ def test_a_run_is_read_back_by_an_independent_reader(tmp_path):
         for index in range(3):
             record_point(run, index, messages=2 + index)
         with run.begin_reference("air-before") as reference:
-            reference.write("/excitation", RECORD, START_NS - 10**9, record_cdr(9), latched=True)
-            reference.finish()
+            reference.write("/excitation", RECORD, START_NS - 10**9, record_cdr(9))
+            reference.finish(result(3, kind=Kind.AIR, time_ns=START_NS - 10**9))
     with AnyReader([tmp_path / "run" / "recording"]) as reader:
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
-        assert counts == {"/record": 2 + 3 + 4, "/point_result": 3, "/excitation": 1}
+        assert counts == {"/record": 2 + 3 + 4, "/point_result": 4, "/excitation": 1}
         heard = [
             (c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()
         ]
@@ -108,9 +112,58 @@ def test_a_row_a_message_and_a_file_say_the_same(tmp_path):
     for a, b, c in zip(given, rows, read, strict=True):
         assert_same(a, b)
         assert_same(a, c)
-    # every field of the message is a column
+    # every field of the message but its poles is a column
     fields = [name for name, _ in message_types().fielddefs["tactile_resonance/msg/PointResult"][1]]
-    assert ["header", *[c for c in COLUMNS if c not in ("time_ns", "frame_id")]] == fields
+    columns = [c for c in COLUMNS if c not in ("time_ns", "frame_id")]
+    assert ["header", *columns, "poles"] == fields
+
+
+def offers_of(path):
+    """Texts in the metadata of the channels of an MCAP file: key and value, each after its length."""
+    content = path.read_bytes()
+    summary = content[int.from_bytes(content[-28:-20], "little") :]  # not compressed; see the footer
+    for found in re.finditer(b"offered_qos_profiles", summary):
+        size = int.from_bytes(summary[found.end() : found.end() + 4], "little")
+        yield summary[found.end() + 4 : found.end() + 4 + size].decode()
+
+
+def test_replays_offer_what_the_nodes_offered(tmp_path):
+    """As rosbag2 writes it, both where it reads: else a replayed topic is offered as volatile."""
+    with create(tmp_path / "run") as run:
+        with run.begin_reference("air-before") as reference:
+            poles = message_types().serialize_cdr(blank(message_types().types, POLES), POLES)
+            reference.write("/poles", POLES, START_NS, poles, offered_qos(1024, latched=True))
+            wrench = offered_qos(5, reliable=False)
+            reference.write("/wrench", RECORD, START_NS, record_cdr(0), wrench)
+            reference.finish(result(4, kind=Kind.AIR))
+        record_point(run, 0)
+    path = tmp_path / "run" / "recording"
+    content = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    in_yaml = {
+        topic["topic_metadata"]["name"]: topic["topic_metadata"]["offered_qos_profiles"]
+        for topic in content["topics_with_message_count"]
+    }
+    assert in_yaml["/record"] == []  # nobody said
+    in_mcap = [yaml.safe_load(text) for text in offers_of(path / "reference-00-air-before.mcap")]
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    for topic, reliability, durability, depth in (
+        ("/poles", "reliable", "transient_local", 1024),
+        ("/point_result", "reliable", "transient_local", 4096),
+        ("/wrench", "best_effort", "volatile", 5),
+    ):
+        (profile,) = in_yaml[topic]
+        assert [profile] in in_mcap
+        assert profile == {
+            "history": "keep_last",
+            "depth": depth,
+            "reliability": reliability,
+            "durability": durability,
+            "deadline": forever,
+            "lifespan": forever,
+            "liveliness": "automatic",
+            "liveliness_lease_duration": forever,
+            "avoid_ros_namespace_conventions": False,
+        }
 
 
 def test_an_attempt_more_replaces_the_row_and_keeps_the_file(tmp_path):

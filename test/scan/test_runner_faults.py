@@ -15,13 +15,16 @@ from tactile_resonance.scan.hands import (
     ATTEMPTS_WITHOUT_NODE,
     NodeAway,
     PointDisturbed,
+    PointFailed,
     ScanEnded,
 )
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.point_result import TYPE, Kind, Outcome, from_message
+from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.scene import OnFailure, TimeLimits
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from bench_hands import Bench, scan, scene
+from bench_hands import Bench, begin, scan, scene
 
 
 def test_a_point_that_fails_is_kept_with_its_reason_and_the_scan_goes_on(tmp_path):
@@ -85,6 +88,72 @@ def test_a_reference_that_is_disturbed_comes_again(tmp_path):
         assert (summary.complete, summary.done) == (True, 4)
         references = [file.name for file in run.files if file.name.startswith("reference-")]
         assert [name[13:-5] for name in sorted(references)] == kept
+
+
+def test_every_attempt_is_told_with_what_became_of_it(tmp_path):
+    controls, left, cdrs = Controls(), [True], []
+
+    def on_measure(bench, blocks):
+        if bench.log[-1] == ("touch", 1) and left and left.pop():
+            raise PointDisturbed("contact: force_stale: 11 ms", "force_stale")
+        if bench.log[-1] == ("touch", 2) and blocks == 2:
+            controls.ask(Request.SKIP)
+        if bench.log[-1] == ("touch", 4):
+            controls.ask(Request.CANCEL)
+
+    made = scene(5)
+    plan, run = begin(tmp_path / "run", made)
+    bench = Bench(on_measure=on_measure, failing=(3,))
+    with run:
+        on_disk = []
+
+        def publish(cdr):
+            cdrs.append(cdr)
+            on_disk.append(len(run.content.files))
+
+        runner.ScanRunner(made, plan, run, bench, controls, lambda _: None, 1, publish).run()
+    told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in cdrs]
+    assert [(r.kind, r.index, r.attempt, r.outcome, r.measurement_id) for r in told] == [
+        (Kind.AIR, 5, 0, Outcome.DONE, 1006),
+        (Kind.TISSUE, 0, 0, Outcome.DONE, 1001),
+        (Kind.TISSUE, 1, 0, Outcome.DISCARDED, 1002),
+        (Kind.TISSUE, 1, 0, Outcome.DONE, 1002),
+        (Kind.TISSUE, 2, 0, Outcome.SKIPPED, 1003),
+        (Kind.TISSUE, 3, 0, Outcome.FAILED, 0),
+        (Kind.TISSUE, 4, 0, Outcome.DISCARDED, 1005),
+    ]
+    assert [r.reason for r in told] == [
+        *("", "", "contact: force_stale: 11 ms", "", "skipped on request"),
+        *("contact: surface_missing: nothing there", "left on request"),
+    ]
+    assert np.isfinite([r.f0_hz for r in told]).tolist() == [True, True, False, True, *[False] * 3]
+    # what counts is on disk before it is told, and told again of a run that is gone on with
+    assert on_disk == [1, 2, 2, 3, 4, 5, 5]
+    kept = [cdr for cdr, r in zip(cdrs, told, strict=True) if r.outcome is not Outcome.DISCARDED]
+    assert list(recorded_results(run.content)) == kept
+
+
+def test_a_reference_that_fails_is_told_and_so_is_one_that_ends_the_scan(tmp_path):
+    class Failing(Bench):
+        def measure(self, design, label, seed, enough, recording, check):
+            recording.measurement_id = next(ids)
+            raise next(errors)
+
+    ids = iter((7, 8, 9))
+    errors = iter((PointDisturbed("frf: lost"), PointFailed("no poles"), ScanEnded("no node")))
+    made = scene(1, on_failure=OnFailure.STOP)
+    plan, run = begin(tmp_path / "run", made)
+    told = []
+    with run:
+        runner.ScanRunner(
+            made, plan, run, Failing(), Controls(), lambda _: None, 1, told.append
+        ).run()
+    told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in told]
+    assert [(r.kind, r.index, r.outcome, r.reason, r.measurement_id) for r in told] == [
+        (Kind.AIR, 1, Outcome.DISCARDED, "frf: lost", 7),
+        (Kind.AIR, 1, Outcome.FAILED, "no poles", 8),
+        (Kind.TISSUE, 0, Outcome.DISCARDED, "no node", 9),
+    ]
 
 
 @dataclass
