@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ HOST = "127.0.80.1"  # of the bench's time where no robot is
 ALL = "all at once"
 UP_WITHIN_S = 240.0  # of a machine that may have other work
 SCAN_WITHIN_S = 300.0
+LOST_WITHIN_S = 60.0
 LONGEST_WAIT_S = 3.0
 BLOCKS = 3
 SCENE = """
@@ -93,7 +95,7 @@ class KilledScan:
         self._known: dict[str, Finished] = {}
         self._run = folder / "run-0"
         self._runs = 0
-        self._phase, self._finished = "", 0
+        self._phase, self._finished, self._heard = "", 0, False
         self.kills: list[Kill] = []
 
     def __enter__(self) -> KilledScan:
@@ -179,15 +181,24 @@ class KilledScan:
         self._ask(resume=False)
 
     def _ask(self, *, resume: bool) -> None:
-        from tactile_resonance.action import Scan
-
-        goal = Scan.Goal(scene=str(self._scene), run_directory=str(self._run), resume=resume)
         # a scan that was killed before it had a folder cannot be resumed
-        if resume and not (self._run / "run.json").exists():
-            goal.resume = False
-        self._result = self._client.start(goal, self._hear).get_result_async()
+        goal: dict[str, Any] = {"scene": self._scene}
+        if resume:
+            self._heard = False
+
+            def known() -> bool:
+                return self._heard or self._result.done()
+
+            self._client.wait(known, LOST_WITHIN_S, "the fate of the scan")
+            if self._heard:  # its goal was not accepted before the kill, and is now
+                return
+            if (self._run / "run.json").exists():
+                goal = {"resume": True}
+        scan = self._client.tactile.scan
+        self._result = scan(**goal, run_directory=self._run, on_feedback=self._hear)
 
     def _hear(self, feedback) -> None:
+        self._heard = True
         self._phase, self._finished = feedback.phase, feedback.finished
 
     def _look(self) -> dict[str, Finished]:
@@ -201,11 +212,11 @@ class KilledScan:
         return found
 
     def _to_the_end(self) -> dict[int, tuple[float, ...]]:
-        from tactile_resonance.action import Scan
+        from tactile_resonance.client import Ending
 
         self._client.wait(self._result.done, SCAN_WITHIN_S, "the scan")
-        result = self._result.result().result
-        assert result.outcome == Scan.Result.COMPLETE, result.message
+        result = self._result.result()
+        assert result.ending is Ending.COMPLETE, result.message
         assert (result.done, result.failed, result.skipped) == (self._points, 0, 0), result.message
         found = self._look()
         assert sorted(point.index for point in found.values()) == list(range(self._points))

@@ -97,7 +97,8 @@ class LiveClient(ScanClient):
     def rest(self) -> None:
         """Wait until contact_node tells that nothing is under way."""
         self.contact_state = ""  # what was told last may be of a node that is away now
-        self.wait(lambda: self.contact_state == "idle", CONTACT_WITHIN_S, "contact_node to rest")
+        idle = msg.ContactState.STATE_IDLE
+        self.wait(lambda: self.contact_state == idle, CONTACT_WITHIN_S, "contact_node to rest")
 
     def _on_contact(self, message: msg.ContactState) -> None:
         self.contact_state = message.state
@@ -159,7 +160,7 @@ class LiveBench:
             held = self.client.press()
             if held:
                 shares = self._over(lambda: self._spin(seconds))
-                held = self.client.contact_state == "hold"
+                held = self.client.contact_state == msg.ContactState.STATE_HOLD
             self.client.draw_back()
             if held:
                 return shares, lost
@@ -167,13 +168,17 @@ class LiveBench:
 
     def scan(self) -> LiveScan:
         """Scan the scene; this process listens to the feedback only."""
-        goal = Scan.Goal(scene=str(self._job.scene), run_directory=str(self._job.output), seed=1)
         heard: list[Scan.Feedback] = []
-        handle = self.client.start(goal, heard.append)
+        scan = self.client.tactile.scan(
+            scene=self._job.scene,
+            run_directory=self._job.output,
+            seed=1,
+            on_feedback=heard.append,
+        )
         self.client.wait(lambda: bool(heard), CONTACT_WITHIN_S, "the scan to begin")
-        begun_s, results = time.monotonic(), []
-        shares = self._over(lambda: results.append(self.client.result(handle, SCAN_WITHIN_S)))
-        (result,) = results
+        begun_s = time.monotonic()
+        shares = self._over(lambda: self.client.wait(scan.done, SCAN_WITHIN_S, "the scan"))
+        result = scan.result()
         return LiveScan(
             shares,
             time.monotonic() - begun_s,

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rclpy.action import ActionClient
-from tactile_resonance.action import Measure, Scan
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.running import RESULTS
@@ -73,10 +73,10 @@ def main() -> None:
             told |= client.counts(result.measurement_id)
         else:
             run = Path(folder)
-            goal = Scan.Goal(scene=str(run / "scene.yaml"), run_directory=str(run / "run"))
-            result = client.scan(goal, lambda _: None, 300.0)
-            names = ("outcome", "message", "points", "done", "failed", "blocks")
-            told = {name: getattr(result, name) for name in names}
+            outcome = client.scan(300.0, scene=run / "scene.yaml", run_directory=run / "run")
+            names = ("message", "points", "done", "failed", "blocks")
+            told = {"ending": outcome.ending.value}
+            told |= {name: getattr(outcome, name) for name in names}
         told["took_s"] = time.monotonic() - begun_s
     print(json.dumps(told))
 

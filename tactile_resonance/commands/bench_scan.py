@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
@@ -19,6 +19,7 @@ from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, STALLS_S
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
+    from tactile_resonance.client import ScanOutcome
 
 NODES = (
     *("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),
@@ -30,7 +31,6 @@ COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan
 NICENESS = 10
 START_WITHIN_S = 300.0  # they come up in seconds; a machine with much else to do takes longer
 INTERRUPTED = 130
-SCAN_WITHIN_S = 24 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,7 @@ def run_job(job: Job) -> int:
                 f"{package} not found: a scan needs ROS 2, ur-rtde, python-can and rosbags; use "
                 "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
             )
+    from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
     from tactile_resonance.scan.scene import read_scan_scene
 
@@ -154,7 +155,7 @@ def run_job(job: Job) -> int:
     ended.at_once()  # every file of a report is whole or not there
     report.run(argparse.Namespace(run_folder=job.output))
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
-    return 0 if result.outcome == type(result).COMPLETE and result.done else 1
+    return 0 if result.ending is Ending.COMPLETE and result.done else 1
 
 
 class _Ended:
@@ -218,19 +219,14 @@ def node_parameters(
     return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}
 
 
-def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> Scan.Result:
+def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     # only here: the command answers --help, and reports what is missing, without ROS
-    from tactile_resonance.action import Scan
+    from tactile_resonance.client import Ending
     from tactile_resonance.nodes.scan_client import ScanClient
 
-    goal = Scan.Goal(
-        scene=str(job.scene),
-        run_directory=str(job.output),
-        resume=job.resume,
-        seed=job.seed,
-        notes=job.notes,
-    )
-
+    goal: dict[str, Any] = {"run_directory": job.output, "resume": job.resume}
+    if not job.resume:
+        goal |= {"scene": job.scene, "seed": job.seed, "notes": job.notes}
     up = False
 
     def check() -> None:
@@ -244,9 +240,9 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> Scan.Result:
         client.wait_until_up(START_WITHIN_S)
         up = True
         with _Bar() as bar:
-            result = client.scan(goal, bar.show, SCAN_WITHIN_S)
+            result = client.scan(**goal, on_feedback=bar.show)
         stalls = client.details("fake_hardware_node").get("simulator stalls")
-    if result.outcome == Scan.Result.REFUSED:
+    if result.ending in (Ending.REJECTED, Ending.REFUSED, Ending.LOST):
         raise ValueError(f"scan: {result.message}")
     print(
         f"{result.message}: {result.done} points with poles, {result.failed} failed, {result.skipped} "

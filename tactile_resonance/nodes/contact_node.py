@@ -131,7 +131,7 @@ class ContactNode(ManagedNode):
             "make_contact",
             self._on_goal,
             on_cancel=lambda _: self._news.trigger(),
-            ready=self._ready,
+            refusal=self._refusal,
         )
 
     def activate(self) -> None:
@@ -206,9 +206,13 @@ class ContactNode(ManagedNode):
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
         return parameters, limits
 
-    def _ready(self) -> bool:
+    def _refusal(self, _: MakeContact.Goal) -> str:
         """Goals are taken one at a time, while both devices are well and the tip is not stopped."""
-        return self._goal is None and self._fault is None and not self._stop.stopped
+        if self._goal is not None:
+            return "a contact is under way"
+        if self._stop.stopped:
+            return "the tip is stopped"
+        return "" if self._fault is None else str(self._fault)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         result = MakeContact.Result(cause="refused")

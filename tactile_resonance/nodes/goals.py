@@ -119,7 +119,7 @@ class Goals:
                     refused = futures[-1].result()
                     if len(futures) > 1 and self._known(refused):
                         return refused
-                    _drop(futures)
+                    drop(futures)
                     return None
                 if not self.client.server_is_ready():
                     raise NodeAway(f"{self.name}: its node went away", "node went away")
@@ -130,7 +130,7 @@ class Goals:
                 check()
                 self.pause(POLL_S)
         except BaseException:
-            _drop(futures)
+            drop(futures)
             # its answer may be lost, and a cancellation does not need it; RuntimeError: ROS has been shut down
             with contextlib.suppress(RuntimeError):
                 ClientGoalHandle(self.client, goal_id, None).cancel_goal_async()
@@ -151,7 +151,7 @@ class Goals:
         return future.done()
 
 
-def _drop(futures: list[Future]) -> None:
+def drop(futures: list[Future]) -> None:
     """Ignore answers from now on, but cancel goals that they accept."""
     for future in futures:
         future.add_done_callback(_cancel_if_taken)

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.contact.goal import State
 from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -128,7 +129,7 @@ class IdealContact:
         self._base_frame, self._frame_id = base_frame, frame_id
         self._lock = threading.Lock()
         self._drawn_back = threading.Event()
-        self._state, self._cause, self._message = "idle", "", ""
+        self._state, self._cause, self._message = State.IDLE, "", ""
         self._depth_m = math.nan
         self._stop = stop
         self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
@@ -141,7 +142,7 @@ class IdealContact:
             "make_contact",
             self._on_goal,
             on_cancel=lambda _: self.draw_back(),
-            ready=lambda: not stop.stopped,
+            refusal=lambda _: "the tip is stopped" if stop.stopped else "",
         )
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
@@ -169,16 +170,16 @@ class IdealContact:
             if result.message:
                 return result
             self._drawn_back.clear()
-            self._say("approach", "", "")
+            self._say(State.APPROACH, "", "")
             began_ns = self._now_ns()
             if not self._wait(CONTACT_S):
-                self._say("idle", "cancelled", "drawn back as asked for")
+                self._say(State.IDLE, "cancelled", "drawn back as asked for")
                 result.cause, result.message = self._cause, self._message
                 return result
             place = request.pose.pose.position
             found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
             if found is None:
-                self._say("idle", "surface_missing", "nothing to touch there")
+                self._say(State.IDLE, "surface_missing", "nothing to touch there")
                 result.cause, result.message = self._cause, self._message
                 return result
             self._depth_m, result.surface_m = found
@@ -187,7 +188,7 @@ class IdealContact:
             pose.header.stamp = time_message(now_ns)
             self._stays.add(Stay(now_ns, request.force_n, pose))
             self._placed()
-            self._say("hold", "none", "")
+            self._say(State.HOLD, "none", "")
             if self._drawn_back.is_set():  # asked for after the wait
                 self.draw_back()
             result.reached, result.cause, result.depth_m = True, "none", self._depth_m
@@ -207,8 +208,8 @@ class IdealContact:
             return f"force_n: {request.force_n:g}, accepted is above 0"
         if self._stop.stopped:
             return "goal: refused while the tip is stopped"
-        if self._state != "idle":
-            return f"goal: refused in state {self._state}; accepted in idle"
+        if self._state is not State.IDLE:
+            return f"goal: refused in state {self._state.value}; accepted in idle"
         return ""
 
     def _wait(self, seconds: float) -> bool:
@@ -237,24 +238,24 @@ class IdealContact:
     def draw_back(self) -> None:
         """Lift the tip off, also one that is on its way."""
         self._drawn_back.set()
-        if self._state == "hold":
+        if self._state is State.HOLD:
             now_ns = self._now_ns()
             self._stays.add(Stay(now_ns, 0.0, self._stays.newest.pose))
             self._depth_m = math.nan
             self._placed()
-            self._say("idle", "cancelled", "drawn back as asked for")
+            self._say(State.IDLE, "cancelled", "drawn back as asked for")
 
-    def _say(self, state: str, cause: str, message: str) -> None:
+    def _say(self, state: State, cause: str, message: str) -> None:
         self._state, self._cause, self._message = state, cause, message
         self._publish()
 
     def _publish(self) -> None:
         now = time_message(self._now_ns())
         stay = self._stays.newest
-        state = msg.ContactState(state=self._state, cause=self._cause, message=self._message)
+        state = msg.ContactState(state=self._state.value, cause=self._cause, message=self._message)
         state.header.stamp, state.header.frame_id = now, self._frame_id
         state.stopped = self._stop.stopped
-        holds = self._state == "hold"
+        holds = self._state is State.HOLD
         state.force_n = stay.force_n if holds else math.nan
         state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan
         self._states.publish(state)

@@ -162,16 +162,17 @@ class ManagedNode(LifecycleNode):
         name: str,
         callback: Callable[[ServerGoalHandle], Awaitable[Any]],
         on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
-        ready: Callable[[], bool] = lambda: True,
+        refusal: Callable[[Any], str] = lambda _: "",
     ) -> None:
         """Action until the node is cleaned up.
 
-        Goals are accepted while the node is active and `ready`. A request to cancel is always accepted; the
-        callback ends the goal.
+        Goals are accepted while the node is active, unless `refusal` has a reason against them. A request to
+        cancel is always accepted; the callback ends the goal.
         """
 
-        def on_request(_: Any) -> GoalResponse:
-            return GoalResponse.ACCEPT if self.active and ready() else GoalResponse.REJECT
+        def on_request(goal: Any) -> GoalResponse:
+            accepted = self.active and not refusal(goal)
+            return GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
 
         def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:
             on_cancel(goal)

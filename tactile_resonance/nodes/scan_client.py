@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A client of scan_node: one goal, its progress, its result."""
+"""For commands and tests: spins around a `TactileClient`, and knows when all nodes are up."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.action import ActionClient
-from rclpy.action.client import ClientGoalHandle
 
-from tactile_resonance.action import Scan
-from tactile_resonance.nodes.client import NoAnswer, NodeClient
-from tactile_resonance.nodes.goals import TAKEN_WITHIN_S, Goals
-from tactile_resonance.scan.hands import NodeAway, ScanEnded
+from tactile_resonance.client import ScanOutcome, TactileClient
+from tactile_resonance.nodes.client import NodeClient
+
+SCAN_WITHIN_S = 24 * 3600.0
 
 
 class ScanClient(NodeClient):
@@ -24,16 +22,24 @@ class ScanClient(NodeClient):
     ----------
     check : callable
         Called while waiting; raises when waiting has become pointless.
+    name : str
+        Of its node.
+
+    Attributes
+    ----------
+    tactile : TactileClient
+    states : dict
+        What each node's diagnostics told last, by its name.
     """
 
-    def __init__(self, check: Callable[[], None]) -> None:
-        super().__init__("scan_client", check)
+    def __init__(self, check: Callable[[], None], name: str = "scan_client") -> None:
+        super().__init__(name, check)
         self.states: dict[str, str] = {}
         self._details: dict[str, dict[str, str]] = {}
 
     def join(self) -> None:
-        """Client of the action, reader of the diagnostics."""
-        self._goals = Goals(ActionClient(self._node, Scan, "scan"), "scan", self.spin)
+        """The client, and a reader of the diagnostics."""
+        self.tactile = TactileClient(self._node)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
     def why(self) -> str:
@@ -59,40 +65,11 @@ class ScanClient(NodeClient):
 
         self.wait(up, timeout_s, "the nodes to come up")
 
-    def start(self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None]) -> ClientGoalHandle:
-        """Ask for a scan until a node takes it.
-
-        A node that was killed stays in the graph for seconds: a goal that went to it is asked for again
-        when it has left, under a new id.
-
-        Raises
-        ------
-        NoAnswer
-            If no node takes it within `TAKEN_WITHIN_S`.
-        """
-        deadline = time.monotonic() + TAKEN_WITHIN_S
-        while True:
-            try:
-                return self._goals.send(
-                    goal, self._check, lambda: None, lambda message: feedback(message.feedback)
-                )
-            except NodeAway as error:
-                if time.monotonic() > deadline:
-                    raise NoAnswer(str(error)) from error
-            except ScanEnded as error:
-                raise NoAnswer(str(error)) from error
-
-    def result(self, handle: ClientGoalHandle, timeout_s: float) -> Scan.Result:
-        """Result of a scan."""
-        future = handle.get_result_async()
+    def scan(self, timeout_s: float = SCAN_WITHIN_S, **wanted: Any) -> ScanOutcome:
+        """Ask for a scan as `TactileClient.scan` does, and wait for its outcome."""
+        future = self.tactile.scan(**wanted)
         self.wait(future.done, timeout_s, "the scan")
-        return future.result().result
-
-    def scan(
-        self, goal: Scan.Goal, feedback: Callable[[Scan.Feedback], None], timeout_s: float
-    ) -> Scan.Result:
-        """Ask for a scan and wait for its result."""
-        return self.result(self.start(goal, feedback), timeout_s)
+        return future.result()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

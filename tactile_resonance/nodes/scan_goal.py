@@ -9,6 +9,7 @@ import sys
 from rclpy.executors import ExternalShutdownException
 
 from tactile_resonance.action import Scan
+from tactile_resonance.client import Ending, ScanOutcome
 from tactile_resonance.nodes.client import NoAnswer
 from tactile_resonance.nodes.parameters import Parameter, declare, values
 from tactile_resonance.nodes.scan_client import ScanClient
@@ -42,15 +43,20 @@ PARAMETERS = (
         read_only=True,
     ),
 )
-SCAN_WITHIN_S = 24 * 3600.0
+QUIET = (
+    Scan.Feedback.PHASE_SURFACE,
+    Scan.Feedback.PHASE_REFERENCE,
+    Scan.Feedback.PHASE_PAUSED,
+    Scan.Feedback.PHASE_WAITING,
+)
+"""Phases in which no point is under way."""
 
 
 class ScanGoal(ScanClient):
     """A node of that name with the goal's fields as parameters."""
 
     def __init__(self) -> None:
-        super().__init__(lambda: None)
-        self._name = "scan_goal"
+        super().__init__(lambda: None, "scan_goal")
         self._said = ""
 
     def join(self) -> None:
@@ -58,24 +64,29 @@ class ScanGoal(ScanClient):
         super().join()
         declare(self._node, PARAMETERS)
 
-    def run(self) -> Scan.Result:
+    def run(self) -> ScanOutcome:
         """Wait for the nodes, scan."""
         names = ("scene", "run_directory", "resume", "notes")
-        goal = Scan.Goal(**dict(zip(names, values(self._node, *names), strict=True)))
+        goal = dict(zip(names, values(self._node, *names), strict=True))
+        if goal["resume"]:
+            del goal["scene"]  # that of the run
         self.wait_until_up(values(self._node, "start_within_s")[0])
-        result = self.scan(goal, self._tell, SCAN_WITHIN_S)
+        outcome = self.scan(**goal, on_feedback=self._tell)
+        if not outcome.points:
+            raise NoAnswer(f"{outcome.ending.value}: {outcome.message}")
         say = self._node.get_logger().info
         say(
-            f"{result.message}: {result.done} of {result.points} points with poles, {result.failed} failed, "
-            f"{result.skipped} skipped, {result.repeats} repeats; run in {result.run_directory}"
+            f"{outcome.message}: {outcome.done} of {outcome.points} points with poles, "
+            f"{outcome.failed} failed, {outcome.skipped} skipped, {outcome.repeats} repeats; "
+            f"run in {outcome.run_directory}"
         )
-        if result.sensor_health:
-            say(result.sensor_health)
-        return result
+        if outcome.sensor_health:
+            say(outcome.sensor_health)
+        return outcome
 
     def _tell(self, feedback: Scan.Feedback) -> None:
         text = f"{feedback.finished} of {feedback.points} points finished"
-        if feedback.phase in ("surface", "reference", "paused", "waiting"):
+        if feedback.phase in QUIET:
             text = feedback.phase
         elif feedback.finished and feedback.time_left_s > 0:
             text += f", {feedback.time_left_s:.0f} s left"
@@ -90,8 +101,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with ScanGoal() as client:
-            result = client.run()
-        sys.exit(0 if result.outcome == Scan.Result.COMPLETE else 1)
+            outcome = client.run()
+        sys.exit(0 if outcome.ending is Ending.COMPLETE else 1)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (NoAnswer, ValueError) as error:

@@ -11,30 +11,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.vectors import rotated, turn_from_quaternion
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
+from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
+from tactile_resonance.scan.goal import Frames, ScanGoal, WantedScan, read_goal, resumed_run
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
-from tactile_resonance.scan.notes import parse_notes
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.point_result import TOPIC
-from tactile_resonance.scan.progress import Progress, Summary
+from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.recorded import recorded_results
-from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -58,6 +56,12 @@ PARAMETERS = (
         "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
         read_only=True,
     ),
+    Parameter(
+        "table_frame",
+        "table",
+        "Name of that frame in a scan of poses without a scene file; a scene names its own.",
+        read_only=True,
+    ),
     Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
     Parameter(
         "run_folder",
@@ -72,10 +76,11 @@ PARAMETERS = (
 )
 
 FEEDBACK_EVERY_S = 0.2
+RUNNING = "a scan is running, cancel it or wait for its result"
 
 
 class ScanNode(ManagedNode):
-    """Action `scan`; services `scan/pause`, `scan/resume`, `scan/skip_point`, `scan/repeat_point`.
+    """Action `scan`; services `pause`, `resume`, `skip_point`, `repeat_point` and `rejection` of `scan/`.
 
     Publishes `point_result` (latched).
     """
@@ -85,12 +90,15 @@ class ScanNode(ManagedNode):
 
     def configure(self) -> None:
         """Offer the action; the topics are subscribed to when a scan begins."""
-        contact, table, base_frame = values(self, "contact", "table_in_base", "base_frame")
+        names = ("contact", "table_in_base", "table_frame", "base_frame")
+        contact, table, table_frame, base_frame = values(self, *names)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
         self._hands = NodeHands(
             self, table_in_base, base_frame, robot, self._time, self._tell_waiting
         )
+        self._frames = Frames(table_frame, base_frame, table_in_base)
+        self._rejection = ""
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
@@ -102,10 +110,12 @@ class ScanNode(ManagedNode):
             "scan/repeat_point": lambda c: c.ask(Request.REPEAT),
         }.items():
             self.serve(Trigger, name, self._control(ask))
-        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel())
+        self.serve(Trigger, "scan/rejection", self._on_rejection)
+        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel(), self._refusal)
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
+        self._rejection = ""
         self._cancel()
 
     def details(self) -> dict[str, str]:
@@ -113,7 +123,7 @@ class ScanNode(ManagedNode):
         progress = getattr(self, "_progress", None)
         if progress is None:
             return {}
-        return {"phase": progress.phase, "points": f"{progress.finished} of {progress.points}"}
+        return {"phase": progress.phase.value, "points": f"{progress.finished} of {progress.points}"}
 
     def _control(self, ask: Any) -> Any:
         def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -131,11 +141,31 @@ class ScanNode(ManagedNode):
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
 
+    def _refusal(self, message: Scan.Goal) -> str:
+        """Why a goal is rejected, kept for who asks; empty where it is accepted."""
+        try:
+            if self._goal is not None:
+                raise ValueError(RUNNING)
+            goal = goal_of(message)
+            if goal.resume:
+                resumed_run(goal)
+            else:
+                self._new_run(goal)
+            self._rejection = ""
+        except (ValueError, OSError) as error:
+            self._rejection = " ".join(str(error).split())
+            self.get_logger().warning(f"goal rejected: {self._rejection}")
+        return self._rejection
+
+    def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Why the last goal was rejected: rclpy has no place for it in its answer to a goal."""
+        response.success, response.message = bool(self._rejection), self._rejection
+        return response
+
     async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
         if self._goal is not None:
             goal.abort()
-            message = "a scan is running, cancel it or wait for its result"
-            return Scan.Result(outcome=Scan.Result.REFUSED, message=message)
+            return Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
         self._goal = goal
         try:
             with self._hands.listening():
@@ -166,7 +196,7 @@ class ScanNode(ManagedNode):
                 runner = ScanRunner(
                     *(scene, plan, run, self._hands, self._controls, tell, seed, self._publish)
                 )
-                _fill(result, runner.run())
+                fill_result(result, runner.run())
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
@@ -183,8 +213,9 @@ class ScanNode(ManagedNode):
         self, request: Scan.Goal, tell: Callable[[Progress], None]
     ) -> tuple[ScanScene, Plan, RunDirectory, int]:
         """Scene, plan and the open run of a goal; ValueError where it is refused."""
-        if request.resume:
-            run = RunDirectory.open(Path(request.run_directory).expanduser())
+        goal = goal_of(request)
+        if goal.resume:
+            run = RunDirectory.open(resumed_run(goal))
             try:
                 scene = read_scan_scene(run.path / "scene.yaml")
                 plan = plan_points(scene, run.content.points)
@@ -192,34 +223,30 @@ class ScanNode(ManagedNode):
             except BaseException:
                 run.close()
                 raise
-        if not request.scene:
-            raise ValueError("scene: empty, expected a scene file")
-        path = Path(request.scene).expanduser()
-        path = path if path.is_absolute() else share_path(request.scene)
-        scene, text = read_scan_scene(path), path.read_text(encoding="utf-8")
-        if request.notes:
-            scene = replace(scene, notes=parse_notes(request.notes, "notes"))
+        wanted, where, needed = self._new_run(goal)
+        scene, plan = wanted.scene, wanted.plan
         (seed,) = values(self, "seed")
-        seed = request.seed or seed
-        where = self._run_path(request.run_directory)
-        design = design_measurement(scene)
-        blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
-        points = max(len(scene.positions_m), len(request.poses.poses))
-        needed = expected_bytes(points, blocks, samples, design.lines)
-        RunDirectory.check_new(where, needed)
+        seed = goal.seed or seed
         found: FoundSurface | None = None
-        if request.poses.poses:
-            plan = plan_points(scene, _points_of(request.poses, scene))
-        elif isinstance(scene.surface, TouchRequest):
+        if plan is None:
+            assert isinstance(scene.surface, TouchRequest)
             found = self._find_surface(scene, scene.surface, tell)
             plan = make_plan(scene, found.surface)
-        else:
-            plan = make_plan(scene)
         facts = self._facts(scene, plan, seed)
         if found is not None:
             facts["surface"] = found.as_json()
-        run = RunDirectory.create(where, text, plan.points, facts, needed)
+        run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
+
+    def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
+        """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
+        wanted = read_goal(goal, self._frames)
+        where = self._run_path(goal.run_directory)
+        design = design_measurement(wanted.scene)
+        blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
+        needed = expected_bytes(len(wanted.scene.positions_m), blocks, samples, design.lines)
+        RunDirectory.check_new(where, needed)
+        return wanted, where, needed
 
     def _find_surface(
         self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
@@ -230,7 +257,7 @@ class ScanNode(ManagedNode):
         radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
 
         def touch(point: ScanPoint) -> Touch:
-            tell(Progress(point, "surface", point.index, len(asked.xy_m)))
+            tell(Progress(point, Phase.SURFACE, point.index, len(asked.xy_m)))
             try:
                 return self._hands.find(point, force_n, radius_m, controls.check)
             except PointFailed as error:
@@ -267,7 +294,7 @@ class ScanNode(ManagedNode):
         goal, progress = self._goal, self._progress
         if waited_for and goal is not None and progress is not None:
             self.get_logger().warning(f"the scan waits for {waited_for}")
-            goal.publish_feedback(_feedback(replace(progress, waiting_for=waited_for)))
+            goal.publish_feedback(feedback_message(replace(progress, waiting_for=waited_for)))
 
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
         last = [("", "", -math.inf)]
@@ -280,80 +307,9 @@ class ScanNode(ManagedNode):
             if progress.waiting_for and news != last[0][:2]:
                 self.get_logger().warning(f"the scan waits: {progress.waiting_for}")
             last[0] = (*news, now_s)
-            goal.publish_feedback(_feedback(progress))
+            goal.publish_feedback(feedback_message(progress))
 
         return tell
-
-
-def _points_of(poses: Any, scene: ScanScene) -> tuple[ScanPoint, ...]:
-    frame = poses.header.frame_id
-    if frame != scene.frame_id:
-        raise ValueError(f"poses: in frame {frame!r}, accepted is the scene's {scene.frame_id!r}")
-    points = []
-    for index, pose in enumerate(poses.poses):
-        place, turn = pose.position, pose.orientation
-        quaternion = (turn.x, turn.y, turn.z, turn.w)
-        if not 0.99 < math.hypot(*quaternion) < 1.01:
-            raise ValueError(
-                f"poses[{index}]: orientation {quaternion}, expected a unit quaternion"
-            )
-        normal = rotated(turn_from_quaternion(*quaternion), (0.0, 0.0, 1.0))
-        points.append(
-            ScanPoint(
-                index,
-                (place.x, place.y, place.z),
-                normal,
-                quaternion,
-                f"{scene.name}, point {index + 1}",
-            )
-        )
-    return tuple(points)
-
-
-def _feedback(progress: Progress) -> Scan.Feedback:
-    feedback = Scan.Feedback(
-        waiting_for=progress.waiting_for,
-        point=progress.point.index if progress.point else progress.finished,
-        finished=progress.finished,
-        points=progress.points,
-        phase=progress.phase,
-        blocks=progress.blocks,
-        time_left_s=float(progress.time_left_s),
-        repeats=progress.repeats,
-    )
-    nan = math.nan
-    feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
-    poles = progress.poles
-    if poles is not None and poles.f0_hz.size:
-        feedback.f0_hz, feedback.damping_ratio = (
-            float(poles.f0_hz[0]),
-            float(poles.damping_ratio[0]),
-        )
-        covariance = (
-            poles.total_covariance if poles.total_covariance is not None else poles.covariance
-        )
-        if covariance is not None:
-            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(
-                np.diag(covariance[0])
-            ).tolist()
-    return feedback
-
-
-def _fill(result: Scan.Result, summary: Summary) -> None:
-    result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
-    for name in (
-        "message",
-        "done",
-        "failed",
-        "skipped",
-        "blocks",
-        "blocks_saved",
-        "saved_s",
-        "repeats",
-    ):
-        setattr(result, name, getattr(summary, name))
-    result.sensor_drifted = summary.health is SensorHealth.DRIFTED
-    result.sensor_health = summary.health_sentence
 
 
 def main() -> None:

@@ -4,10 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.scan_point import ScanPoint
+
+
+class Phase(str, Enum):
+    """What a scan does; the values are those of ``action/Scan.action``."""
+
+    SURFACE = "surface"  # found by touch
+    REFERENCE = "reference"  # in free air
+    WAITING = "waiting"  # for a node
+    PAUSED = "paused"
+    CONTACT = "contact"
+    MEASURE = "measure"
+    RETRACT = "retract"
 
 
 @dataclass(frozen=True)
@@ -18,8 +31,7 @@ class Progress:
     ----------
     point : ScanPoint or None
         Under way; None before the first and after the last.
-    phase : str
-        For people: waiting, reference, contact, measure, retract, paused.
+    phase : Phase
     finished, points : int
     blocks : int
         At this point so far.
@@ -34,7 +46,7 @@ class Progress:
     """
 
     point: ScanPoint | None
-    phase: str
+    phase: Phase
     finished: int
     points: int
     blocks: int = 0

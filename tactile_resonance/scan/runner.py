@@ -29,7 +29,7 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import NAN, Kind, Outcome, PointResult
-from tactile_resonance.scan.progress import Progress, Summary
+from tactile_resonance.scan.progress import Phase, Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
@@ -128,10 +128,10 @@ class ScanRunner:
         deadline = time.monotonic() + NODE_BACK_WITHIN_S
         while not self._controls.cancelled.is_set():
             if self._controls.paused.is_set():
-                self._say(None, "paused")
+                self._say(None, Phase.PAUSED)
                 deadline = time.monotonic() + NODE_BACK_WITHIN_S
             elif missing := self._hands.missing():
-                self._say(None, "waiting", waiting_for=missing)
+                self._say(None, Phase.WAITING, waiting_for=missing)
                 if self._hands.held():
                     deadline = time.monotonic() + NODE_BACK_WITHIN_S
                 elif time.monotonic() > deadline:
@@ -148,7 +148,7 @@ class ScanRunner:
 
         def enough(poles: Poles, blocks: int) -> bool:
             decisions.append(self._decide(poles, blocks))
-            self._say(point, "measure", blocks, poles)
+            self._say(point, Phase.MEASURE, blocks, poles)
             return decisions[-1].stop
 
         def check() -> None:
@@ -162,9 +162,9 @@ class ScanRunner:
             seed = self._seed + point.index + recording.attempt * ATTEMPT_SEEDS
             self._hands.begin(self._seed, point.index, recording.attempt)
             try:
-                self._say(point, "contact")
+                self._say(point, Phase.CONTACT)
                 self._hands.touch(point, scene.force_n, scene.hold, check)
-                self._say(point, "measure")
+                self._say(point, Phase.MEASURE)
                 measured = self._hands.measure(
                     self._plan.measurement,
                     point.label,
@@ -190,7 +190,7 @@ class ScanRunner:
                 self._hands.retract()
                 self._discard(point, recording, reason)
                 return
-            self._say(point, "retract")
+            self._say(point, Phase.RETRACT)
             self._hands.retract()
             duration_s = self._hands.now_s() - begun_s
             if measured is None:
@@ -245,7 +245,7 @@ class ScanRunner:
         disturbed = Disturbances()
         while True:
             self._wait()
-            self._say(None, "reference")
+            self._say(None, Phase.REFERENCE)
             self._hands.begin(self._seed, point.index, 0)
             with self._run.begin_reference(name) as recording:
                 begun_s = self._hands.now_s()
@@ -312,7 +312,7 @@ class ScanRunner:
     def _say(
         self,
         point: ScanPoint | None,
-        phase: str,
+        phase: Phase,
         blocks: int = 0,
         poles: Poles | None = None,
         waiting_for: str = "",

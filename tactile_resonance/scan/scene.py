@@ -182,7 +182,24 @@ def read_scan_scene(path: Path) -> ScanScene:
         One line that names the field, its value and what is accepted.
     """
     path = Path(path)
-    content, where = read_yaml(path), path.name
+    return parse_scan_scene(read_yaml(path), path)
+
+
+def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
+    """Scene of a file's content.
+
+    Parameters
+    ----------
+    content : mapping
+    path : Path
+        Of the file: for messages, and for the files that it names.
+
+    Raises
+    ------
+    ValueError
+        One line that names the field, its value and what is accepted.
+    """
+    where = path.name
     for key, value in content.items():
         require(key in _KEYS, f"{where}: {key}", value, f"one of {sorted(_KEYS)}")
     force_n = number(content.get("force_n"), f"{where}: force_n")

@@ -12,8 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from robot_at_hand import own_time
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
-from tactile_resonance.action import Measure, Scan
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.configuration import share_path
@@ -71,13 +70,12 @@ class Client(ScanClient):
 
     def join(self):
         super().join()
-        self._repeat = self._node.create_client(Trigger, "scan/repeat_point")
         self._measure = ActionClient(self._node, Measure, "measure")
         self._asked = None
 
     def repeat_once(self, feedback):
         if self._asked is None and feedback.point == 1 and feedback.blocks:
-            self._asked = self._repeat.call_async(Trigger.Request())
+            self._asked = self.tactile.repeat()
 
     def measure(self):
         self.wait(self._measure.server_is_ready, 30.0, "the action measure")
@@ -104,8 +102,9 @@ def scanned(module_domain, tmp_path_factory):
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up((*NODES, "scan_node"), parameters)
         client.wait_until_up(60.0)
-        goal = Scan.Goal(scene=str(scene), run_directory=str(run))
-        result = client.scan(goal, client.repeat_once, 120.0)
+        result = client.scan(
+            120.0, scene=scene, run_directory=run, on_feedback=client.repeat_once
+        )
         assert (result.done, result.failed, result.skipped) == (3, 1, 0), result.message
         cloud = late_map(len(ACCEPTED))
         told = late_reader(msg.PointResult, "point_result", POINT_RESULTS, lambda m: len(m) == 7)

@@ -16,9 +16,10 @@ from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message
 from robot_at_hand import own_time
 from rosbags.highlevel import AnyReader
-from tactile_resonance.action import Measure, Scan
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
+from tactile_resonance.client import Ending
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
@@ -123,14 +124,13 @@ def recorded(module_domain, tmp_path_factory):
         client.join_all(periods=3)
         # somebody else is measuring when the scan begins: it waits, and records none of that
         other = client.ask(periods=60)
-        goal = Scan.Goal(scene=str(scene), run_directory=str(run))
-        result = client.scan(goal, lambda _: None, 90.0)
+        result = client.scan(90.0, scene=scene, run_directory=run)
         assert other.done()
         assert other.result().result.outcome == Measure.Result.DONE
         for _ in range(10):
             client.spin(0.05)
         heard = client.by_measurement()
-    assert result.outcome == Scan.Result.COMPLETE, result.message
+    assert result.ending is Ending.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (4, 0, 0)
     return run, heard, other.result().result.measurement_id
 

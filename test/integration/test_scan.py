@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 from tactile_resonance.action import Scan
 
 from tactile_resonance import msg
+from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
@@ -56,9 +57,11 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         nodes.bring_up(NODES, parameters)
         client.wait_until_up(90.0)
         heard = []
-        client.start(Scan.Goal(scene=str(scene), run_directory=str(run_path)), heard.append)
+        killed = client.tactile.scan(
+            scene=scene, run_directory=run_path, on_feedback=heard.append
+        )
         client.wait(
-            lambda: heard and heard[-1].finished >= 1 and heard[-1].phase == "measure",
+            lambda: heard and heard[-1].finished >= 1 and heard[-1].phase == Scan.Feedback.PHASE_MEASURE,
             90.0,
             "a point",
         )
@@ -70,14 +73,15 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         assert [r.index for r in before.results] == [0]
         # started anew, brought up by the manager, and on it goes
         nodes.start("scan_node", parameters["scan_node"])
-        goal = Scan.Goal(run_directory=str(run_path), resume=True)
-        result = client.scan(goal, heard.append, 180.0)
+        client.wait(killed.done, 60.0, "the loss of the scan to be noticed")
+        assert killed.result().ending is Ending.LOST
+        result = client.scan(180.0, run_directory=run_path, resume=True)
         told = []
         client._node.create_subscription(
             msg.PointResult, "point_result", told.append, POINT_RESULTS
         )
         client.wait(lambda: len(told) == 5, 20.0, "all results")
-    assert result.outcome == Scan.Result.COMPLETE, result.message
+    assert result.ending is Ending.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (3, 0, 0)
     run = read_run(run_path)
     assert run.problems == ()

@@ -14,6 +14,7 @@ from std_srvs.srv import SetBool
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import ContactState
 
+from tactile_resonance.client import Ending
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
@@ -46,12 +47,13 @@ class Supervisor(ScanClient):
     def _on_contact(self, message):
         self.contact = message.state
 
-    def begin(self, goal):
+    def begin(self, **goal):
         """Ask for a scan, and wait until it measures."""
         self.heard = []
-        self.handle = self.start(goal, self.heard.append)
+        self.outcome = self.tactile.scan(**goal, on_feedback=self.heard.append)
+        measures = Scan.Feedback.PHASE_MEASURE
         self.wait(
-            lambda: self.heard and self.heard[-1].phase == "measure", WITHIN_S, "a measurement"
+            lambda: self.heard and self.heard[-1].phase == measures, WITHIN_S, "a measurement"
         )
 
     def see_it_wait(self, reason):
@@ -66,8 +68,9 @@ class Supervisor(ScanClient):
 
     def see_it_complete(self):
         """It goes on, and repeats the point."""
-        result = self.result(self.handle, 180.0)
-        assert result.outcome == Scan.Result.COMPLETE, result.message
+        self.wait(self.outcome.done, 180.0, "the scan")
+        result = self.outcome.result()
+        assert result.ending is Ending.COMPLETE, result.message
         assert (result.done, result.failed, result.repeats) == (2, 0, 1)
 
     def call(self, kind, name, request):
@@ -99,8 +102,7 @@ def supervisor(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, Supervisor(nodes.check) as supervisor:
         nodes.bring_up(NODES, parameters)
         supervisor.wait_until_up(90.0)
-        goal = Scan.Goal(scene=str(scene), run_directory=str(tmp_path / "run"))
-        supervisor.begin(goal)
+        supervisor.begin(scene=scene, run_directory=tmp_path / "run")
         yield supervisor
 
 

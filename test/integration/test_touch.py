@@ -12,6 +12,7 @@ from robot_at_hand import own_host, own_time
 from scipy.spatial.transform import Rotation
 from tactile_resonance.action import Scan
 
+from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
@@ -54,17 +55,21 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, ScanClient(nodes.check) as client:
         nodes.bring_up(NODES, parameters)
         client.wait_until_up(90.0)
-        phases = []
-        goal = Scan.Goal(scene=str(scene), run_directory=str(run_path), notes="{tip_wetness: wet}")
-        result = client.scan(goal, lambda feedback: phases.append(feedback.phase), 240.0)
-        assert result.outcome == Scan.Result.COMPLETE, result.message
+        result = client.scan(
+            240.0, scene=scene, run_directory=run_path, notes="{tip_wetness: wet}"
+        )
+        assert result.ending is Ending.COMPLETE, result.message
         assert result.done == 1, read_run(run_path).latest[0].reason
         # gone on with, there is nothing left to do and nothing is touched again
-        phases.clear()
-        goal = Scan.Goal(run_directory=str(run_path), resume=True)
-        again = client.scan(goal, lambda feedback: phases.append(feedback.phase), 60.0)
-        assert (again.outcome, again.done) == (Scan.Result.COMPLETE, 1)
-        assert "surface" not in phases
+        phases = []
+        again = client.scan(
+            60.0,
+            run_directory=run_path,
+            resume=True,
+            on_feedback=lambda feedback: phases.append(feedback.phase),
+        )
+        assert (again.ending, again.done) == (Ending.COMPLETE, 1)
+        assert Scan.Feedback.PHASE_SURFACE not in phases
     run = read_run(run_path)
     assert run.facts["notes"] == {"tip_wetness": "wet"}
     assert len(run.facts["surface"]["touches"]) == 4

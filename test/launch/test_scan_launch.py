@@ -22,6 +22,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from tactile_resonance.action import Scan
 
 from launch import LaunchDescription
+from tactile_resonance.client import Ending
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import read_run
@@ -84,16 +85,20 @@ class TestScan(unittest.TestCase):
 
         def hear(feedback):
             heard.append(feedback)
-            if feedback.phase == "measure" and feedback.point == 1 and not killed:
+            if feedback.phase == Scan.Feedback.PHASE_MEASURE and feedback.point == 1 and not killed:
                 killed.append(time.monotonic())
                 kill("frf_node")
 
         with ScanClient(lambda: None) as client:
             client.wait_until_up(120.0)
-            goal = Scan.Goal(scene=str(FOLDER / "scene.yaml"), run_directory=str(FOLDER / "run"))
-            result = client.scan(goal, hear, 300.0)
+            result = client.scan(
+                300.0,
+                scene=FOLDER / "scene.yaml",
+                run_directory=FOLDER / "run",
+                on_feedback=hear,
+            )
         assert killed
-        assert result.outcome == Scan.Result.COMPLETE, result.message
+        assert result.ending is Ending.COMPLETE, result.message
         assert (result.done, result.failed) == (2, 0), result.message
         run = read_run(FOLDER / "run")
         assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0)]

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Goals whose answers are late or lost, on a clock that is told: none is left of which nobody knows."""
 
+import contextlib
 from dataclasses import dataclass
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -12,10 +14,12 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from action_msgs.msg import GoalStatus
 from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
+from tactile_resonance.action import Scan
 
+from tactile_resonance import client as client_module
+from tactile_resonance.client import SILENT_S, TICK_S, Ending, TactileClient
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
 
 REFUSED = "refused"
@@ -48,6 +52,7 @@ class Node:
     def __init__(self, answers):
         self.now_s, self.up = 0.0, True
         self.answers = answers
+        self.result_of = lambda status: status
         self.ends_after_s = 0.0  # from a cancellation to the end of its goal
         self.asked, self.running, self.cancelled = [], [], []
         self.results = {}
@@ -116,7 +121,8 @@ class Node:
 
     def end(self, goal_id, status=GoalStatus.STATUS_SUCCEEDED):
         self.running.remove(goal_id)
-        self.results[goal_id].set_result(SimpleNamespace(status=status, result=status))
+        result = self.result_of(status)
+        self.results[goal_id].set_result(SimpleNamespace(status=status, result=result))
 
 
 @pytest.fixture
@@ -211,23 +217,6 @@ def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was
     assert node.running == []
 
 
-def test_a_scan_asked_of_a_node_that_was_killed_is_taken_by_the_one_that_follows(taken):
-    # a killed node stays in the graph until its lease ends: the first goal goes to it
-    node, _ = taken({0: LOST})
-    client = ScanClient(lambda: None)
-
-    def follow():
-        node.up = not 1.0 < node.now_s < 5.0
-
-    pause, node.pause = node.pause, lambda seconds: (pause(seconds), follow())
-    client._goals = Goals(node, "scan", node.pause)
-    handle = client.start("goal", nothing)
-    assert handle.accepted
-    assert node.now_s > 5.0
-    assert node.running == [bytes(handle.goal_id.uuid)]
-    assert node.asked[0] != node.asked[-1]
-
-
 def test_a_goal_that_nobody_takes_ends_the_scan(taken):
     node, goals = taken(dict.fromkeys(range(10000), REFUSED))
     with pytest.raises(ScanEnded, match="measure: no node takes the goal for 60 s"):
@@ -269,3 +258,77 @@ def test_a_goal_of_a_node_that_was_started_anew_is_not_waited_for(taken):
     with pytest.raises(NodeAway, match="its node does not know the goal"):
         goals.follow(handle, nothing, nothing)
     assert node.now_s < 1.0
+
+
+@pytest.fixture
+def scan(monkeypatch):
+    """Makes a node, the outcome of a scan asked of it, and what lets that scan go on for some time."""
+
+    def make(answers=None):
+        node = Node(answers or {})
+        node.result_of = lambda _: Scan.Result(outcome=Scan.Result.COMPLETE)
+        monkeypatch.setattr(client_module, "time", node)
+        monkeypatch.setattr(client_module, "GoalClient", lambda *_, **__: node)
+        client = TactileClient(MagicMock())
+        future, conducted = client.scan(scene="x.yaml"), client._conduct()
+
+        def go_on(seconds):
+            until_s = node.now_s + seconds
+            while not future.done() and node.now_s < until_s:
+                with contextlib.suppress(StopIteration):
+                    conducted.send(None)
+                node.pause(TICK_S)
+                client._on_tick()
+
+        return node, client, future, go_on
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "answers", [{}, {0: 5.0}, {0: 5.0, 1: LOST, 2: LOST}, {0: LOST}, {0: LOST, 1: 1.0}]
+)
+def test_a_scan_whose_answers_are_late_or_lost_is_accepted_once(scan, answers):
+    node, _, future, go_on = scan(answers)
+    go_on(10.0)
+    assert len(set(node.asked)) == len(node.running) == 1
+    assert not future.done()
+    node.end(node.asked[0])
+    go_on(1.0)
+    assert future.result().ending is Ending.COMPLETE
+    assert node.cancelled == []
+
+
+def test_a_scan_asked_of_a_node_that_was_killed_is_taken_by_the_one_that_follows(scan):
+    # a killed node stays in the graph until its lease ends: the first goal goes to it
+    node, _, future, go_on = scan({0: LOST})
+    go_on(1.0)
+    node.up = False
+    node.running.clear()
+    node.results.clear()
+    go_on(5.0)
+    assert node.running == []
+    node.up = True
+    go_on(5.0)
+    assert len(node.running) == 1
+    assert not future.done()
+
+
+def test_a_scan_whose_node_was_started_anew_is_lost(scan):
+    node, _, future, go_on = scan()
+    go_on(60.0)
+    assert not future.done()
+    node.results.clear()
+    go_on(SILENT_S + 1.0)
+    assert future.result().ending is Ending.LOST
+
+
+@pytest.mark.parametrize("answers", [{0: 1.0}, {0: LOST}, {0: 3.0}, {0: Late(1.0)}, {0: Late(5.0)}])
+def test_a_scan_that_is_cancelled_before_its_answer_came_does_not_go_on(scan, answers):
+    node, client, future, go_on = scan(answers)
+    go_on(0.5)
+    client.cancel()
+    go_on(30.0)
+    node.pause(10.0)  # what is late comes now
+    assert node.running == []
+    assert future.result().ending is Ending.CANCELLED

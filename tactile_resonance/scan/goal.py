@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a goal of the action ``scan`` asks for: its scene, its points, and why it is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import number, read_yaml, require
+from tactile_resonance.scan.notes import parse_notes
+from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
+from tactile_resonance.scan.surface import TouchRequest
+
+
+@dataclass(frozen=True)
+class ScanGoal:
+    """A goal, as ``action/Scan.action`` gives unit and meaning of each field.
+
+    ``poses``, each of place [m] and quaternion (x, y, z, w), and ``frame_id`` stand for its ``poses``.
+    """
+
+    scene: str = ""
+    poses: Sequence[Sequence[float]] = ()
+    frame_id: str = ""
+    force_n: float = 0.0
+    f0_std_hz: float = 0.0
+    damping_ratio_std: float = 0.0
+    run_directory: str = ""
+    resume: bool = False
+    seed: int = 0
+    notes: str = ""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames in which poses may be given.
+
+    Attributes
+    ----------
+    table : str
+        Name of the frame of a scan without a scene file; a scene names its own.
+    base : str
+        Name of the robot's base.
+    table_in_base : Pose
+    """
+
+    table: str
+    base: str
+    table_in_base: Pose
+
+
+@dataclass(frozen=True)
+class WantedScan:
+    """What a goal asks for.
+
+    Attributes
+    ----------
+    scene : ScanScene
+        With what the goal has in place of the file's.
+    text : str
+        The same as a scene file.
+    plan : Plan or None
+        None: the surface is to be found by touch.
+    """
+
+    scene: ScanScene
+    text: str
+    plan: Plan | None
+
+
+def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
+    """What a goal for a new run asks for.
+
+    Raises
+    ------
+    ValueError
+        One line that names the field, its value and what is accepted.
+    OSError
+        If its scene cannot be read.
+    """
+    path = scene_path(goal.scene) if goal.scene else Path("goal")
+    content = read_yaml(path) if goal.scene else _without_file(goal, frames)
+    changes = _changes(goal)
+    frame_id = str(content.get("frame_id", ScanScene.frame_id))
+    poses = _poses_in_table(goal, frame_id, frames)
+    if len(poses):
+        content.pop("surface", None)
+        changes["positions"] = {"list": poses[:, :3].tolist()}
+    content = {**content, **changes}
+    scene = parse_scan_scene(content, path)
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    if goal.scene and not changes:
+        text = path.read_text(encoding="utf-8")
+    if len(poses):
+        plan: Plan | None = plan_points(scene, _points(poses, scene.name))
+    else:
+        plan = None if isinstance(scene.surface, TouchRequest) else make_plan(scene)
+    return WantedScan(scene, text, plan)
+
+
+def resumed_run(goal: ScanGoal) -> Path:
+    """Folder of the run that a goal goes on with.
+
+    Raises
+    ------
+    ValueError
+        If there is no run, or the goal asks for something else than the run does.
+    """
+    path = Path(goal.run_directory).expanduser()
+    good = bool(goal.run_directory) and (path / "run.json").is_file()
+    require(good, "run_directory", goal.run_directory, "the folder of a run, to resume it")
+    only = ScanGoal(run_directory=goal.run_directory, resume=True)
+    for name, value in asdict(goal).items():
+        default = getattr(only, name)
+        unset = isinstance(value, float) and math.isnan(value)
+        require(value == default or unset, name, value, f"{default!r} with resume: it is the run's")
+    return path
+
+
+def scene_path(scene: str) -> Path:
+    """Path of a scene file, absolute or in the package's share folder."""
+    path = Path(scene).expanduser()
+    return path if path.is_absolute() else share_path(path)
+
+
+def _without_file(goal: ScanGoal, frames: Frames) -> dict[str, Any]:
+    require(len(goal.poses) > 0, "scene", goal.scene, "a scene file, or poses and force_n")
+    wanted = goal.force_n != 0 and not math.isnan(goal.force_n)
+    require(wanted, "force_n", goal.force_n, "a number above 0 where no scene has one")
+    return {"name": "poses", "frame_id": frames.table}
+
+
+def _changes(goal: ScanGoal) -> dict[str, Any]:
+    """Sections of the scene that the goal has others for."""
+    given = {}
+    for name in ("force_n", "f0_std_hz", "damping_ratio_std"):
+        value = getattr(goal, name)
+        if value == 0 or math.isnan(value):
+            continue
+        require(0 < value < math.inf, name, value, "a number above 0 (0 or NaN: the scene's)")
+        given[name] = value
+    changes: dict[str, Any] = {}
+    if "force_n" in given:
+        changes["force_n"] = given.pop("force_n")
+    if given:
+        changes["precision"] = given
+    if goal.notes:
+        changes["notes"] = parse_notes(goal.notes, "notes").as_json()
+    return changes
+
+
+def _poses_in_table(goal: ScanGoal, table: str, frames: Frames) -> npt.NDArray[np.float64]:
+    """(n, 7) places [m] and unit quaternions of the goal's poses, in the frame of the scene."""
+    if not goal.poses:
+        return np.zeros((0, 7))
+    accepted = f"{table!r} or {frames.base!r}"
+    good = goal.frame_id in (table, frames.base)
+    require(good, "poses.header.frame_id", goal.frame_id, accepted)
+    for index, pose in enumerate(goal.poses):
+        for value, name in zip(pose, "xyzxyzw", strict=True):
+            number(value, f"poses[{index}]: {name}")
+        good = 0.99 < math.hypot(*pose[3:]) < 1.01
+        require(good, f"poses[{index}].orientation", tuple(pose[3:]), "a unit quaternion")
+    poses = np.array(goal.poses, dtype=float)
+    if goal.frame_id != table:
+        back = frames.table_in_base.rotation.inv()
+        places = back.apply(poses[:, :3] - frames.table_in_base.position_m)
+        turns = (back * Rotation.from_quat(poses[:, 3:])).as_quat()
+        poses = np.concatenate([places, turns], axis=1)
+    return poses
+
+
+def _points(poses: npt.NDArray[np.float64], name: str) -> tuple[ScanPoint, ...]:
+    normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
+    return tuple(
+        ScanPoint(
+            index,
+            tuple(pose[:3].tolist()),
+            tuple(normal.tolist()),
+            tuple(pose[3:].tolist()),
+            f"{name}, point {index + 1}",
+        )
+        for index, (pose, normal) in enumerate(zip(poses, normals, strict=True))
+    )

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node of a user that asks scan_node for scans: what is rejected, and why; cancel, pause, skip."""
+
+import math
+import os
+import time
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+from geometry_msgs.msg import Point, Pose, Quaternion
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+from tactile_resonance.action import Scan
+from tactile_resonance.msg import PointResult
+
+from tactile_resonance.client import Ending, ScanOutcome, TactileClient
+from tactile_resonance.nodes.running import POLES, initialised
+from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
+from tactile_resonance.processes import free_domain_id
+from test.spinning import spin_until
+
+HERE = (Pose(),)
+GOAL = {"poses": HERE, "frame": "table", "force_n": 0.01}
+
+
+class Stack:
+    """scan_node without a robot, alone, and a user's node."""
+
+    def __init__(self, executor, folder):
+        self.executor = executor
+        self.scan_node = ScanNode()
+        self.user = Node("user")
+        self.client = TactileClient(self.user)
+        self.folder = folder
+        for node in (self.scan_node, self.user):
+            executor.add_node(node)
+
+    def activate(self):
+        self.scan_node.trigger_configure()
+        self.scan_node.trigger_activate()
+
+    def until(self, holds):
+        assert spin_until(self.executor, holds)
+
+    def ended(self, future):
+        self.until(future.done)
+        outcome = future.result()
+        assert isinstance(outcome, ScanOutcome)
+        return outcome
+
+    def begin(self, heard, **goal):
+        """A scan that waits for nodes, which do not come."""
+        goal = {**GOAL, "run_directory": self.folder / "run", **goal}
+        future = self.client.scan(**goal, on_feedback=heard.append)
+        self.until(lambda: heard and heard[-1].phase == Scan.Feedback.PHASE_WAITING)
+        return future
+
+
+@pytest.fixture(params=[SingleThreadedExecutor, lambda: MultiThreadedExecutor(2)])
+def stack(request, tmp_path):
+    with initialised(
+        domain_id=free_domain_id(os.environ), args=["--ros-args", "-p", "contact:=none"]
+    ):
+        made = Stack(request.param(), tmp_path)
+        try:
+            yield made
+        finally:
+            made.client.destroy()
+            made.user.destroy_node()
+            made.scan_node.destroy_node()
+            made.executor.shutdown()
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(stack):
+    stack.activate()
+    (stack.folder / "full").mkdir()
+    (stack.folder / "full" / "something").touch()
+    lying = (Pose(orientation=Quaternion(w=0.5)),)
+    nowhere = (Pose(position=Point(x=math.nan)),)
+    new = stack.folder / "new"
+    for changes, reason in (
+        ({"poses": ()}, "scene: got ''; accepted is a scene file, or poses and force_n"),
+        ({"frame": "camera"}, "got 'camera'; accepted is 'table' or 'base'"),
+        ({"force_n": -0.01}, "force_n: got -0.01; accepted is a number above 0"),
+        ({"force_n": 0.0}, "force_n: got 0.0; accepted is a number above 0"),
+        ({"f0_std_hz": -1.0}, "f0_std_hz: got -1.0"),
+        ({"damping_ratio_std": math.inf}, "damping_ratio_std: got inf"),
+        ({"poses": lying}, "poses[0].orientation: got (0.0, 0.0, 0.0, 0.5)"),
+        ({"poses": nowhere}, "poses[0]: x: got nan; accepted is a finite number"),
+        ({"notes": "{tip_wetness: damp}"}, "notes.tip_wetness: got 'damp'"),
+        ({"scene": stack.folder / "none.yaml"}, "none.yaml: cannot be read"),
+        ({"run_directory": stack.folder / "full"}, "holds something; accepted is a new or empty"),
+        ({"resume": True}, "accepted is the folder of a run, to resume it"),
+    ):
+        goal = {**GOAL, "run_directory": new, **changes}
+        outcome = stack.ended(stack.client.scan(**goal))
+        assert outcome.ending is Ending.REJECTED
+        assert reason in outcome.message
+        assert not new.exists()
+
+
+def test_a_scan_is_followed_paused_and_cancelled_by_a_node_that_does_not_spin_itself(stack):
+    stack.activate()
+    heard = []
+    future = stack.begin(heard)
+    with pytest.raises(RuntimeError, match="one of this client is under way"):
+        stack.client.scan(**GOAL)
+    pausing = stack.client.pause()
+    stack.until(lambda: pausing.done() and heard[-1].phase == Scan.Feedback.PHASE_PAUSED)
+    assert pausing.result().success
+    resuming = stack.client.resume()
+    stack.until(lambda: resuming.done() and heard[-1].phase == Scan.Feedback.PHASE_WAITING)
+    # somebody else's goal
+    other = TactileClient(stack.user)
+    outcome = stack.ended(other.scan(**GOAL))
+    assert (outcome.ending, outcome.message) == (Ending.REJECTED, RUNNING)
+    other.destroy()
+    stack.client.cancel()
+    outcome = stack.ended(future)
+    assert (outcome.ending, outcome.points) == (Ending.CANCELLED, 1)
+    assert outcome.run_directory == str(stack.folder / "run")
+    # and the next
+    heard.clear()
+    again = stack.begin(heard, run_directory=stack.folder / "second")
+    stack.client.cancel()
+    assert stack.ended(again).ending is Ending.CANCELLED
+    skipping = stack.client.skip()
+    stack.until(skipping.done)
+    assert (skipping.result().success, skipping.result().message) == (False, "no scan is running")
+
+
+def test_results_of_points_come_while_a_scan_is_under_way(stack):
+    stack.activate()
+    points, inside, most_inside = [], [], []
+
+    def on_point(point):
+        inside.append(point)
+        most_inside.append(len(inside))
+        time.sleep(0.02)
+        points.append(point.label)
+        inside.pop()
+
+    publisher = stack.user.create_publisher(PointResult, "point_result", POLES)
+    publisher.publish(PointResult(label="of a scan before"))
+    spin_until(stack.executor, lambda: False, 0.5)
+    future = stack.begin([], on_point=on_point)
+    labels = [f"point {k}" for k in range(20)]
+    for label in labels:
+        publisher.publish(PointResult(label=label))
+    stack.until(lambda: len(points) == len(labels))
+    assert points == labels
+    assert max(most_inside) == 1  # whatever the executor
+    stack.client.cancel()
+    stack.ended(future)
+    publisher.publish(PointResult(label="of a scan after"))
+    assert not spin_until(stack.executor, lambda: len(points) > len(labels), 0.5)
+
+
+def test_an_outcome_can_be_awaited(stack):
+    stack.activate()
+
+    async def palpate():
+        return await stack.client.scan(**{**GOAL, "frame": "camera"})
+
+    task = stack.executor.create_task(palpate)
+    assert stack.ended(task).ending is Ending.REJECTED
+
+
+def test_a_node_that_is_not_active_is_waited_for(stack):
+    outcome = stack.ended(stack.client.scan(**GOAL, wait_s=0.3))
+    assert outcome.ending is Ending.REJECTED
+    assert outcome.message == "no scan_node is there, for 0.3 s"
+    repeating = stack.client.repeat()
+    stack.until(repeating.done)
+    assert not repeating.result().success
+    stack.scan_node.trigger_configure()
+    outcome = stack.ended(stack.client.scan(**GOAL, wait_s=2.0))
+    assert outcome == ScanOutcome(Ending.REJECTED, "scan_node is not active, for 2 s")
+    future = stack.client.scan(**GOAL)
+    assert not spin_until(stack.executor, future.done, 0.5)
+    stack.client.cancel()
+    assert stack.ended(future).ending is Ending.CANCELLED
+    future = stack.client.scan(**{**GOAL, "frame": "camera"})
+    assert not spin_until(stack.executor, future.done, 0.5)
+    stack.scan_node.trigger_activate()
+    assert "got 'camera'" in stack.ended(future).message
+    # what it had against the last goal is nothing against the next
+    stack.scan_node.trigger_deactivate()
+    outcome = stack.ended(stack.client.scan(**GOAL, wait_s=1.0))
+    assert outcome.message == "scan_node is not active, for 1 s"
+
+
+def test_a_scan_whose_node_goes_away_is_lost(stack):
+    stack.activate()
+    future = stack.begin([])
+    stack.executor.remove_node(stack.scan_node)
+    stack.scan_node.trigger_deactivate()
+    stack.scan_node.trigger_cleanup()
+    assert stack.ended(future).ending is Ending.LOST
+
+
+def test_a_scan_node_in_a_namespace_is_named(stack):
+    client = TactileClient(stack.user, namespace="left")
+    outcome = stack.ended(client.scan(**GOAL, wait_s=0.3))
+    assert client._goals._action_name == "left/scan"
+    assert outcome.ending is Ending.REJECTED
+    client.destroy()

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a goal of a scan asks for: exact places, what it has in place of its scene, and why it is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.scan.decision import Precise
+from tactile_resonance.scan.goal import Frames, ScanGoal, read_goal, resumed_run
+from tactile_resonance.scan.scene import read_scan_scene
+
+TABLE_IN_BASE = Pose(np.array([-0.49, -0.13, 0.2]), np.array([0.3, -0.2, -1.5]))
+FRAMES = Frames("table", "base", TABLE_IN_BASE)
+TILTED = Rotation.from_rotvec([0.1, -0.2, 0.7])
+POSES = ((0.0, 0.001, 0.0, 0.0, 0.0, 0.0, 1.0), (0.004, -0.003, 0.0021, *TILTED.as_quat().tolist()))
+GOAL = ScanGoal(poses=POSES, frame_id="table", force_n=0.012)
+SCENE = """
+name: slope
+frame_id: phantom
+force_n: 0.01
+surface: {plane: {point_m: [0, 0, 0], normal: [0, 0.1, 1]}}
+positions: {list: [[0, 0], [0.004, 0]]}
+precision: {f0_std_hz: 0.05}
+regions: [{name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0, 0], radius_m: 0.03}}]
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "slope.yaml"
+    path.write_text(SCENE)
+    return str(path)
+
+
+def again(wanted, tmp_path):
+    """The scene as a run that is gone on with reads it."""
+    path = tmp_path / "again.yaml"
+    path.write_text(wanted.text)
+    return read_scan_scene(path)
+
+
+def test_poses_need_no_scene_and_give_points_at_exactly_these_places(tmp_path):
+    wanted = read_goal(GOAL, FRAMES)
+    assert tuple((*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points) == POSES
+    assert wanted.plan.points[1].normal == pytest.approx(TILTED.apply([0, 0, 1]).tolist())
+    for scene in (wanted.scene, again(wanted, tmp_path)):
+        assert (scene.force_n, scene.frame_id) == (0.012, "table")
+
+
+def test_poses_in_the_base_are_those_places_in_the_frame_of_the_scene(scene):
+    turn, place = TABLE_IN_BASE.rotation, TABLE_IN_BASE.position_m
+    in_base = tuple(
+        (*(place + turn.apply(pose[:3])), *(turn * Rotation.from_quat(pose[3:])).as_quat())
+        for pose in POSES
+    )
+    for named in ("", scene):
+        goal = ScanGoal(scene=named, poses=in_base, frame_id="base", force_n=0.012)
+        for point, pose in zip(read_goal(goal, FRAMES).plan.points, POSES, strict=True):
+            assert point.position_m == pytest.approx(pose[:3], abs=1e-12)
+            turned = Rotation.from_quat(point.orientation_xyzw) * Rotation.from_quat(pose[3:]).inv()
+            assert turned.magnitude() < 1e-12
+
+
+def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene, tmp_path):
+    wanted = read_goal(ScanGoal(scene=scene), FRAMES)
+    assert wanted.text == SCENE
+    assert [p.position_m[2] for p in wanted.plan.points] == [0.0, 0.0]
+    goal = ScanGoal(
+        scene=scene,
+        poses=POSES,
+        frame_id="phantom",
+        force_n=0.02,
+        damping_ratio_std=1e-4,
+        notes="{tip_wetness: wet}",
+    )
+    wanted = read_goal(goal, FRAMES)
+    for read in (wanted.scene, again(wanted, tmp_path)):
+        assert read.force_n == 0.02
+        assert read.precision == Precise(None, 1e-4)
+        assert read.notes.tip_wetness == "wet"
+        assert read.positions_m.tolist() == [list(pose[:3]) for pose in POSES]
+    assert "gelatine_percent" in wanted.text  # the bench reads it too
+    unset = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
+    assert (unset.scene.force_n, unset.scene.precision) == (0.01, Precise(0.05))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"poses": ()}, "scene: got ''; accepted is a scene file, or poses and force_n"),
+        ({"scene": "config/scenes/none.yaml"}, "config/scenes/none.yaml"),
+        ({"frame_id": "camera"}, "frame_id: got 'camera'; accepted is 'table' or 'base'"),
+        ({"frame_id": ""}, "frame_id: got ''; accepted is 'table' or 'base'"),
+        ({"force_n": 0.0}, "force_n: got 0.0; accepted is a number above 0"),
+        ({"force_n": math.nan}, "force_n: got nan; accepted is a number above 0"),
+        ({"force_n": -0.01}, "force_n: got -0.01; accepted is a number above 0"),
+        ({"force_n": math.inf}, "force_n: got inf; accepted is a number above 0"),
+        ({"f0_std_hz": -1.0}, "f0_std_hz: got -1.0; accepted is a number above 0"),
+        ({"damping_ratio_std": math.inf}, "damping_ratio_std: got inf"),
+        ({"notes": "{tip_wetness: damp}"}, "notes.tip_wetness: got 'damp'"),
+        ({"poses": ((0, math.nan, 0, 0, 0, 0, 1),)}, r"poses\[0\]: y: got nan"),
+        ({"poses": (POSES[0], (0,) * 7)}, r"poses\[1\].orientation: got \(0, 0, 0, 0\)"),
+    ],
+)
+def test_a_goal_that_is_wrong_is_refused_with_the_field_its_value_and_what_is_accepted(
+    changes, reason
+):
+    with pytest.raises((ValueError, OSError), match=reason):
+        read_goal(replace(GOAL, **changes), FRAMES)
+
+
+def test_the_frame_of_poses_is_that_of_the_scene(scene):
+    with pytest.raises(ValueError, match="got 'table'; accepted is 'phantom' or 'base'"):
+        read_goal(replace(GOAL, scene=scene), FRAMES)
+
+
+def test_a_run_is_resumed_as_it_was_asked_for(tmp_path):
+    goal = ScanGoal(run_directory=str(tmp_path), resume=True)
+    with pytest.raises(ValueError, match=r"run_directory: got .*; accepted is the folder of a run"):
+        resumed_run(goal)
+    (tmp_path / "run.json").write_text("{}")
+    assert resumed_run(replace(goal, force_n=math.nan)) == tmp_path
+    for changes in ({"force_n": 0.02}, {"scene": "x.yaml"}, {"poses": POSES}, {"seed": 2}):
+        (name,) = changes
+        with pytest.raises(ValueError, match=f"{name}: got .* with resume: it is the run's"):
+            resumed_run(replace(goal, **changes))
