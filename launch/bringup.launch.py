@@ -77,8 +77,9 @@ def generate_launch_description():
         ),
         DeclareLaunchArgument(
             "table_frame",
-            default_value="table",
-            description="Frame of scenes and map; with a namespace it is best one of its own.",
+            default_value="",
+            description="Frame of the table, of poses and of the map; by default table. With a namespace it is "
+            "best one of its own.",
         ),
         DeclareLaunchArgument(
             "base_frame",
@@ -129,7 +130,7 @@ def _nodes(context):
     ]
     wanted = []
     if plan.table is not None and given.get("static_transforms") != "false":
-        wanted.append(_table_in_base(plan.table, plan.base_frame, given["table_frame"]))
+        wanted.append(_table_in_base(plan.table, plan.base_frame, plan.table_frame))
     if given["rviz"] == "true":
         view = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "pole_map.rviz"])
         wanted.append(
@@ -138,7 +139,7 @@ def _nodes(context):
                 executable="rviz2",
                 namespace=LaunchConfiguration("namespace"),
                 # the view's topics are relative: those of the namespace, which the title names
-                arguments=["-d", view, "-f", given["table_frame"], "-t", "Pole map of {NAMESPACE}"],
+                arguments=["-d", view, "-f", plan.table_frame, "-t", "Pole map of {NAMESPACE}"],
                 parameters=[{"use_sim_time": plan.simulated_time}],
                 remappings=[("/clock", "clock")],
             )

@@ -38,6 +38,7 @@ ARGUMENTS = {
     "robot_config": ("robot_config", "contact_node"),
     "force_config": ("force_config", "contact_node"),
     "base_frame": ("base_frame", "contact_node", "scan_node", "fake_hardware_node"),
+    "table_frame": ("table_frame", "scan_node"),
     "run_folder": ("run_folder", "scan_node"),
     "scene": ("scene", "fake_hardware_node"),
 }
@@ -62,13 +63,14 @@ class Bringup:
         Whether they live in the time of the simulated bench.
     table : Pose or None
         Where the simulated table stands in the robot's base; None where there is none.
-    base_frame : str
+    base_frame, table_frame : str
     """
 
     nodes: dict[str, Parameters]
     simulated_time: bool
     table: Pose | None
     base_frame: str
+    table_frame: str
 
 
 def read_parameter_file(path: str | Path) -> dict[str, Parameters]:
@@ -206,18 +208,20 @@ def plan_bringup(
         for node, name in (("contact_node", "force_config"), ("scan_node", "table_in_base")):
             accepted = "one that argument or params_file states: a robot must not move by a default"
             require(value(node, name) is not None, name, None, accepted)
+    base_frame = value("scan_node", "base_frame") or "base"
+    table_frame = value("scan_node", "table_frame") or "table"
     if (stands := value("scan_node", "table_in_base")) is not None:
-        base_frame = value("scan_node", "base_frame") or "base"
         tell("pole_map_node", "base_frame", base_frame=base_frame)
         tell("pole_map_node", "table_in_base", table_in_base=_table(stands))
-        tell("pole_map_node", "", frame_id=given.get("table_frame", "table"))
+        tell("pole_map_node", "table_frame", frame_id=table_frame)
     for node in nodes:
         plan.check(node)
     return Bringup(
         nodes={node: plan.told[node] for node in nodes},
         simulated_time=simulated_time,
         table=None if table is None else Pose.from_vector(np.array(table)),
-        base_frame=value("scan_node", "base_frame") or "base",
+        base_frame=base_frame,
+        table_frame=table_frame,
     )
 
 

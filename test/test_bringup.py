@@ -312,6 +312,10 @@ def test_the_map_lies_on_the_table_where_the_scan_has_it(own):
     told = nodes["pole_map_node"]
     assert (told["frame_id"], told["base_frame"]) == ("left_table", "left_base")
     assert told["table_in_base"] == nodes["scan_node"]["table_in_base"]
+    assert nodes["scan_node"]["table_frame"] == "left_table"
+    del given["table_frame"]
+    _, nodes = heard(given, {"/left/scan_node": {"table_frame": "bed"}}, "/left")
+    assert nodes["pole_map_node"]["frame_id"] == "bed"
     _, nodes = heard(given, {"/left/pole_map_node": {"frame_id": "bed"}}, "/left")
     assert nodes["pole_map_node"]["frame_id"] == "bed"
     _, nodes = heard({"use_mock_hardware": "false", "robot": "false"})
