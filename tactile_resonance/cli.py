@@ -30,8 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"tactile_resonance: {_one_line(error)}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("tactile_resonance: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print(f"tactile_resonance: interrupted{error}", file=sys.stderr)
         return 130
 
 

@@ -127,10 +127,14 @@ def run_job(job: Job) -> int:
             )
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
+    from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
 
     begun_s = time.monotonic()
-    content = read_scan_scene(job.scene)  # errors in it are reported before anything is started
+    # what cannot be scanned is reported before anything is started
+    content = read_scan_scene(job.scene)
+    if not job.resume:
+        RunDirectory.check_new(job.output, 0)
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     ended = _Ended()
@@ -151,6 +155,11 @@ def run_job(job: Job) -> int:
             result = _scan(nodes, job, ended)
         except RuntimeError as error:
             raise ValueError(f"{error} (logs in {work / 'log'})") from error
+        except KeyboardInterrupt as error:
+            if not (job.output / "scene.yaml").exists():
+                raise
+            text = f"; tactile_resonance resume {job.output} goes on with the run"
+            raise KeyboardInterrupt(text) from error
     ended.check()
     ended.at_once()  # every file of a report is whole or not there
     report.run(argparse.Namespace(run_folder=job.output))

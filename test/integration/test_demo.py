@@ -98,6 +98,25 @@ def test_interrupted_demo_leaves_no_process(domain, tmp_path, number):
     assert processes_of(domain) == []
 
 
+def test_an_interrupted_scan_says_how_to_go_on_and_its_folder_is_taken(domain, tmp_path):
+    demo, run = start(tmp_path, domain), tmp_path / "run"
+    deadline = time.monotonic() + 60
+    while not (run / "scene.yaml").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    demo.send_signal(signal.SIGINT)
+    _, errors = demo.communicate(timeout=60)
+    end = f"interrupted; tactile_resonance resume {run} goes on with the run"
+    assert errors.splitlines()[-1] == f"tactile_resonance: {end}"
+    again = subprocess.run(
+        [*COMMAND, "--output", run], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert again.returncode == 1
+    assert again.stderr == (
+        f"tactile_resonance: run: {run} holds something; accepted is a new or empty folder\n"
+    )
+    assert again.stdout == "", "nodes were started"
+
+
 def test_killed_demo_takes_its_nodes_along(domain, tmp_path):
     demo = start(tmp_path, domain)
     demo.kill()
