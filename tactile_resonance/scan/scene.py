@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
     known_keys,
     number,
@@ -91,6 +92,8 @@ class SensorUse:
     heading_rad: float = 0.0
 
     def __post_init__(self) -> None:
+        known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))
+        require(self.name in known, "name", self.name, f"one of config/sensors: {', '.join(known)}")
         require(self.band_low_hz > 0, "band_low_hz", self.band_low_hz, "a number above 0")
         good = self.band_high_hz > self.band_low_hz
         require(

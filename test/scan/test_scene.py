@@ -122,6 +122,7 @@ def test_classes_from_a_file_and_from_points(tmp_path):
         ({"blocks": {"least": 2.5}}, "blocks.least: got 2.5; accepted is an integer"),
         ({"blocks": {"fewest": 2}}, "blocks.fewest"),
         ({"sensor": {"band_low_hz": 300.0, "band_high_hz": 200.0}}, "sensor.band_high_hz: got 200"),
+        ({"sensor": {"name": "bimorf"}}, "sensor.name: got .bimorf.; accepted is one of .*bimorph"),
         ({"time_limits": {"point_s": 0.0}}, "time_limits.point_s: got 0"),
         ({"precision": {}}, "precision: got {}"),
         ({"precision": {"f0_std_hz": 0}}, "precision.f0_std_hz: got 0"),
