@@ -11,6 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from robot_at_hand import own_time
 from tactile_resonance.action import Measure
 
+from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
 from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.nodes.client import NoAnswer
@@ -21,7 +22,6 @@ from tactile_resonance.nodes.conversions import (
     record_from_message,
 )
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
-from tactile_resonance.nodes.scan_session import ScanSession
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues

@@ -11,9 +11,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.task import Future
+from tactile_resonance.action import Measure
+from tactile_resonance.srv import Truth
 
 from tactile_resonance import msg
-from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.client import NoAnswer, NodeClient
@@ -24,7 +25,6 @@ from tactile_resonance.nodes.conversions import (
 )
 from tactile_resonance.nodes.running import RESULTS, STREAM, TRUTHS
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.srv import Truth
 
 Progress = Callable[[int, int], None]
 
