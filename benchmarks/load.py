@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo under loads of the machine: its results against the truth, and its duration.
 
-In simulated time a load may make the demo slower and change nothing else: every point is measured at the first
-attempt, the same tissues are called, and every force and every pole is within 4 of its standard deviations of
-the truth. On the wall clock every point must be measured, and the demo may take 1.5 times as long beside the busy
-loops and twice as long without real-time priority. `make load` refuses what exceeds that, and writes this page. All
-of it is simulated; none of it is a measurement on a sensor.
+In simulated time a load may make the demo slower and change nothing else: every point is measured at the
+first attempt, the same tissues are called, and every force and every pole is within 4 of its standard
+deviations of the truth. On the wall clock every point must be measured, and the demo may take 1.5 times as
+long beside the busy loops and twice as long without real-time priority. `make load` refuses what exceeds
+that, and writes this page. All of it is simulated; none of it is a measurement on a sensor.
 """
 
 from __future__ import annotations

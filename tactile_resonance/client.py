@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -13,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Pose, PoseArray
 from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
@@ -125,6 +127,8 @@ class TactileClient:
         self._timer.cancel()
         self._tick = Future()
         self._asked: _Asked | None = None
+        self._waiting: _Asked | None = None  # until it is begun, once
+        self._claim = threading.Lock()
 
     def scan(
         self,
@@ -167,15 +171,29 @@ class TactileClient:
         ------
         RuntimeError
             If a scan of this client is under way.
+        ValueError
+            If a value is not of the type or in the range of its field.
         """
         if self._asked is not None:
             raise RuntimeError("scan: one of this client is under way; cancel it or await its outcome")
-        goal = Scan.Goal(scene=str(scene), run_directory=str(run_directory), resume=resume)
-        goal.force_n, goal.f0_std_hz = float(force_n), float(f0_std_hz)
-        goal.damping_ratio_std = float(damping_ratio_std)
-        goal.seed, goal.notes = seed, notes
-        goal.poses.header.frame_id, goal.poses.poses = frame, list(poses)
-        self._asked = _Asked(goal, wait_s, on_feedback, on_point)
+        try:
+            # unchecked, a value of a wrong type ends the process that sends it
+            header = Header(check_fields=True, frame_id=frame)
+            goal = Scan.Goal(
+                check_fields=True,
+                scene=str(scene),
+                poses=PoseArray(check_fields=True, header=header, poses=list(poses)),
+                force_n=float(force_n),
+                f0_std_hz=float(f0_std_hz),
+                damping_ratio_std=float(damping_ratio_std),
+                run_directory=str(run_directory),
+                resume=resume,
+                seed=seed,
+                notes=notes,
+            )
+        except AssertionError as error:
+            raise ValueError(f"scan: {error}") from error
+        self._asked = self._waiting = _Asked(goal, wait_s, on_feedback, on_point)
         self._timer.reset()
         self._begin.trigger()
         return self._asked.future
@@ -241,9 +259,11 @@ class TactileClient:
         return True
 
     async def _conduct(self) -> None:
-        """From the goal to the outcome."""
-        asked = self._asked
-        assert asked is not None
+        """From the goal to the outcome; an executor of several threads may begin it more than once."""
+        with self._claim:
+            asked, self._waiting = self._waiting, None
+        if asked is None:
+            return
         try:
             ended = await self._send(asked)
             outcome = await self._follow(asked) if ended is None else ended
@@ -308,7 +328,8 @@ class TactileClient:
                 if self._goals.server_is_ready():
                     seen_s = time.monotonic()
                 if answer is not None or time.monotonic() - seen_s > GONE_S:
-                    return ScanOutcome(Ending.LOST, "scan_node went away; the run can be resumed")
+                    text = "scan_node went away; the run can be resumed"
+                    return ScanOutcome(Ending.LOST, text, asked.goal.run_directory)
                 await self._tick
 
     def _hear_for(self, asked: _Asked) -> Callable[[Any], None]:

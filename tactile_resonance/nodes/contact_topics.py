@@ -85,6 +85,6 @@ class ContactTopics:
 
     def _say(self, state: msg.ContactState) -> None:
         self._newest, self._said_s = state, time.monotonic()
-        state.stopped = self._stop.stopped
+        state.instance, state.stopped = self._node.instance, self._stop.stopped
         if self._state.get_subscription_count():
             self._state.publish(state)

@@ -84,6 +84,7 @@ PARAMETERS = (
 
 EFFECTS = ("noise", "quantisation", "nonlinearity")
 PLANT_CHECK_S = 0.5
+CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its first goal
 LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
 
 
@@ -159,6 +160,10 @@ class FakeHardwareNode(ManagedNode):
         if by_action:
             base_frame, frame_id = values(self, "base_frame", "frame_id")
             assert self._stop is not None
+            table = self._laid.table
+            x, y, z = (table.position_m + table.rotation.apply([0.0, 0.0, CLEAR_M])).tolist()
+            place = Contact(position_m=(x, y, z), frame_id=base_frame)
+            self._stays.add(Stay(0, 0.0, pose_to_message(place)))
             self._contact = IdealContact(
                 self,
                 self._stays,

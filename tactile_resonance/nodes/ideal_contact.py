@@ -166,10 +166,10 @@ class IdealContact:
             result.message = "goal: a contact is under way"
             return result
         try:
+            self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
             result.message = self._refusal(request)
             if result.message:
                 return result
-            self._drawn_back.clear()
             self._say(State.APPROACH, "", "")
             began_ns = self._now_ns()
             if not self._wait(CONTACT_S):
@@ -254,7 +254,7 @@ class IdealContact:
         stay = self._stays.newest
         state = msg.ContactState(state=self._state.value, cause=self._cause, message=self._message)
         state.header.stamp, state.header.frame_id = now, self._frame_id
-        state.stopped = self._stop.stopped
+        state.instance, state.stopped = self._node.instance, self._stop.stopped
         holds = self._state is State.HOLD
         state.force_n = stay.force_n if holds else math.nan
         state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan

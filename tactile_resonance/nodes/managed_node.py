@@ -80,7 +80,7 @@ class ManagedNode(LifecycleNode):
                 service.callback = partial(self._change_state, service.callback)
         declare(self, parameters)
         self.health = Health(self, self.state_name, self.details)
-        self._instance = int.from_bytes(os.urandom(7), "big")
+        self.instance = int.from_bytes(os.urandom(7), "big")
         # started by the first subscriber: each call wakes the executor: most of the cost of an idle node
         self._beat_timer = self.steady_timer(BEAT_S, self._beat)
         self._beat_timer.cancel()
@@ -136,11 +136,12 @@ class ManagedNode(LifecycleNode):
         qos: QoSProfile,
         *,
         raw: bool = False,
+        always: bool = False,
     ) -> None:
-        """Subscription until the node is cleaned up; heard while it is active, serialised if `raw`."""
+        """Subscription until the node is cleaned up, heard while active or `always`; serialised if `raw`."""
 
         def heard(message: Any) -> None:
-            if self.active:
+            if self.active or always:
                 self.health.saw(topic)
                 begun_s = time.perf_counter()
                 callback(message)
@@ -248,7 +249,7 @@ class ManagedNode(LifecycleNode):
                 msg.Heartbeat(
                     node=self.get_fully_qualified_name(),
                     state=self.state_name(),
-                    instance=self._instance,
+                    instance=self.instance,
                     waiting_for=self.waiting_for(),
                 )
             )

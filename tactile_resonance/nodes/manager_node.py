@@ -166,10 +166,10 @@ class ManagerNode(Node):
             node.state = answer.current_state.id
             if node.state == State.PRIMARY_STATE_ACTIVE:
                 node.worked, node.held = True, False
-            elif node.worked:
+            elif node.worked and self._wanted_up:
                 # a node that fails does not stay inactive
                 node.worked = False
-                node.held = self._wanted_up and node.state == State.PRIMARY_STATE_INACTIVE
+                node.held = node.state == State.PRIMARY_STATE_INACTIVE
                 said = "was deactivated, and is held" if node.held else "is not active any more"
                 self.health.error(f"{node.name} {said}")
             return

@@ -259,7 +259,7 @@ class ScanNode(ManagedNode):
         def touch(point: ScanPoint) -> Touch:
             tell(Progress(point, Phase.SURFACE, point.index, len(asked.xy_m)))
             try:
-                return self._hands.find(point, force_n, radius_m, controls.check)
+                return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
             except PointFailed as error:
                 raise PointFailed(f"surface.touch: touch {point.index + 1}: {error}") from error
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from geometry_msgs.msg import PoseStamped
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
@@ -17,6 +17,7 @@ from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
+from tactile_resonance.nodes.stop_input import STOP
 from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -24,6 +25,7 @@ from tactile_resonance.scan.hands import (
     PointDisturbed,
     PointFailed,
     ScanEnded,
+    Stopped,
 )
 from tactile_resonance.scan.scene import Hold
 
@@ -67,15 +69,19 @@ class TipContact:
         self._goals = Goals(client, "make_contact")
         node.resources.callback(client.destroy)
         self._retract = node.create_client(Trigger, "retract")
-        node.resources.callback(node.destroy_client, self._retract)
+        self._stop = node.create_client(SetBool, STOP)
+        for service in (self._retract, self._stop):
+            node.resources.callback(node.destroy_client, service)
 
     def listen(self) -> None:
         """Hear of contacts, for one scan; where the tip is now nobody knows."""
         self.touching = True  # a scan that was killed may have left it there
-        self.stopped = False
+        self.stopped, self._instance = False, 0
+        self._stop_asked_s = 0.0
         self._state: msg.ContactState | None = None
         # the newest only: the recorder's may have to wait behind what else is recorded
-        self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST)
+        # always: a scan that the node's deactivation ends still draws the tip back
+        self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST, always=True)
 
     def hold(self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll) -> None:
         """Press there until the force is held."""
@@ -86,15 +92,18 @@ class TipContact:
             poll()
             check()
             if state is not None and state.cause not in ("", Cause.NONE.value):
-                raise _failure(state)
+                raise self._failure(state)
             time.sleep(POLL_S)
 
     def touch(
         self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
     ) -> MakeContact.Result:
-        """Touch and draw back; a touch that is disturbed is repeated."""
+        """Touch and draw back; a touch that is disturbed is repeated, once nobody stops the tip."""
         disturbed = Disturbances()
         while True:
+            while self.stopped:
+                check()
+                time.sleep(POLL_S)
             try:
                 return self._make(MakeContact.Goal(pose=pose, force_n=force_n), check, poll)
             except PointDisturbed as error:
@@ -120,7 +129,7 @@ class TipContact:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
         state = self._state
         if self.touching and state is not None and state.state != state.STATE_HOLD:
-            raise _failure(state)
+            raise self._failure(state)
 
     def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
@@ -133,7 +142,7 @@ class TipContact:
         self._time.go()
         result = self._goals.follow(self._goals.send(goal, check, poll), check, poll)
         if not result.reached:
-            raise _failure(result)
+            raise self._failure(result)
         return result
 
     def _ask_to_retract(self) -> bool:
@@ -164,7 +173,18 @@ class TipContact:
         return False
 
     def _on_state(self, message: msg.ContactState) -> None:
-        self._state, self.stopped = message, message.stopped
+        self._state = message
+        if not self.stopped or message.stopped or message.instance == self._instance:
+            self.stopped, self._instance = message.stopped, message.instance
+        elif time.monotonic() - self._stop_asked_s > ASK_AGAIN_S:
+            # a node that was started anew does not know that it was stopped, and nobody has released it
+            self._stop_asked_s = time.monotonic()
+            self._stop.call_async(SetBool.Request(data=True))
+
+    def _failure(self, ended: MakeContact.Result | msg.ContactState) -> PointFailed:
+        if self.stopped and ended.cause == Cause.CANCELLED.value:
+            return Stopped()
+        return _failure(ended)
 
 
 def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:

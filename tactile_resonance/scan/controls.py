@@ -42,5 +42,11 @@ class Controls:
 
     def check(self) -> None:
         """Raise `Interrupted` where the point under way shall be left."""
-        if self.cancelled.is_set() or self._request is not None:
+        self.check_cancelled()
+        if self._request is not None:
+            raise Interrupted
+
+    def check_cancelled(self) -> None:
+        """Raise `Interrupted` where the scan shall end; a request about a point waits for the next one."""
+        if self.cancelled.is_set():
             raise Interrupted

@@ -256,7 +256,7 @@ class ScanRunner:
                         self._seed + point.index,
                         all_blocks,
                         recording,
-                        self._controls.check,
+                        self._controls.check_cancelled,
                     )
                 except PointFailed as error:
                     if isinstance(error, PointDisturbed) and disturbed.again(error):

@@ -45,7 +45,7 @@ class Supervisor(ScanClient):
         )
 
     def _on_contact(self, message):
-        self.contact = message.state
+        self.contact, self.message = message.state, message
 
     def begin(self, **goal):
         """Ask for a scan, and wait until it measures."""
@@ -103,6 +103,7 @@ def supervisor(domain, tmp_path):
         nodes.bring_up(NODES, parameters)
         supervisor.wait_until_up(90.0)
         supervisor.begin(scene=scene, run_directory=tmp_path / "run")
+        supervisor.nodes, supervisor.parameters = nodes, parameters
         yield supervisor
 
 
@@ -120,8 +121,36 @@ def test_a_scan_waits_for_a_node_that_a_supervisor_holds(supervisor, tmp_path):
     assert [r.disturbances for r in read_run(tmp_path / "run").results] == ["node away 1", ""]
 
 
+def test_a_scan_whose_node_is_deactivated_draws_the_tip_back_and_ends(supervisor):
+    supervisor.change("scan_node", Transition.TRANSITION_DEACTIVATE)
+    supervisor.wait(supervisor.outcome.done, 30.0, "the scan to end")
+    outcome = supervisor.outcome.result()
+    assert (outcome.message, outcome.done) == ("cancelled", 0)
+    supervisor.wait(lambda: supervisor.contact == "idle", WITHIN_S, "the tip to leave")
+
+
 def test_a_scan_waits_while_the_tip_is_stopped(supervisor):
     assert supervisor.call(SetBool, "stop", SetBool.Request(data=True)).success
-    supervisor.see_it_wait("contact: the tip is stopped (service or topic stop)")
+    reason = "contact: the tip is stopped (service or topic stop)"
+    supervisor.see_it_wait(reason)
+    assert supervisor.call(SetBool, "stop", SetBool.Request(data=False)).success
+    supervisor.see_it_complete()
+
+
+def test_a_stop_outlives_the_node_that_was_stopped(supervisor):
+    assert supervisor.call(SetBool, "stop", SetBool.Request(data=True)).success
+    reason = "contact: the tip is stopped (service or topic stop)"
+    supervisor.see_it_wait(reason)
+    before = supervisor.message.instance
+    process = supervisor.nodes._processes.pop("fake_hardware_node")
+    process.kill()
+    process.wait()
+    supervisor.nodes.start("fake_hardware_node", supervisor.parameters["fake_hardware_node"])
+    supervisor.wait(
+        lambda: supervisor.message.instance != before and supervisor.message.stopped,
+        WITHIN_S,
+        "the new node to be stopped",
+    )
+    supervisor.see_it_wait(reason)
     assert supervisor.call(SetBool, "stop", SetBool.Request(data=False)).success
     supervisor.see_it_complete()

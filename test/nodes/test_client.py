@@ -4,6 +4,7 @@
 import math
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -101,6 +102,51 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
         assert outcome.ending is Ending.REJECTED
         assert reason in outcome.message
         assert not new.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("seed", -1), ("seed", 1.5), ("seed", 2**64), ("notes", None), ("frame", None)),
+        *(("poses", ["x"]), ("resume", "yes")),
+    ],
+)
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
+    """Unchecked, they end the executor, or the process."""
+    field = "frame_id" if name == "frame" else name
+    with pytest.raises(ValueError, match=f"scan: The '{field}' field must be"):
+        stack.client.scan(**{**GOAL, name: value})
+    stack.activate()
+    future = stack.begin([])  # another one is taken
+    stack.client.cancel()
+    assert stack.ended(future).ending is Ending.CANCELLED
+
+
+def test_a_goal_is_sent_once_however_often_an_executor_begins(stack, monkeypatch):
+    """One of several threads takes a guard condition that is still triggered."""
+    stack.activate()
+    trigger, heard = stack.client._begin.trigger, []
+    monkeypatch.setattr(
+        stack.client, "_begin", SimpleNamespace(trigger=lambda: [trigger() for _ in range(9)])
+    )
+    begun = []
+    conduct = stack.client._send
+
+    def counted(asked):
+        begun.append(asked)
+        return conduct(asked)
+
+    monkeypatch.setattr(stack.client, "_send", counted)
+    future = stack.begin(heard)
+    for _ in range(9):
+        trigger()
+    said = len(heard)
+    stack.until(lambda: len(heard) > said + 3)
+    assert len(begun) == 1
+    monkeypatch.undo()
+    stack.client.cancel()
+    assert stack.ended(future).ending is Ending.CANCELLED
 
 
 def test_a_scan_is_followed_paused_and_cancelled_by_a_node_that_does_not_spin_itself(stack):

@@ -95,6 +95,28 @@ def test_skip_repeat_and_cancel(tmp_path):
     assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [3, 4]
 
 
+@pytest.mark.parametrize(
+    ("request_", "first"), [(Request.SKIP, Outcome.SKIPPED), (Request.REPEAT, Outcome.DONE)]
+)
+def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
+    tmp_path, request_, first
+):
+    controls, asked = Controls(), [request_]
+
+    class Asked(Bench):
+        def measure(self, design, label, seed, enough, recording, check):
+            if asked and label == "air":
+                controls.ask(asked.pop())
+            check()
+            return super().measure(design, label, seed, enough, recording, check)
+
+    summary, run, _ = scan(tmp_path / "run", scene(2), Asked(), controls)
+    assert not asked
+    assert summary.complete
+    assert [result.outcome for result in run.latest] == [first, Outcome.DONE]
+    assert len([file for file in run.files if file.name.startswith("reference-")]) == 2
+
+
 def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     controls = Controls()
     made = scene(2)
