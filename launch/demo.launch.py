@@ -39,7 +39,7 @@ def generate_launch_description():
             description="Of the session, as YAML: {temperature_c: 21.5, tip_wetness: wet, adhesion: none}.",
         ),
     ]
-    # the scene, and whatever else the mock can be told, go through to it: namespace, robot_ip, rviz ...
+    # the scene and all other arguments of mock.launch.py are passed on: namespace, robot_ip, rviz ...
     mock = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "mock.launch.py"]))
     )

@@ -20,7 +20,7 @@ SENSORS = {"left": "127.0.1.2", "right": "127.0.1.3"}
 def generate_launch_description():
     """Arguments of the stack, and each sensor in a group of its own: what is set there stays there.
 
-    Whatever else mock.launch.py can be told holds for both: scene, discovery, rviz ...
+    All other arguments of mock.launch.py hold for both: scene, discovery, rviz ...
     """
     arguments = [
         DeclareLaunchArgument(

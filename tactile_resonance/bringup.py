@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which nodes the launch files start, and what they tell each beyond the user's parameter file.
+"""Which nodes the launch files start, and which parameters each is passed after the user's file.
 
 An argument that is given wins over the file, the file wins over the defaults that the simulated bench needs.
 Everything else is left to the nodes.
@@ -103,7 +103,7 @@ def _sections(loader: yaml.SafeLoader, node: Any, name: str) -> Iterator[tuple[s
 
 
 def stated_for(name: str, sections: Mapping[str, Parameters]) -> Parameters:
-    """What a parameter file says to the node of a full name.
+    """Parameters that a file sets for the node of a full name.
 
     As rclpy has it: each section whose pattern matches counts, the later over the earlier, whatever
     the patterns are.
@@ -118,7 +118,7 @@ def stated_for(name: str, sections: Mapping[str, Parameters]) -> Parameters:
 
 
 class _Decisions:
-    """What each node is told beyond the file."""
+    """Parameters that each node is passed after the file."""
 
     def __init__(
         self, arguments: Mapping[str, str], sections: Mapping[str, Parameters], namespace: str
@@ -127,26 +127,26 @@ class _Decisions:
         self._sections = sections
         self._names = {node: re.sub("/+", "/", f"/{namespace}/{node}") for node in NODES}
         self.stated = {node: stated_for(name, sections) for node, name in self._names.items()}
-        self.told: dict[str, Parameters] = {node: {} for node in NODES}
+        self.passed: dict[str, Parameters] = {node: {} for node in NODES}
 
-    def tell(self, node: str, by: str, **parameters: object) -> None:
-        """Tell a node what one of the arguments `by` says; where none is given, what the file does not say."""
+    def pass_on(self, node: str, by: str, **parameters: object) -> None:
+        """Pass parameters to a node where an argument of `by` is given, or the file does not set them."""
         given = any(argument in self.given for argument in by.split())
         for name, value in parameters.items():
-            if given or name not in {**self.stated[node], **self.told[node]}:
-                self.told[node][name] = value
+            if given or name not in {**self.stated[node], **self.passed[node]}:
+                self.passed[node][name] = value
 
     def value(self, node: str, name: str) -> Any:
-        """What a node is told; None where neither arguments nor file nor a default here say it."""
-        return {**self.stated[node], **self.told[node]}.get(name)
+        """Value that a node receives; None where neither an argument, the file nor a default here sets it."""
+        return {**self.stated[node], **self.passed[node]}.get(name)
 
     def check(self, node: str) -> None:
-        """``ValueError`` where a later section of the file would win over what a node is told."""
-        told, name = self.told[node], self._names[node]
-        # ROS puts what it is told into the section of that name, if there is one, and keeps its place
-        merged = {**self._sections, name: {**self._sections.get(name, {}), **told}}
+        """``ValueError`` where a later section of the file would override what a node is passed."""
+        passed, name = self.passed[node], self._names[node]
+        # ROS merges what is passed into the section of that name, if there is one, at its place in the file
+        merged = {**self._sections, name: {**self._sections.get(name, {}), **passed}}
         heard = stated_for(name, merged)
-        for parameter, value in told.items():
+        for parameter, value in passed.items():
             by_file, place = heard[parameter], f"{value!r}: put the section {name} last"
             require(by_file == value, f"params_file: {parameter} of {node}", by_file, place)
 
@@ -176,7 +176,7 @@ def plan_bringup(
         If arguments and file contradict each other, or a robot lacks what has no safe default.
     """
     plan = _Decisions(arguments, sections, namespace)
-    given, tell, value = plan.given, plan.tell, plan.value
+    given, pass_on, value = plan.given, plan.pass_on, plan.value
     hardware = given.get("use_mock_hardware")
     accepted = "true, as mock.launch.py says, or false, as ur.launch.py"
     require(hardware in ("true", "false"), "use_mock_hardware", hardware, accepted)
@@ -185,23 +185,23 @@ def plan_bringup(
     require(mock or robot != "ideal", "robot", robot, "true or false without the simulated bench")
     for argument, (name, *its_nodes) in ARGUMENTS.items():
         for node in its_nodes if argument in given else ():
-            tell(node, argument, **{name: given[argument]})
+            pass_on(node, argument, **{name: given[argument]})
     if "table_in_base" in given:
-        told = _table(given["table_in_base"])
-        tell("scan_node", "table_in_base", table_in_base=told)
-    tell("scan_node", "robot", contact="none" if robot == "false" else "robot")
+        passed = _table(given["table_in_base"])
+        pass_on("scan_node", "table_in_base", table_in_base=passed)
+    pass_on("scan_node", "robot", contact="none" if robot == "false" else "robot")
     # without robot and bench nobody measures the force
     source = "force_over" if mock or robot == "true" else "tcp_pose"
-    tell("excitation_node", "robot", contact_source=source)
+    pass_on("excitation_node", "robot", contact_source=source)
     left_out = {
         *(() if mock else ("fake_hardware_node",)),
         *(() if robot == "true" else ("contact_node",)),
     }
     nodes = [node for node in NODES if node not in left_out]
-    tell("manager_node", "", nodes=nodes[:-1])
+    pass_on("manager_node", "", nodes=nodes[:-1])
     simulated_time, table = False, None
     if mock:
-        simulated_time = _tell_mock(plan, robot, priority)
+        simulated_time = _pass_mock(plan, robot, priority)
         if robot != "false":
             table = _table(value("scan_node", "table_in_base"))
     elif robot == "true":
@@ -211,13 +211,13 @@ def plan_bringup(
     base_frame = value("scan_node", "base_frame") or "base"
     table_frame = value("scan_node", "table_frame") or "table"
     if (stands := value("scan_node", "table_in_base")) is not None:
-        tell("pole_map_node", "base_frame", base_frame=base_frame)
-        tell("pole_map_node", "table_in_base", table_in_base=_table(stands))
-        tell("pole_map_node", "table_frame", frame_id=table_frame)
+        pass_on("pole_map_node", "base_frame", base_frame=base_frame)
+        pass_on("pole_map_node", "table_in_base", table_in_base=_table(stands))
+        pass_on("pole_map_node", "table_frame", frame_id=table_frame)
     for node in nodes:
         plan.check(node)
     return Bringup(
-        nodes={node: plan.told[node] for node in nodes},
+        nodes={node: plan.passed[node] for node in nodes},
         simulated_time=simulated_time,
         table=None if table is None else Pose.from_vector(np.array(table)),
         base_frame=base_frame,
@@ -225,33 +225,33 @@ def plan_bringup(
     )
 
 
-def _tell_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
-    """Tell the nodes what the simulated bench needs; return whether they live in its time."""
-    given, tell, value = plan.given, plan.tell, plan.value
+def _pass_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
+    """Pass what the simulated bench needs; return whether the nodes live in its time."""
+    given, pass_on, value = plan.given, plan.pass_on, plan.value
     host = value("contact_node", "robot_host") or value("fake_hardware_node", "robot_host") or HOST
     accepted = "127.x.y.z, of a simulated robot; ur.launch.py is for real ones"
     require(str(host).startswith("127."), "robot_host", host, accepted)
-    tell("contact_node", "", robot_host=host)
-    tell(
+    pass_on("contact_node", "", robot_host=host)
+    pass_on(
         "fake_hardware_node",
         "robot robot_ip",
         robot_host=host if robot == "true" else "",
         serve_contact=robot == "ideal",
     )
-    tell("fake_hardware_node", "", scene=SCENE)
+    pass_on("fake_hardware_node", "", scene=SCENE)
     table = value("scan_node", "table_in_base") or value("fake_hardware_node", "table_in_base")
     for node in ("scan_node", "fake_hardware_node"):
-        tell(node, "table_in_base", table_in_base=_table(table or TABLE_IN_BASE))
+        pass_on(node, "table_in_base", table_in_base=_table(table or TABLE_IN_BASE))
     if value("contact_node", "force_config") in (None, SIMULATED_CELL):
-        tell("contact_node", "", force_host=host)
+        pass_on("contact_node", "", force_host=host)
     clock = plan.stated["fake_hardware_node"].get("use_sim_time", True)
     simulated_time = given.get("real_time", "false" if clock else "true") == "false"
     for node in NODES:
-        tell(node, "real_time", use_sim_time=simulated_time)
+        pass_on(node, "real_time", use_sim_time=simulated_time)
     for node in IN_BENCH_TIME:
-        tell(node, "real_time", time_server=f"{host}:{TIME_PORT}" if simulated_time else "")
+        pass_on(node, "real_time", time_server=f"{host}:{TIME_PORT}" if simulated_time else "")
     if not (simulated_time or priority):
-        tell("contact_node", "", simulated_stalls_s=STALLS_S)
+        pass_on("contact_node", "", simulated_stalls_s=STALLS_S)
     return simulated_time
 
 
