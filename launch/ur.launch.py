@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes with a Universal Robots arm; docs/robot.md states the arguments they need, and the order of steps."""
+"""The nodes with a Universal Robots arm; docs/robot.md states their arguments and the order of steps."""
 
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource

@@ -56,8 +56,7 @@ class NodeWatch:
         self._lock = threading.Lock()
         self._signs: dict[str, _Sign] = {}
         self._behind: dict[str, set[str]] = {}  # newest publishers of a topic, which may have gone
-        # a scan that the node's deactivation ends still draws the tip back
-        node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS, always=True)
+        node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
     def met(self) -> bool:
         """Whether all nodes that publish now have given a sign of life.

@@ -32,7 +32,7 @@ class Graph:
         self.publishers = publishers
         self.beat = None
 
-    def listen(self, kind, topic, callback, qos, *, always):
+    def listen(self, kind, topic, callback, qos):
         self.beat = lambda node, state="active", instance=1, waiting_for="": callback(
             kind(node=node, state=state, instance=instance, waiting_for=waiting_for)
         )
