@@ -62,7 +62,19 @@ class Watcher:
         return future.result()
 
     def state(self, node):
-        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+        """Asked anew every few seconds: a node that was killed stays in the graph and takes questions for
+        the one that was started in its place."""
+        client = self.node.create_client(GetState, f"{node}/get_state")
+        deadline = time.monotonic() + 60.0
+        while True:
+            self.wait(client.service_is_ready)
+            future = client.call_async(GetState.Request())
+            asked = time.monotonic()
+            self.wait(lambda: future.done() or time.monotonic() > asked + 3.0)
+            if future.done():
+                self.node.destroy_client(client)
+                return future.result().current_state.label
+            assert time.monotonic() < deadline, f"{node} does not answer: {self.heard}"
 
     def all_are(self, state):
         return all(self.state(node) == state for node in NODES)
