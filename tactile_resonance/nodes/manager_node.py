@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
 from rclpy.node import Node
@@ -31,6 +31,8 @@ PARAMETERS = (
 )
 
 TICK_S = 0.1
+# While all are up: nodes tell by themselves when they change, only one that was killed has to be found.
+QUIET_S = 1.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
 LONGEST_RETRY_S = 16.0
@@ -66,6 +68,7 @@ class _Managed:
     refusals: int = 0
     worked: bool = False  # it has been active since it was last brought up
     held: bool = False  # somebody else has deactivated it
+    due: bool = False  # its turn came while a question was under way
     next_try_s: float = field(default=0.0)
 
 
@@ -87,17 +90,24 @@ class ManagerNode(Node):
             raise ValueError("nodes: empty, expected names of nodes")
         self._wanted_up = True
         self._was_up = False
+        self._quiet_until_s = 0.0
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/shut_down", self._on_shut_down)
-        self.create_timer(TICK_S, self._tick, clock=STEADY)
+        self.create_timer(TICK_S, self._on_timer, clock=STEADY)
 
     def _managed(self, name: str) -> _Managed:
-        return _Managed(
+        node = _Managed(
             name,
             self.create_client(GetState, f"{name}/get_state"),
             self.create_client(ChangeState, f"{name}/change_state"),
         )
+
+        def on_event(event: TransitionEvent) -> None:
+            self._on_event(node, event.goal_state.id)
+
+        self.create_subscription(TransitionEvent, f"{name}/transition_event", on_event, 10)
+        return node
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._want(True, response)
@@ -114,7 +124,21 @@ class ManagerNode(Node):
         response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
         return response
 
+    def _on_event(self, node: _Managed, state: int) -> None:
+        """A node has changed, asked by this one or by somebody else."""
+        if state not in _NAMES:  # it is on its way
+            return
+        if node.client is node.get and node.pending is not None:
+            self._forget_question(node)  # its answer may be older
+        self._see(node, state)
+        self._tick()
+
+    def _on_timer(self) -> None:
+        if not self._was_up or time.monotonic() >= self._quiet_until_s:
+            self._tick()
+
     def _tick(self) -> None:
+        self._quiet_until_s = time.monotonic() + QUIET_S
         ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
@@ -130,6 +154,7 @@ class ManagerNode(Node):
         now_s = time.monotonic()
         if node.pending is not None:
             if not node.pending.done():
+                node.due = bool(moves)
                 if now_s > node.deadline_s:
                     self._drop(node)
                 return
@@ -153,25 +178,17 @@ class ManagerNode(Node):
         node.pending.add_done_callback(lambda future: self._hear(node, future))
 
     def _hear(self, node: _Managed, answer: Future) -> None:
-        """An answer by which a node has moved leads to the next question at once, others at the next tick."""
+        """An answer by which a node has moved, or may now, leads to a tick at once."""
         if node.pending is answer and not answer.cancelled():
-            before = node.state
+            before, due, node.due = node.state, node.due, False
             self._take(node, time.monotonic())
-            if node.state != before:
+            if due or node.state != before:
                 self._tick()
 
     def _take(self, node: _Managed, now_s: float) -> None:
         answer, node.pending = node.pending.result(), None
         if isinstance(answer, GetState.Response):
-            node.state = answer.current_state.id
-            if node.state == State.PRIMARY_STATE_ACTIVE:
-                node.worked, node.held = True, False
-            elif node.worked and self._wanted_up:
-                # a node that fails does not stay inactive
-                node.worked = False
-                node.held = node.state == State.PRIMARY_STATE_INACTIVE
-                said = "was deactivated, and is held" if node.held else "is not active any more"
-                self.health.error(f"{node.name} {said}")
+            self._see(node, answer.current_state.id)
             return
         node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:
@@ -186,10 +203,24 @@ class ManagerNode(Node):
             f"asked again in {wait_s:g} s"
         )
 
-    def _drop(self, node: _Managed) -> None:
-        """A node that was killed never answers."""
+    def _see(self, node: _Managed, state: int) -> None:
+        node.state = state
+        if state == State.PRIMARY_STATE_ACTIVE:
+            node.worked, node.held = True, False
+        elif node.worked and self._wanted_up:
+            # a node that fails does not stay inactive
+            node.worked = False
+            node.held = state == State.PRIMARY_STATE_INACTIVE
+            said = "was deactivated, and is held" if node.held else "is not active any more"
+            self.health.error(f"{node.name} {said}")
+
+    def _forget_question(self, node: _Managed) -> None:
         node.client.remove_pending_request(node.pending)
         node.pending = None
+
+    def _drop(self, node: _Managed) -> None:
+        """A node that was killed never answers."""
+        self._forget_question(node)
         node.state = State.PRIMARY_STATE_UNKNOWN
         self.health.error(f"{node.name} does not answer")
 

@@ -62,19 +62,16 @@ class Watcher:
         return future.result()
 
     def state(self, node):
-        """Asked anew every few seconds: a node that was killed stays in the graph and takes questions for
-        the one that was started in its place."""
+        """Asked until it answers: one that was killed takes questions for its successor for a while."""
         client = self.node.create_client(GetState, f"{node}/get_state")
-        deadline = time.monotonic() + 60.0
-        while True:
+        deadline, future = time.monotonic() + 60.0, None
+        while future is None or not future.done():
+            assert time.monotonic() < deadline, f"{node} does not answer: {self.heard}"
             self.wait(client.service_is_ready)
             future = client.call_async(GetState.Request())
-            asked = time.monotonic()
-            self.wait(lambda: future.done() or time.monotonic() > asked + 3.0)
-            if future.done():
-                self.node.destroy_client(client)
-                return future.result().current_state.label
-            assert time.monotonic() < deadline, f"{node} does not answer: {self.heard}"
+            self.executor.spin_until_future_complete(future, 3.0)
+        self.node.destroy_client(client)
+        return future.result().current_state.label
 
     def all_are(self, state):
         return all(self.state(node) == state for node in NODES)

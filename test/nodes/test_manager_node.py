@@ -34,29 +34,67 @@ class Managed(ManagedNode):
         self._log.append(("activate", self.get_name()))
 
 
-def test_one_tick_brings_all_up_in_order(monkeypatch):
+class Stack:
+    """A manager without a timer of its own, and the nodes that it manages, in one executor."""
+
+    def __init__(self, *names):
+        self.log = []
+        self.manager = ManagerNode()
+        self.nodes = {name: Managed(name, self.log) for name in names}
+        self._executor = SingleThreadedExecutor()
+        for node in (self.manager, *self.nodes.values()):
+            self._executor.add_node(node)
+
+    def spin_until(self, done):
+        deadline_s = time.monotonic() + WITHIN_S
+        while not done() and time.monotonic() < deadline_s:
+            self._executor.spin_once(0.05)
+        return done()
+
+    def bring_up(self):
+        """One tick of the manager once it knows all nodes; whether all came up."""
+        managed = self.manager._nodes
+        asked = [client for each in managed for client in (each.get, each.change)]
+        assert self.spin_until(lambda: all(client.service_is_ready() for client in asked))
+        self.manager._tick()
+        return self.spin_until(
+            lambda: all(each.state == State.PRIMARY_STATE_ACTIVE for each in managed)
+        )
+
+    def close(self):
+        for node in self._executor.get_nodes():
+            node.destroy_node()
+
+
+@pytest.fixture
+def stack(monkeypatch):
     monkeypatch.setattr(manager_node, "TICK_S", 3600.0)
-    log, names = [], ["first", "second", "third"]
+    names = ("first", "second", "third")
     arguments = ["--ros-args", "-p", f"manager_node:nodes:=[{','.join(names)}]"]
     with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
-        manager, nodes = ManagerNode(), [Managed(name, log) for name in names]
-        executor = SingleThreadedExecutor()
-        for node in (manager, *nodes):
-            executor.add_node(node)
+        made = Stack(*names)
+        yield made
+        made.close()
 
-        def spin_until(done):
-            deadline_s = time.monotonic() + WITHIN_S
-            while not done() and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
-            return done()
 
-        asked = [client for each in manager._nodes for client in (each.get, each.change)]
-        assert spin_until(lambda: all(client.service_is_ready() for client in asked))
-        manager._tick()
-        up = spin_until(
-            lambda: all(each.state == State.PRIMARY_STATE_ACTIVE for each in manager._nodes)
-        )
-        for node in executor.get_nodes():
-            node.destroy_node()
-    assert up, log
-    assert log == [(step, name) for name in names for step in ("configure", "activate")]
+def test_one_tick_brings_all_up_in_order(stack):
+    assert stack.bring_up(), stack.log
+    assert stack.log == [(step, name) for name in stack.nodes for step in ("configure", "activate")]
+
+
+def test_a_node_that_is_deactivated_and_cleaned_up_at_once_is_held(stack):
+    """Nobody asks it in between: it tells its changes by itself."""
+    assert stack.bring_up(), stack.log
+    # once it is known that the events are heard; the newest question may still be under way
+    managed, node = stack.manager._nodes[1], stack.nodes["second"]
+    assert stack.spin_until(lambda: node.count_subscribers("second/transition_event") == 1)
+    del stack.log[:]
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    assert stack.spin_until(lambda: managed.state == State.PRIMARY_STATE_UNCONFIGURED)
+    assert managed.held
+    for _ in range(2):  # asked, it is unconfigured, and is not brought up again
+        stack.manager._tick()
+        assert stack.spin_until(lambda: managed.pending is None)
+    assert stack.log == []
+    assert managed.held
