@@ -8,8 +8,11 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 import rclpy
+import yaml
 
-from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, Health
+from tactile_resonance.bringup import NODES
+from tactile_resonance.configuration import share_path
+from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S, Health
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
@@ -31,3 +34,14 @@ def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatc
     assert float(first[f"record{LONGEST}"]) == pytest.approx(10.0)
     assert first["record: messages"] == second["record: messages"] == "3"
     assert f"record{MEAN}" not in second
+
+
+def test_the_aggregator_puts_each_node_into_one_group():
+    file = yaml.safe_load(share_path("config/diagnostics.yaml").read_text())
+    groups = [g for g in file["analyzers"]["ros__parameters"].values() if isinstance(g, dict)]
+    for node in NODES:
+        for namespace in ("", "/left"):
+            status = f"{namespace}/{node}"
+            matching = [g["path"] for g in groups if any(part in status for part in g["contains"])]
+            assert len(matching) == 1, status
+    assert all(group["timeout"] > 2 * PERIOD_S for group in groups)
