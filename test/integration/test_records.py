@@ -87,14 +87,16 @@ class Client:
         return result.result().result
 
     def join(self, **goal):
-        """Measure until every topic's last message is heard: all have found each other by then."""
+        """Measure until every topic is heard, and the bench hears the tip's place."""
         for _ in range(20):
             key = self.measure(**goal).measurement_id
             deadline = time.monotonic() + 1.0
             while time.monotonic() < deadline:
                 self.executor.spin_once(timeout_sec=0.05)
                 if all(self.finished(topic, key) for topic in ("record", "frf", "poles")):
-                    return
+                    if self.of("record", key)[-1].tip_pose.pose.position.x > 0:
+                        return
+                    break
         raise AssertionError("the nodes are not heard")
 
     def measure_to_the_end(self, **goal):
