@@ -31,7 +31,7 @@ def generate_launch_description():
         DeclareLaunchArgument(
             "run_directory",
             default_value="",
-            description="New or empty folder of the run; empty: made in tactile_resonance/runs of $ROS_HOME.",
+            description="New or empty folder of the run, relative to run_folder; empty: made there.",
         ),
         DeclareLaunchArgument(
             "notes",

@@ -44,6 +44,9 @@ ARGUMENTS = {
 }
 """Arguments that are parameters as they stand: the parameter's name, and the nodes that have it."""
 
+FILES_OF_GOALS = ("scene", "run_directory")
+"""Arguments whose files the goals of a scan may name."""
+
 IN_BENCH_TIME = ("fake_hardware_node", "excitation_node", "contact_node", "scan_node")
 SIMULATED_CELL = "can_simulated.yaml"
 SCENE = "config/scenes/inclusion_scan.yaml"
@@ -189,6 +192,10 @@ def plan_bringup(
     if "table_in_base" in given:
         passed = _table(given["table_in_base"])
         pass_on("scan_node", "table_in_base", table_in_base=passed)
+    named = [Path(given[name]).expanduser() for name in FILES_OF_GOALS if name in given]
+    if folders := [str(path.parent) for path in named if path.is_absolute()]:
+        stated = value("scan_node", "goal_folders") or []
+        plan.passed["scan_node"]["goal_folders"] = [*stated, *folders]
     pass_on("scan_node", "robot", contact="none" if robot == "false" else "robot")
     # without robot and bench nobody measures the force
     source = "force_over" if mock or robot == "true" else "tcp_pose"

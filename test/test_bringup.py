@@ -305,6 +305,15 @@ def test_what_is_no_parameter_file_is_refused_by_name(tmp_path, text):
         read_parameter_file("absent.yaml")
 
 
+def test_a_goal_may_name_the_files_that_the_launch_names():
+    given = MOCK | {"scene": "/a/dish.yaml", "run_directory": "/b/c"}
+    _, nodes = heard(given, {"/scan_node": {"goal_folders": ["/mine"]}})
+    assert nodes["scan_node"]["goal_folders"] == ["/mine", "/a", "/b"]
+    # these are relative to the package's share folder, and to run_folder
+    _, nodes = heard(MOCK | {"scene": "config/scenes/demo.yaml", "run_directory": "c"})
+    assert "goal_folders" not in nodes["scan_node"]
+
+
 @pytest.mark.parametrize("own", [MOCK, REAL])
 def test_the_map_lies_on_the_table_where_the_scan_has_it(own):
     given = own | {"table_frame": "left_table", "base_frame": "left_base"}

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
@@ -223,7 +224,11 @@ def node_parameters(
             "frame_id": map_frame,
             "table_in_base": table,
         },
-        "scan_node": {"table_in_base": table, **time_server},
+        "scan_node": {
+            "table_in_base": table,
+            "goal_folders": json.dumps([str(job.scene.parent), str(job.output.parent)]),
+            **time_server,
+        },
     }
     return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}
 

@@ -26,7 +26,15 @@ from tactile_resonance.nodes.scan_messages import feedback_message, fill_result,
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
-from tactile_resonance.scan.goal import Frames, ScanGoal, WantedScan, read_goal, resumed_run
+from tactile_resonance.scan.goal import (
+    Frames,
+    ScanGoal,
+    WantedScan,
+    read_goal,
+    require_within,
+    resumed_run,
+    scene_path,
+)
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
@@ -68,6 +76,13 @@ PARAMETERS = (
         "",
         "Folder of the runs that name none; empty: tactile_resonance/runs in $ROS_HOME (~/.ros where "
         "that is not set).",
+        read_only=True,
+    ),
+    Parameter(
+        "goal_folders",
+        [""],
+        "Folders in which scenes and run folders of goals may be, beside the package's scenes and run_folder; "
+        "/ for any.",
         read_only=True,
     ),
     Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
@@ -146,7 +161,7 @@ class ScanNode(ManagedNode):
         try:
             if self._goal is not None:
                 raise ValueError(RUNNING)
-            goal = goal_of(message)
+            goal = self._goal_of(message)
             if goal.resume:
                 resumed_run(goal)
             else:
@@ -213,7 +228,7 @@ class ScanNode(ManagedNode):
         self, request: Scan.Goal, tell: Callable[[Progress], None]
     ) -> tuple[ScanScene, Plan, RunDirectory, int]:
         """Scene, plan and the open run of a goal; ValueError where it is refused."""
-        goal = goal_of(request)
+        goal = self._goal_of(request)
         if goal.resume:
             run = RunDirectory.open(resumed_run(goal))
             try:
@@ -238,10 +253,25 @@ class ScanNode(ManagedNode):
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
 
+    def _goal_of(self, message: Scan.Goal) -> ScanGoal:
+        """A goal whose files are where goals may have them; a relative run folder is in `run_folder`."""
+        goal, (names,) = goal_of(message), values(self, "goal_folders")
+        others = [Path(name).expanduser() for name in names if name]
+        scene, scenes = scene_path(goal.scene), share_path("config")
+        # what an installation has linked to elsewhere is the package's all the same
+        if goal.scene and not Path(os.path.normpath(scene)).is_relative_to(scenes):
+            require_within(scene, "scene", [scenes, *others])
+        if goal.run_directory:
+            runs = self._run_folder()
+            path = runs / Path(goal.run_directory).expanduser()
+            require_within(path, "run_directory", [runs, *others])
+            goal = replace(goal, run_directory=str(path))
+        return goal
+
     def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
         wanted = read_goal(goal, self._frames)
-        where = self._run_path(goal.run_directory)
+        where = Path(goal.run_directory) if goal.run_directory else self._unused_folder()
         design = design_measurement(wanted.scene)
         blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
         needed = expected_bytes(len(wanted.scene.positions_m), blocks, samples, design.lines)
@@ -267,15 +297,16 @@ class ScanNode(ManagedNode):
         self._hands.retract()
         return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
 
-    def _run_path(self, given: str) -> Path:
-        if given:
-            return Path(given).expanduser().absolute()
+    def _run_folder(self) -> Path:
         (folder,) = values(self, "run_folder")
         if folder:
-            parent = Path(folder).expanduser().absolute()
-        else:
-            home = os.environ.get("ROS_HOME")
-            parent = (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "runs"
+            return Path(folder).expanduser().absolute()
+        home = os.environ.get("ROS_HOME")
+        return (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "runs"
+
+    def _unused_folder(self) -> Path:
+        """For a run that names none."""
+        parent = self._run_folder()
         stamp, number = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()), 1
         while (path := parent / (stamp if number == 1 else f"{stamp}-{number}")).exists():
             number += 1

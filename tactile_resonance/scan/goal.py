@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -133,6 +134,14 @@ def scene_path(scene: str) -> Path:
     """Path of a scene file, absolute or in the package's share folder."""
     path = Path(scene).expanduser()
     return path if path.is_absolute() else share_path(path)
+
+
+def require_within(path: Path, name: str, folders: Sequence[Path]) -> None:
+    """Raise ``ValueError`` where a path of a goal leads out of all of some folders, by a link or ``..`` too."""
+    real = Path(os.path.realpath(path))
+    within = any(real.is_relative_to(os.path.realpath(folder)) for folder in folders)
+    listed = " or ".join(map(str, folders))
+    require(within, name, str(path), f"a path in {listed} (goal_folders of scan_node adds others)")
 
 
 def _without_file(goal: ScanGoal, frames: Frames) -> dict[str, Any]:

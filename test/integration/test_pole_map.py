@@ -97,7 +97,7 @@ def scanned(module_domain, tmp_path_factory):
     parameters = {
         "fake_hardware_node": {"scene": scene, **ideal, **time_server},
         "excitation_node": {"record_folder": folder / "records", **time_server},
-        "scan_node": time_server,
+        "scan_node": {"goal_folders": f"[{folder}]", **time_server},
     }
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up((*NODES, "scan_node"), parameters)

@@ -49,7 +49,7 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": table},
         "excitation_node": {"record_folder": tmp_path / "records"},
         "contact_node": {"robot_host": HOST, "force_host": HOST},
-        "scan_node": {"table_in_base": table},
+        "scan_node": {"table_in_base": table, "goal_folders": f"[{tmp_path}]"},
     }
     for node in parameters.values():
         node["time_server"] = TIME

@@ -97,7 +97,11 @@ def supervisor(domain, tmp_path):
     parameters = {
         "fake_hardware_node": {"scene": scene, "serve_contact": True, "time_server": TIME},
         "excitation_node": {"record_folder": tmp_path / "records", "time_server": TIME},
-        "scan_node": {"table_in_base": table, "time_server": TIME},
+        "scan_node": {
+            "table_in_base": table,
+            "goal_folders": f"[{tmp_path}]",
+            "time_server": TIME,
+        },
     }
     with NodeProcesses(tmp_path / "log") as nodes, Supervisor(nodes.check) as supervisor:
         nodes.bring_up(NODES, parameters)

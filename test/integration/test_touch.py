@@ -48,7 +48,7 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": listed(true)},
         "excitation_node": {"record_folder": tmp_path / "records"},
         "contact_node": {"robot_host": HOST, "force_host": HOST},
-        "scan_node": {"table_in_base": listed(told)},
+        "scan_node": {"table_in_base": listed(told), "goal_folders": f"[{tmp_path}]"},
     }
     for node in parameters.values():
         node["time_server"] = TIME

@@ -63,7 +63,8 @@ class Stack:
 @pytest.fixture(params=[SingleThreadedExecutor, lambda: MultiThreadedExecutor(2)])
 def stack(request, tmp_path):
     with initialised(
-        domain_id=free_domain_id(os.environ), args=["--ros-args", "-p", "contact:=none"]
+        domain_id=free_domain_id(os.environ),
+        args=["--ros-args", "-p", "contact:=none", "-p", f"goal_folders:=[{tmp_path}]"],
     ):
         made = Stack(request.param(), tmp_path)
         try:
@@ -96,6 +97,11 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
         ({"scene": stack.folder / "none.yaml"}, "none.yaml: cannot be read"),
         ({"run_directory": stack.folder / "full"}, "holds something; accepted is a new or empty"),
         ({"resume": True}, "accepted is the folder of a run, to resume it"),
+        ({"scene": "../../setup.py"}, "a path in"),
+        ({"scene": "/etc/passwd"}, "a path in"),
+        ({"run_directory": "/etc/new"}, "run_directory: got '/etc/new'; accepted is a path in"),
+        ({"run_directory": "../new"}, "(goal_folders of scan_node adds others)"),
+        ({"run_directory": "/etc", "resume": True}, "a path in"),
     ):
         goal = {**GOAL, "run_directory": new, **changes}
         outcome = stack.ended(stack.client.scan(**goal))

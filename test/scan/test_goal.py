@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.decision import Precise
-from tactile_resonance.scan.goal import Frames, ScanGoal, read_goal, resumed_run
+from tactile_resonance.scan.goal import Frames, ScanGoal, read_goal, require_within, resumed_run
 from tactile_resonance.scan.scene import read_scan_scene
 
 TABLE_IN_BASE = Pose(np.array([-0.49, -0.13, 0.2]), np.array([0.3, -0.2, -1.5]))
@@ -116,6 +117,20 @@ def test_a_goal_that_is_wrong_is_refused_with_the_field_its_value_and_what_is_ac
 def test_the_frame_of_poses_is_that_of_the_scene(scene):
     with pytest.raises(ValueError, match="got 'table'; accepted is 'phantom' or 'base'"):
         read_goal(replace(GOAL, scene=scene), FRAMES)
+
+
+def test_a_path_that_leads_out_of_the_folders_is_refused(tmp_path):
+    folders = [tmp_path / "runs", tmp_path / "more"]
+    for folder in folders:
+        folder.mkdir()
+    (tmp_path / "runs" / "link").symlink_to(tmp_path)
+    (tmp_path / "linked").symlink_to(tmp_path / "more")
+    for inside in ("runs/a/b", "more/../runs/c", "linked/d", "runs"):
+        require_within(tmp_path / inside, "run_directory", folders)
+    for outside in ("runs/../a", "runs/link/a", "runs2", ""):
+        with pytest.raises(ValueError, match="^run_directory: got .*; accepted is a path in .*runs or"):
+            require_within(tmp_path / outside, "run_directory", folders)
+    require_within(tmp_path, "run_directory", [Path("/")])
 
 
 def test_a_run_is_resumed_as_it_was_asked_for(tmp_path):
