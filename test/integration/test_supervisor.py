@@ -133,15 +133,7 @@ def test_a_scan_whose_node_is_deactivated_draws_the_tip_back_and_ends(supervisor
     supervisor.wait(lambda: supervisor.contact == "idle", WITHIN_S, "the tip to leave")
 
 
-def test_a_scan_waits_while_the_tip_is_stopped(supervisor):
-    assert supervisor.call(SetBool, "stop", SetBool.Request(data=True)).success
-    reason = "contact: the tip is stopped (service or topic stop)"
-    supervisor.see_it_wait(reason)
-    assert supervisor.call(SetBool, "stop", SetBool.Request(data=False)).success
-    supervisor.see_it_complete()
-
-
-def test_a_stop_outlives_the_node_that_was_stopped(supervisor):
+def test_a_scan_waits_while_the_tip_is_stopped_also_by_a_node_started_anew(supervisor):
     assert supervisor.call(SetBool, "stop", SetBool.Request(data=True)).success
     reason = "contact: the tip is stopped (service or topic stop)"
     supervisor.see_it_wait(reason)

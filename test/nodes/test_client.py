@@ -17,6 +17,7 @@ from rclpy.node import Node
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import PointResult
 
+from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
@@ -246,7 +247,8 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
     assert outcome.message == "scan_node is not active, for 1 s"
 
 
-def test_a_scan_whose_node_goes_away_is_lost(stack):
+def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
+    monkeypatch.setattr(client_module, "GONE_S", 1.0)
     stack.activate()
     future = stack.begin([])
     stack.executor.remove_node(stack.scan_node)
