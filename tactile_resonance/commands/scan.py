@@ -39,6 +39,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _resume(options: argparse.Namespace) -> int:
-    run = options.output.resolve()
-    scene = run / "scene.yaml"
-    return run_job(Job(scene, run, options.robot_host, resume=True, real_time=options.real_time))
+    from tactile_resonance.scan.goal import ScanGoal, resumed_run
+
+    run = resumed_run(ScanGoal(run_directory=str(options.output.resolve()), resume=True))
+    host, real_time = options.robot_host, options.real_time
+    return run_job(Job(run / "scene.yaml", run, host, resume=True, real_time=real_time))

@@ -131,6 +131,8 @@ class RunDirectory:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise ValueError(f"run: {path} holds something; accepted is a new or empty folder")
         parent = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        if not parent.is_dir():
+            raise ValueError(f"run: {path} is below the file {parent}; accepted is a folder")
         free = shutil.disk_usage(parent).free
         if needed_bytes > free:
             raise ValueError(

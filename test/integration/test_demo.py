@@ -152,8 +152,11 @@ def test_bad_options_are_refused_in_one_line(capsys):
             ["--notes", "{tip_wetness: damp}"],
             "tip_wetness: got 'damp'; accepted is one of dry, wet",
         ),
+        (["--output", f"{__file__}/run"], f"is below the file {__file__}; accepted is a folder"),
     ):
         assert cli.main(["demo", *options]) == 1
         printed = capsys.readouterr()
         assert message in printed.err
         assert printed.err.count("\n") == 1
+    assert cli.main(["resume", "nowhere"]) == 1
+    assert "nowhere'; accepted is the folder of a run, to resume it" in capsys.readouterr().err
