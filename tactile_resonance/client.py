@@ -94,6 +94,7 @@ class _Asked:
     handle: ClientGoalHandle | None = None
     cancelled: bool = False
     heard_s: float = 0.0
+    run_directory: str = ""  # as heard
 
 
 class TactileClient:
@@ -329,12 +330,13 @@ class TactileClient:
                     seen_s = time.monotonic()
                 if answer is not None or time.monotonic() - seen_s > GONE_S:
                     text = "scan_node went away; the run can be resumed"
-                    return ScanOutcome(Ending.LOST, text, asked.goal.run_directory)
+                    return ScanOutcome(Ending.LOST, text, asked.run_directory)
                 await self._tick
 
     def _hear_for(self, asked: _Asked) -> Callable[[Any], None]:
         def hear(message: Any) -> None:
             asked.heard_s = time.monotonic()
+            asked.run_directory = message.feedback.run_directory
             if asked.on_feedback is not None:
                 asked.on_feedback(message.feedback)
 

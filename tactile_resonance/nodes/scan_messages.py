@@ -28,9 +28,10 @@ def goal_of(message: Scan.Goal) -> ScanGoal:
     return ScanGoal(poses=poses, frame_id=message.poses.header.frame_id, **fields)
 
 
-def feedback_message(progress: Progress) -> Scan.Feedback:
+def feedback_message(progress: Progress, run_directory: str) -> Scan.Feedback:
     """Where a scan is, with the poles so far."""
     feedback = Scan.Feedback(
+        run_directory=run_directory,
         waiting_for=progress.waiting_for,
         point=progress.point.index if progress.point else progress.finished,
         finished=progress.finished,

@@ -117,6 +117,7 @@ class ScanNode(ManagedNode):
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
+        self._run_directory = ""
         self._progress: Progress | None = None
         for name, ask in {
             "scan/pause": lambda c: c.paused.set(),
@@ -203,6 +204,7 @@ class ScanNode(ManagedNode):
             self._hands.meet()
             scene, plan, run, seed = self._prepare(goal.request, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
+            self._run_directory = result.run_directory
             result.outcome = Scan.Result.ENDED
             self.get_logger().info(f"run goes to {run.path}")
             with run:
@@ -217,7 +219,7 @@ class ScanNode(ManagedNode):
             self.health.error(result.message)
         finally:
             self._time.end()
-            self._controls = self._progress = None
+            self._controls, self._progress, self._run_directory = None, None, ""
         return result
 
     def _publish(self, result: bytes) -> None:
@@ -325,7 +327,8 @@ class ScanNode(ManagedNode):
         goal, progress = self._goal, self._progress
         if waited_for and goal is not None and progress is not None:
             self.get_logger().warning(f"the scan waits for {waited_for}")
-            goal.publish_feedback(feedback_message(replace(progress, waiting_for=waited_for)))
+            waiting = replace(progress, waiting_for=waited_for)
+            goal.publish_feedback(feedback_message(waiting, self._run_directory))
 
     def _tell_of(self, goal: ServerGoalHandle) -> Any:
         last = [("", "", -math.inf)]
@@ -338,7 +341,7 @@ class ScanNode(ManagedNode):
             if progress.waiting_for and news != last[0][:2]:
                 self.get_logger().warning(f"the scan waits: {progress.waiting_for}")
             last[0] = (*news, now_s)
-            goal.publish_feedback(feedback_message(progress))
+            goal.publish_feedback(feedback_message(progress, self._run_directory))
 
         return tell
 

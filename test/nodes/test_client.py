@@ -4,6 +4,7 @@
 import math
 import os
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -65,7 +66,10 @@ class Stack:
 def stack(request, tmp_path):
     with initialised(
         domain_id=free_domain_id(os.environ),
-        args=["--ros-args", "-p", "contact:=none", "-p", f"goal_folders:=[{tmp_path}]"],
+        args=[
+            *("--ros-args", "-p", "contact:=none", "-p", f"run_folder:={tmp_path}"),
+            *("-p", f"goal_folders:=[{tmp_path}]"),
+        ],
     ):
         made = Stack(request.param(), tmp_path)
         try:
@@ -250,11 +254,16 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
 def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     monkeypatch.setattr(client_module, "GONE_S", 1.0)
     stack.activate()
-    future = stack.begin([])
+    heard = []
+    future = stack.begin(heard, run_directory="named by the node")
     stack.executor.remove_node(stack.scan_node)
     stack.scan_node.trigger_deactivate()
     stack.scan_node.trigger_cleanup()
-    assert stack.ended(future).ending is Ending.LOST
+    outcome = stack.ended(future)
+    assert outcome.ending is Ending.LOST
+    # it can be resumed
+    assert outcome.run_directory == heard[-1].run_directory
+    assert Path(outcome.run_directory, "run.json").is_file()
 
 
 def test_a_scan_node_in_a_namespace_is_named(stack):
