@@ -30,6 +30,8 @@ def test_index_executables_config_and_launch(prefix):
         "package.xml",
         "config/nodes.yaml",
         "config/tissues.yaml",
+        "config/security/policy.xml",
+        "config/security/node.xml",
         "launch/bringup.launch.py",
         "launch/mock.launch.py",
         "launch/ur.launch.py",
