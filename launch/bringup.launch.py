@@ -48,6 +48,12 @@ def generate_launch_description():
             description=f"Who finds these nodes: {DISCOVERY} for them. LOCALHOST: this machine only.",
         ),
         DeclareLaunchArgument(
+            "enclaves",
+            default_value="",
+            description="Security enclaves of the nodes: /tactile_resonance for those of "
+            "config/security/policy.xml. Empty: none is passed.",
+        ),
+        DeclareLaunchArgument(
             "robot",
             default_value="",
             choices=["", "true", "ideal", "false"],
@@ -106,7 +112,7 @@ def generate_launch_description():
 def _nodes(context):
     """The nodes that arguments and file ask for, and the manager that brings them up in this order."""
     given = context.launch_configurations
-    stack = given.get("ros_namespace")
+    stack, enclaves = given.get("ros_namespace"), given["enclaves"]
     plan = plan_bringup(
         given,
         read_parameter_file(given["params_file"]),
@@ -122,6 +128,7 @@ def _nodes(context):
             parameters=[LaunchConfiguration("params_file"), *([parameters] if parameters else [])],
             # a clock of its own for each namespace: two benches do not share their time
             remappings=[("/clock", "clock")],
+            ros_arguments=["--enclave", f"{enclaves}/{name}"] if enclaves else None,
             output="screen",
             respawn=True,  # the manager brings up again what was started anew
             respawn_delay=1.0,

@@ -188,6 +188,17 @@ def test_nodes_are_found_on_this_machine_only_unless_asked(
     assert os.environ.get(DISCOVERY) == by_user  # what else a stack starts keeps its own
 
 
+@pytest.mark.parametrize("file", ["mock", "ur", "example_stack"])
+def test_each_node_has_an_enclave_of_its_own_where_enclaves_are_given(file):
+    given = REAL if file == "ur" else {}
+    nodes = start(f"{file}.launch.py", **given, enclaves="/tactile_resonance")
+    for name, node in nodes.items():
+        enclave = node.command[node.command.index("--enclave") + 1]
+        assert enclave == f"/tactile_resonance/{name.rpartition('/')[2]}"
+        assert node.hears()["use_sim_time"] is (file != "ur")
+    assert not any("--enclave" in n.command for n in start(f"{file}.launch.py", **given).values())
+
+
 @pytest.fixture
 def tf2_ros(tmp_path, monkeypatch):
     (tmp_path / "share/ament_index/resource_index/packages").mkdir(parents=True)
