@@ -35,9 +35,8 @@ class ContactClient(NodeClient):
         self.message = ""
 
     def join(self) -> None:
-        """Action, service and state."""
+        """Action and state."""
         self._action = ActionClient(self._node, MakeContact, "make_contact")
-        self._retract = self._node.create_client(Trigger, "retract")
         self._node.create_subscription(msg.ContactState, "contact_state", self._on_state, SERIES)
 
     def why(self) -> str:
@@ -66,10 +65,11 @@ class ContactClient(NodeClient):
         """Of a goal."""
         return self._done(handle.get_result_async(), "the result").result
 
-    def retract(self) -> Trigger.Response:
-        """Ask once for a retraction."""
-        self.wait(self._retract.service_is_ready, HANGS_S, "retract")
-        return self._done(self._retract.call_async(Trigger.Request()), "an answer to retract")
+    def ask(self, name: str) -> Trigger.Response:
+        """Call a service without fields: `retract`, `manager_node/start` ..."""
+        service = self._node.create_client(Trigger, name)
+        self.wait(service.service_is_ready, HANGS_S, name)
+        return self._done(service.call_async(Trigger.Request()), f"an answer to {name}")
 
     def until(self, state: str) -> None:
         """Wait for a state."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stub of somebody's twist controller as a node, in lockstep with who commands it; for benchmark and tests."""
+"""A stub of a twist controller as a node, in lockstep with who commands it; for benchmark and tests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from tactile_resonance.simulation.twist_controller import TwistController
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
 CLEAR_M = 0.02
 LATENCY_S = 0.002
-"""The newest wrench of the bench's cell was measured a period before the step that brings it [s]."""
+"""A wrench of the bench's cell arrives, and is stamped, a period after it was measured [s]."""
+CELL_HZ = 500.0
 
 
 class TwistStub:
@@ -114,11 +115,12 @@ class TwistStub:
     def _publish(self) -> None:
         controller = self.controller
         stamp = time_message(controller.time_ns)
-        wrench = WrenchStamped()
-        wrench.header.stamp = stamp
-        force, torque = wrench.wrench.force, wrench.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = controller.wrench.wrench
-        self._wrench.publish(wrench)
+        for sample in controller.wrenches:
+            wrench = WrenchStamped()
+            wrench.header.stamp = time_message(sample.time_ns + round(1e9 * LATENCY_S))
+            force, torque = wrench.wrench.force, wrench.wrench.torque
+            force.x, force.y, force.z, torque.x, torque.y, torque.z = sample.wrench
+            self._wrench.publish(wrench)
         if self.poses:
             pose = PoseStamped()
             pose.header.stamp, pose.header.frame_id = stamp, "base"
@@ -136,16 +138,13 @@ def stub_parameters(folder: Path, rate_hz: float) -> dict[str, object]:
     robot = {"kind": "twist", "command_topic": COMMAND_TOPIC, "pose_topic": POSE_TOPIC}
     robot |= {"rate_hz": rate_hz, "lockstep": True}
     force = yaml.safe_load(share_path("config/force/topic.yaml").read_text(encoding="utf-8"))
-    force |= {"topic": WRENCH_TOPIC, "rate_hz": rate_hz, "latency_s": LATENCY_S}
+    force |= {"topic": WRENCH_TOPIC, "rate_hz": CELL_HZ, "latency_s": LATENCY_S}
     force["frame"] = {"position_m": [0.0] * 3, "rotation_rad": [0.0] * 3}
     for name, content in (("robot", robot), ("force", force)):
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    # a force may be two periods and its latency old
-    force_age_s = 2.5 / rate_hz + 2 * LATENCY_S
     return {
         "robot_config": str(folder / "robot.yaml"),
         "force_config": str(folder / "force.yaml"),
         "contact.period_s": 1 / rate_hz,
-        "limits.force_age_s": max(0.01, force_age_s),
         "publish_rate_hz": 50.0,
     }

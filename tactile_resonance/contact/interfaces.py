@@ -177,7 +177,7 @@ class Arm(Protocol):
 
 
 class LoopClock(Clock, Protocol):
-    """Simulated time that a control loop leads: when a wait returns, what the devices sent until then is here."""
+    """Simulated time that a control loop leads: after a wait, what the devices sent until then is here."""
 
     def ask_ns(self) -> int:
         """Time now [ns], also where it has gone on without the loop."""
@@ -220,7 +220,7 @@ class NodeArm(Arm, Protocol):
         ...
 
     def led_clock(self, cell: Cell, while_waiting: Callable[[], None]) -> LoopClock | None:
-        """Simulated time, led from now on by the loop that asks for it; None: it lives by this machine's clock.
+        """Simulated time, led from now on by the loop that asks for it; None on the wall clock.
 
         `while_waiting` is called every tenth of a second of this machine's time while simulated time
         stands; what it raises ends the wait.

@@ -14,8 +14,8 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
-from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.twist_config import TwistConfig, read_twist_config
+from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.fields import read_yaml, require
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -189,13 +189,17 @@ def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
             f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN"
         )
     if config.kind == "rtde" and isinstance(arm, TwistArm):
-        raise ValueError(f"force_config: {name!r} is of kind rtde, accepted with an arm of kind twist are can, topic")
+        raise ValueError(
+            f"force_config: {name!r} is of kind rtde, accepted for an arm of kind twist are can, topic"
+        )
+    # a retraction while the node goes down needs both
+    listens = arm.listener.node if isinstance(arm, TwistArm) else node
     return force_source(
         config,
         arm.recent,
         clock=arm.clock,
         arm_clock_std_s=lambda: arm.clock_uncertainty_s,
-        topic=lambda asked: TopicWrench(node, asked, arm.clock),
+        topic=lambda asked: TopicWrench(listens, asked, arm.clock),
     )
 
 

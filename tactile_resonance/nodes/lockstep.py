@@ -11,11 +11,11 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from tactile_resonance.clock import Demand
 from tactile_resonance.nodes.conversions import time_from_message
-from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import PLACES
 
 POLL_S = 0.1
@@ -48,7 +48,7 @@ class Lockstep:
 
     Parameters
     ----------
-    node : ManagedNode
+    node : Node
     answer : callable
         Publishes the command that holds, with the stamp that it is given [ns].
 
@@ -62,18 +62,17 @@ class Lockstep:
 
     simulated = True
 
-    def __init__(self, node: ManagedNode, answer: Callable[[int], None]) -> None:
+    def __init__(self, node: Node, answer: Callable[[int], None]) -> None:
         self.awaited: Sequence[Arrivals] = ()
         self.while_waiting: Callable[[], None] = lambda: None
         self._answer = answer
         self._steps = Arrivals()
         self._now_ns = 0
-        node.listen(
+        node.create_subscription(
             ClockMessage,
             "clock",
             lambda message: self._steps.add(time_from_message(message.clock)),
             PLACES,
-            always=True,
         )
 
     def now_ns(self) -> int:

@@ -32,9 +32,10 @@ from tactile_resonance.contact.vectors import (
 )
 from tactile_resonance.drivers.twist_config import TwistConfig
 from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.nodes.listener import Listener
 from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import COMMANDS, SERIES, RCLError
+from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
 
 REST: Six = (*ZERO, *ZERO)
@@ -74,10 +75,14 @@ class TwistArm:
     Parameters
     ----------
     node : ManagedNode
-        Subscribes and publishes until it is cleaned up; its thread is not the control loop's.
+        Until it is cleaned up the arm listens and commands, in a thread of its own.
     config : TwistConfig
     base_frame : str
         Frame of poses and twists.
+
+    Attributes
+    ----------
+    listener : Listener
     """
 
     waits_for = ""
@@ -86,7 +91,8 @@ class TwistArm:
 
     def __init__(self, node: ManagedNode, config: TwistConfig, base_frame: str) -> None:
         self.config, self._base_frame = config, base_frame
-        self._lockstep = Lockstep(node, self._publish) if config.lockstep else None
+        self.listener = Listener(node)
+        self._lockstep = Lockstep(self.listener.node, self._publish) if config.lockstep else None
         self.clock: Clock = self._lockstep or WallClock()
         self._arrivals = Arrivals()
         self._offset_m = vector(config.tip_in_tool.position_m)
@@ -98,11 +104,12 @@ class TwistArm:
         self._commanded_ns: int | None = None  # when the last command was given
         self._moving = False
         self._forget_way()
-        self._publisher = node.create_publisher(TwistStamped, config.command_topic, COMMANDS)
-        node.resources.callback(node.destroy_publisher, self._publisher)
-        node.listen(PoseStamped, config.pose_topic, self._on_pose, SERIES, always=True)
-        watchdog = node.steady_timer(config.max_command_gap_s / 2, self._watch_commands)
-        node.resources.callback(node.destroy_timer, watchdog)
+        own = self.listener.node
+        self._publisher = own.create_publisher(TwistStamped, config.command_topic, COMMANDS)
+        own.create_subscription(PoseStamped, config.pose_topic, self._on_pose, SERIES)
+        own.create_timer(config.max_command_gap_s / 2, self._watch_commands, clock=STEADY)
+        node.resources.callback(self.listener.close)
+        self.listener.start()
 
     # the contract
 
@@ -212,7 +219,7 @@ class TwistArm:
         raise self._fault
 
     def _watch_commands(self) -> None:
-        """Whether commands come often enough; also called while the loop hangs, by the node's timer."""
+        """Whether commands come often enough; also called while the loop hangs, by a timer."""
         with self._lock:
             gap_s = 0.0
             if self._moving and self._commanded_ns is not None:
@@ -241,7 +248,9 @@ class TwistArm:
         a, b, c = last.commanded_m
         path_m = last.path_m + math.hypot(x, y, z)
         oldest_ns = now_ns - 1e9 * config.follow_s
-        while self._ways[self._lag_from].time_ns < oldest_ns and self._lag_from < len(self._ways) - 1:
+        while (
+            self._ways[self._lag_from].time_ns < oldest_ns and self._lag_from < len(self._ways) - 1
+        ):
             self._lag_from += 1
         slack_m = path_m - self._ways[self._lag_from].path_m
         newest = _Way(now_ns, tip_m, (a + x, b + y, c + z), path_m, slack_m)
@@ -268,7 +277,7 @@ class TwistArm:
     # topics
 
     def _on_pose(self, message: PoseStamped) -> None:
-        """Take a pose, in the executor's thread."""
+        """Take a pose, in the listener's thread."""
         try:
             self._take(message)
         except ArmError:  # raised again by `state`
@@ -297,7 +306,9 @@ class TwistArm:
         turn = turn_from_quaternion(x, y, z, w)
         a, b, c = rotated(turn, self._offset_m)
         tip_m = (place.x + a, place.y + b, place.z + c)
-        tool = _Tool(time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn))
+        tool = _Tool(
+            time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn)
+        )
         self._tools.append(tool)
         self._arrivals.add(stamp_ns)
 

@@ -25,6 +25,8 @@ class TwistController:
 
     Attributes
     ----------
+    wrenches : list of CellSample
+        What the cell sent in the newest step; the newest was measured a period of the bench before its end.
     active : bool
         False: somebody has switched to another controller; commands are not followed.
     force_n : list of (float, float)
@@ -47,7 +49,7 @@ class TwistController:
         self._bench, self._period_ns = bench, round(1e9 / rate_hz)
         self._timeout_ns, self._acceleration_m_s2 = round(1e9 * timeout_s), acceleration_m_s2
         self._commanded_ns, self._twist = 0, np.zeros(6)
-        self._wrench: CellSample | None = None
+        self.wrenches: list[CellSample] = []
         bench.clock.on_step.append(self._record)
         self.step()
 
@@ -61,12 +63,6 @@ class TwistController:
         """Of the tool, as the encoders say."""
         return self._bench.clock.motion.reported
 
-    @property
-    def wrench(self) -> CellSample:
-        """Newest wrench that the cell has sent."""
-        assert self._wrench is not None
-        return self._wrench
-
     def command(self, stamp_ns: int, twist: Sequence[float]) -> None:
         """Take a twist (6,) of the tool in the base [m/s, rad/s]."""
         self._commanded_ns, self._twist = stamp_ns, np.array(twist, dtype=float)
@@ -78,9 +74,7 @@ class TwistController:
         clock = self._bench.clock
         clock.motion.speed(twist, self._acceleration_m_s2)
         clock.wait_until(clock.time_ns + self._period_ns)
-        self._wrench = (self._bench.cell.read() or [self._wrench])[-1]
-        if self._wrench is None:  # the first is still on its way
-            self.step()
+        self.wrenches = self._bench.cell.read()
 
     def _record(self) -> None:
         plant = self._bench.plant
