@@ -29,7 +29,7 @@ PARAMETERS = (
     Parameter(
         "robot_config",
         "config/devices/ur5e.yaml",
-        "The arm: a file, absolute or in the package's share folder.",
+        "The arm: a file, absolute or in the package's share folder; of kind ur, or twist for another driver's arm.",
         read_only=True,
     ),
     Parameter(
