@@ -29,7 +29,7 @@ PARAMETERS = (
     Parameter(
         "robot_config",
         "config/devices/ur5e.yaml",
-        "The arm: a file, absolute or in the package's share folder; of kind ur, or twist for another driver's arm.",
+        "The arm: a file, absolute or in the package's share folder; its kind is ur or twist.",
         read_only=True,
     ),
     Parameter(
