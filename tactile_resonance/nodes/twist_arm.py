@@ -43,6 +43,8 @@ VELOCITY_OVER_NS = 7_000_000
 """A velocity is the difference of two poses at least so far apart [ns]."""
 FOLLOWED_NS = 1_000_000_000
 """Over so long the way of the tip is compared with what was commanded [ns]."""
+COMMANDS_END_NS = 200_000_000
+"""Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""
 TURN_LEVER_M = 0.1
 """Turns the limit of acceleration [m/s2] into one of rotation [rad/s2]."""
 
@@ -69,8 +71,8 @@ class _Way(NamedTuple):
 class TwistArm:
     """An arm behind two topics (a `contact.interfaces.NodeArm`): poses in, twists out.
 
-    Every fault stays until `connect` is called, which only a new start of the node and a call of `retract` do;
-    until then all that is published is zero. While no contact is under way nothing is published.
+    Every fault of a contact stays until `connect` is called, which only a new start of the node and a call of
+    `retract` do; until then all that is published is zero. While no contact is under way nothing is published.
 
     Parameters
     ----------
@@ -140,11 +142,13 @@ class TwistArm:
         newest = tools[-1]
         age_s = (now_ns - newest.time_ns) * 1e-9
         if age_s > config.max_state_age_s:
-            self._fail(
-                ArmFault.STALE,
+            text = (
                 f"the newest pose on {config.pose_topic} is {1e3 * age_s:.0f} ms old, accepted are "
-                f"{1e3 * config.max_state_age_s:g} ms",
             )
+            text += f"{1e3 * config.max_state_age_s:g} ms"
+            if self._commanded_ns is None or now_ns - self._commanded_ns > COMMANDS_END_NS:
+                raise ArmError(ArmFault.STALE, text)  # nothing is under way that it could end
+            self._fail(ArmFault.STALE, text)
         if self._moving:
             self._check_followed(now_ns, newest.tip_m)
         else:  # how hard it slows down is its controller's

@@ -252,6 +252,22 @@ def test_an_old_pose_is_zero_and_a_fault_that_a_new_one_does_not_end(make):
     assert controller.commanded()[1][2] < 0
 
 
+def test_an_old_pose_while_nothing_is_under_way_ends_nothing(make):
+    controller = make()
+    controller.pose()
+    controller.now_ns += 10**9
+    assert fault_of(controller.arm.state) is ArmFault.STALE
+    controller.pose()
+    controller.arm.state()
+    # at rest in a contact it does, and it stays
+    controller.arm.stop(1.0)
+    controller.now_ns += 100_000_000
+    assert fault_of(controller.arm.state) is ArmFault.STALE
+    controller.pose()
+    assert fault_of(controller.arm.state) is ArmFault.STALE
+    assert controller.commanded()[1] == (0.0,) * 6
+
+
 @pytest.mark.parametrize("by_timer", [False, True])
 def test_commands_that_come_too_seldom_while_it_moves_are_zero_and_a_fault(make, by_timer):
     controller = make()
