@@ -70,14 +70,19 @@ def numbers(value: object, field: str, count: int | None = None) -> tuple[float,
     return tuple(number(item, f"{field}[{i}]") for i, item in enumerate(value))
 
 
-def read_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+def read_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str, **read: object) -> T:
     """Build a dataclass of float, int, bool and str fields from a mapping with exactly its keys.
 
-    Fields with a default may be left out. Range checks are the dataclass's own.
+    Fields with a default may be left out. Range checks are the dataclass's own. `read` are fields of other
+    types, which the caller has read.
     """
-    specifications = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    specifications = {
+        f.name: f
+        for f in dataclasses.fields(cls)  # type: ignore[arg-type]
+        if f.name not in read
+    }
     known_keys(mapping, set(specifications), where)
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = dict(read)
     for name, specification in specifications.items():
         field = _join(where, name)
         if name not in mapping:

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 NAMES = (
-    *("frf", "poles", "bench", "contact", "touch", "robot", "cell"),
+    *("frf", "poles", "bench", "contact", "touch", "robot", "twist", "cell"),
     *("recording", "pipeline", "live", "load"),
 )
 WITH_FULL = ("contact",)

@@ -7,10 +7,13 @@ time. The times of their samples are of the monotonic clock, or of the simulatio
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
+from tactile_resonance.clock import Clock
+from tactile_resonance.contact.command_limits import CommandLimits
 from tactile_resonance.contact.samples import ArmSample, CellSample, WrenchSample
 from tactile_resonance.contact.vectors import Six
 
@@ -48,6 +51,9 @@ class ArmFault(str, Enum):
     PROGRAM_NOT_STARTED = "program_not_started"
     COMMAND_REFUSED = "command_refused"
     CLIENT_DIED = "client_died"
+    INVALID = "invalid"  # a state without a time stamp, of another clock or frame
+    LATE = "late"  # commands came too seldom
+    NOT_FOLLOWED = "not_followed"  # the tip does not move as commanded
 
 
 class ForceError(Exception):
@@ -167,4 +173,56 @@ class Arm(Protocol):
 
     def close(self) -> None:
         """Stop and disconnect; never raises."""
+        ...
+
+
+class LoopClock(Clock, Protocol):
+    """Simulated time that a control loop leads: after a wait, what the devices sent until then is here."""
+
+    def ask_ns(self) -> int:
+        """Time now [ns], also where it has gone on without the loop."""
+        ...
+
+    def hurry(self) -> None:
+        """Make a wait that does not demand time demand it. From any thread."""
+        ...
+
+    def close(self) -> None:
+        """Lead no more."""
+        ...
+
+
+class NodeArm(Arm, Protocol):
+    """An arm as contact_node drives it."""
+
+    @property
+    def config(self) -> CommandLimits:
+        """What it allows."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """Clock on which its states are dated."""
+        ...
+
+    @property
+    def clock_uncertainty_s(self) -> float:
+        """Standard deviation of `ArmSample.time_ns` against `clock` [s]. Raises `ArmError`."""
+        ...
+
+    @property
+    def waits_for(self) -> str:
+        """What holds simulated time up, for people; empty: nothing."""
+        ...
+
+    def recent(self) -> ArmSample:
+        """As `state`, for calls after it in the same period."""
+        ...
+
+    def led_clock(self, cell: Cell, while_waiting: Callable[[], None]) -> LoopClock | None:
+        """Simulated time, led from now on by the loop that asks for it; None on the wall clock.
+
+        `while_waiting` is called every tenth of a second of this machine's time while simulated time
+        stands; what it raises ends the wait.
+        """
         ...

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from tactile_resonance.clock import Demand
 from tactile_resonance.contact.interfaces import Cell
 from tactile_resonance.drivers.can_wrench import CanWrench
-from tactile_resonance.drivers.ur_arm import UrArm
+
+if TYPE_CHECKING:
+    from tactile_resonance.drivers.ur_arm import UrArm
 
 
 class LedClock:

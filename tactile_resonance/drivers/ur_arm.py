@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import math
 import select
 import threading
 import time
 from collections.abc import Callable, Sequence
 
 from tactile_resonance.clock import Clock, Demand
-from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.contact.command_limits import check_acceleration, checked_twist
+from tactile_resonance.contact.interfaces import ArmError, ArmFault, Cell, LoopClock
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.rtde_stream import RtdeStream
@@ -158,18 +158,8 @@ class UrArm:
         ValueError
             Where a figure is beyond the limits of the configuration; nothing is sent then.
         """
-        values = tuple(map(float, twist))
-        if len(values) != 6 or not all(map(math.isfinite, values)):
-            raise ValueError(f"twist: {values}, expected 6 finite numbers")
-        config, (x, y, z, a, b, c) = self.config, values
-        speed_m_s, turn_rad_s = math.hypot(x, y, z), math.hypot(a, b, c)
-        if speed_m_s > config.max_speed_m_s:
-            allowed = f"the configuration allows {config.max_speed_m_s:g}"
-            raise ValueError(f"speed: {speed_m_s:g}, {allowed}")
-        if turn_rad_s > config.max_turn_rad_s:
-            allowed = f"the configuration allows {config.max_turn_rad_s:g}"
-            raise ValueError(f"turn: {turn_rad_s:g}, {allowed}")
-        self._check_acceleration(acceleration_m_s2)
+        values = checked_twist(twist, self.config)
+        check_acceleration(acceleration_m_s2, self.config)
         self.recent()
         assert self._states is not None
         if self._states.fault is not None:
@@ -181,7 +171,7 @@ class UrArm:
 
         Where states are stale the client still takes it, and sends it to the robot as soon as it may.
         """
-        self._check_acceleration(deceleration_m_s2)
+        check_acceleration(deceleration_m_s2, self.config)
         try:
             self._fresh()
         except ArmError as error:
@@ -198,6 +188,14 @@ class UrArm:
         self._time.close()
 
     # simulated time, led by a loop
+
+    def led_clock(self, cell: Cell, while_waiting: Callable[[], None]) -> LoopClock | None:
+        """Simulated time, led from now on; None on the wall clock. See `contact.interfaces.NodeArm`."""
+        if not self._time.address:
+            return None
+        from tactile_resonance.drivers.led_clock import LedClock  # it needs python-can
+
+        return LedClock(self, cell, while_waiting)
 
     def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:
         """Let simulated time go on only as far as `wait_until` asks for; does nothing on the wall clock.
@@ -463,10 +461,3 @@ class UrArm:
         if self._stream is not None:
             self._stream.close()
             self._stream = None
-
-    def _check_acceleration(self, value: float) -> None:
-        if not 0 < value <= self.config.max_acceleration_m_s2:
-            raise ValueError(
-                f"acceleration: {value:g}, the configuration allows above 0 to "
-                f"{self.config.max_acceleration_m_s2:g}"
-            )

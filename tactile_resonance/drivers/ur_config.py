@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import require
 
 
 def _is_loopback(host: str) -> bool:
@@ -152,6 +153,8 @@ def read_ur_config(path: Path) -> UrArmConfig:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
         if not isinstance(fields, dict):
             raise ValueError("expected names and values")
+        kind = fields.pop("kind", "ur")
+        require(kind == "ur", "kind", kind, "ur")
         return UrArmConfig.from_dict(fields)
     except (ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: {error}") from error

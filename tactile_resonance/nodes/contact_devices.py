@@ -7,17 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.command_limits import CommandLimits
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.interfaces import NodeArm
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
+from tactile_resonance.drivers.twist_config import TwistConfig, read_twist_config
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
-from tactile_resonance.fields import require
+from tactile_resonance.fields import read_yaml, require
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
+from tactile_resonance.nodes.twist_arm import TwistArm
 from tactile_resonance.processes import may_take_priority, take_priority
 from tactile_resonance.simulation.parameters import read_sensor
 
@@ -25,7 +29,7 @@ PARAMETERS = (
     Parameter(
         "robot_config",
         "config/devices/ur5e.yaml",
-        "The arm: a file, absolute or in the package's share folder.",
+        "The arm: a file, absolute or in the package's share folder; its kind is ur or twist.",
         read_only=True,
     ),
     Parameter(
@@ -111,11 +115,26 @@ def take_realtime(node: ManagedNode) -> int:
     return 0
 
 
-def make_arm(node: ManagedNode, priority: int) -> UrArm:
+def make_arm(node: ManagedNode, priority: int) -> NodeArm:
     """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
-    name, host, stalls_s = values(node, "robot_config", "robot_host", "simulated_stalls_s")
-    config = read_ur_config(_path(name))
-    config = replace(config, host=host or config.host)
+    names = ("robot_config", "robot_host", "simulated_stalls_s", "base_frame")
+    name, host, stalls_s, base_frame = values(node, *names)
+    path = _path(name)
+    kind = read_yaml(path).get("kind", "ur")
+    require(kind in ("ur", "twist"), f"{path}: kind", kind, "ur or twist")
+    if kind == "ur":
+        config = read_ur_config(path)
+        return _ur_arm(node, replace(config, host=host or config.host), stalls_s, priority)
+    for field, value, accepted in (
+        ("robot_host", host, "empty"),
+        ("simulated_stalls_s", stalls_s, "0"),
+        ("time_server", node.time_server, "empty"),
+    ):
+        require(not value, field, value, f"{accepted} for an arm of kind twist")
+    return TwistArm(node, read_twist_config(path), base_frame)
+
+
+def _ur_arm(node: ManagedNode, config: UrArmConfig, stalls_s: float, priority: int) -> UrArm:
     if stalls_s:
         good = config.simulated
         require(good, "simulated_stalls_s", stalls_s, f"0 for the robot at {config.host}")
@@ -131,7 +150,9 @@ def make_arm(node: ManagedNode, priority: int) -> UrArm:
     return UrArm(replace(config, realtime_priority=config.realtime_priority or priority))
 
 
-def require_arm_allows(config: UrArmConfig, parameters: ContactParameters, limits: Limits) -> None:
+def require_arm_allows(
+    config: CommandLimits, parameters: ContactParameters, limits: Limits
+) -> None:
     """Raise ``ValueError`` where the arm's driver would refuse what the controller may command."""
     speed, turn, acceleration = (
         ("max_speed_m_s", config.max_speed_m_s),
@@ -147,9 +168,13 @@ def require_arm_allows(config: UrArmConfig, parameters: ContactParameters, limit
     ):
         value = getattr(owner, name)
         require(value <= most, name, value, f"at most {field} = {most:g} of robot_config")
+    if isinstance(config, TwistConfig):
+        least = (1 - 1e-9) / config.rate_hz
+        value = parameters.period_s
+        require(value >= least, "period_s", value, f"1/rate_hz = {least:g} of robot_config or more")
 
 
-def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
+def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
     """The force source that the parameters name, not started yet; ValueError where they are wrong."""
     name, host, stalls_s = values(node, "force_config", "force_host", "simulated_stalls_s")
     config = read_force_config(Path(name).expanduser())
@@ -163,12 +188,18 @@ def make_force_source(node: ManagedNode, arm: UrArm) -> TipForce:
         raise ValueError(
             f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN"
         )
+    if config.kind == "rtde" and isinstance(arm, TwistArm):
+        raise ValueError(
+            f"force_config: {name!r} is of kind rtde, accepted for an arm of kind twist are can, topic"
+        )
+    # a retraction while the node goes down needs both
+    listens = arm.listener.node if isinstance(arm, TwistArm) else node
     return force_source(
         config,
         arm.recent,
         clock=arm.clock,
         arm_clock_std_s=lambda: arm.clock_uncertainty_s,
-        topic=lambda asked: TopicWrench(node, asked, arm.clock),
+        topic=lambda asked: TopicWrench(listens, asked, arm.clock),
     )
 
 

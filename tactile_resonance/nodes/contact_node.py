@@ -15,12 +15,11 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.interfaces import ArmError, ForceError
+from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
@@ -82,7 +81,7 @@ class ContactNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("contact_node", PARAMETERS)
         self._thread: ContactThread | None = None
-        self._arm: UrArm | None = None
+        self._arm: NodeArm | None = None
         self._stop = StopInput(self, self._draw_back)
         self.add_on_set_parameters_callback(self._on_parameters)
 
@@ -146,7 +145,6 @@ class ContactNode(ManagedNode):
             self._limits,
             self._tip,
             self._on_cycle,
-            bool(self.time_server),
         )
 
     def deactivate(self) -> None:

@@ -11,13 +11,11 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import ForceError
+from tactile_resonance.contact.interfaces import ForceError, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
-from tactile_resonance.drivers.led_clock import LedClock
-from tactile_resonance.drivers.ur_arm import UrArm
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0
@@ -37,14 +35,12 @@ class ContactThread:
 
     Parameters
     ----------
-    arm, force : UrArm, TipForce
+    arm, force : NodeArm, TipForce
         Connected and started.
     parameters, limits : ContactParameters, Limits
     tip : TipGeometry
     listener : callable
         Called with each cycle in the loop's thread; must return at once.
-    simulated : bool
-        The loop lives in simulated time and leads it; else on this machine's clock.
 
     Attributes
     ----------
@@ -54,13 +50,12 @@ class ContactThread:
 
     def __init__(
         self,
-        arm: UrArm,
+        arm: NodeArm,
         force: TipForce,
         parameters: ContactParameters,
         limits: Limits,
         tip: TipGeometry,
         listener: Callable[[Cycle], None],
-        simulated: bool,
     ) -> None:
         self.controller = ContactController(parameters, limits, tip)
         self.error: Exception | None = None
@@ -70,7 +65,7 @@ class ContactThread:
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
         self._source_tried_s = 0.0
         self._alive_s = time.monotonic()
-        self._led = LedClock(arm, force.cell, self._stay) if simulated else None
+        self._led = arm.led_clock(force.cell, self._stay)
         self.clock: Clock = self._led or arm.clock
         self.loop = ContactLoop(arm, force, self.clock, self.controller, listener)
         self._thread = threading.Thread(target=self._run, name="contact", daemon=True)

@@ -82,6 +82,10 @@ NEWEST = QoSProfile(
 PLACES = QoSProfile(
     depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
 )
+# To a controller: only the newest counts, and it must arrive.
+COMMANDS = QoSProfile(
+    depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
+)
 # Of a recording: two seconds of what is published at 50 Hz may wait.
 SERIES = QoSProfile(
     depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT

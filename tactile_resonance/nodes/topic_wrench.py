@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 
 from geometry_msgs.msg import WrenchStamped
@@ -11,12 +10,13 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from tactile_resonance.clock import WallClock
+from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import ForceConfig
 from tactile_resonance.nodes.conversions import time_from_message
+from tactile_resonance.nodes.lockstep import Arrivals
 
 SENSOR = QoSProfile(
     depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
@@ -36,15 +36,17 @@ class TopicWrench:
     node : Node
     config : ForceConfig
         Of kind topic.
-    clock : WallClock
-        On which wrenches are dated; stamps of messages are ROS time.
+    clock : Clock
+        On which wrenches are dated and silence is judged; stamps of messages are ROS time. Stamps of simulated
+        time are those of its bench, and not judged.
     """
 
-    def __init__(self, node: Node, config: ForceConfig, clock: WallClock | None = None) -> None:
+    def __init__(self, node: Node, config: ForceConfig, clock: Clock | None = None) -> None:
         if config.kind != "topic":
             raise ValueError(f"kind: {config.kind!r}, expected topic")
         self._node, self._config = node, config
-        self._clock = WallClock() if clock is None else clock
+        self._clock: Clock = WallClock() if clock is None else clock
+        self.arrivals = Arrivals()
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._samples: deque[CellSample] = deque(maxlen=10000)
         self._fault: ForceError | None = None
@@ -64,7 +66,7 @@ class TopicWrench:
         self._samples.clear()
         self._checks.restart()
         self._fault, self._last_stamp_ns = None, 0
-        self._silent_from_s = time.monotonic() + FIRST_WITHIN_S
+        self._silent_from_s = self._now_s + FIRST_WITHIN_S
         self._listening = True
         if self._subscription is None:
             self._subscription = self._node.create_subscription(
@@ -84,7 +86,7 @@ class TopicWrench:
         samples = []
         while self._samples:
             samples.append(self._samples.popleft())
-        late_s = time.monotonic() - self._silent_from_s
+        late_s = self._now_s - self._silent_from_s
         if not samples and late_s > 0:
             known = self._last_stamp_ns > 0
             since_s = late_s + (self._config.limits.silent_s if known else FIRST_WITHIN_S)
@@ -113,16 +115,21 @@ class TopicWrench:
             self._fault = error
             return
         self._last_stamp_ns = stamp_ns
-        self._silent_from_s = time.monotonic() + self._config.limits.silent_s
+        self._silent_from_s = self._now_s + self._config.limits.silent_s
         taken_ns = self._clock.own_ns(stamp_ns) - round(self._config.latency_s * 1e9)
         self._samples.append(CellSample(taken_ns, wrench, overload))
+        self.arrivals.add(stamp_ns)
+
+    @property
+    def _now_s(self) -> float:
+        return self._clock.now_ns() * 1e-9
 
     def _check_stamp(self, stamp_ns: int) -> None:
         topic = self._config.topic
-        age_s = (time.time_ns() - stamp_ns) * 1e-9
+        age_s = (self._clock.now_ns() - self._clock.own_ns(stamp_ns)) * 1e-9
         if stamp_ns == 0:
             raise ForceError(ForceFault.INVALID, f"topic {topic}: its messages have no time stamp")
-        if not -EARLIEST_S <= age_s <= LATEST_S:
+        if not (self._clock.simulated or -EARLIEST_S <= age_s <= LATEST_S):
             text = (
                 f"topic {topic}: its time stamp is {age_s:.3g} s old, accepted are {-EARLIEST_S:g} to "
                 f"{LATEST_S:g} s: are the clocks of both machines synchronised?"

@@ -13,6 +13,7 @@ import sys
 import time
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -47,8 +48,10 @@ class ContactClient(NodeClient):
         super().__init__("contact_client", check)
         self.state = None
         self.states = []
+        self.managed = ""  # what the manager reports
 
     def join(self):
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         self._action = ActionClient(self._node, MakeContact, "make_contact")
         self._retract = self._node.create_client(Trigger, "retract")
         self._stop = self._node.create_client(SetBool, "stop")
@@ -58,6 +61,11 @@ class ContactClient(NodeClient):
             SetParametersAtomically, "contact_node/set_parameters_atomically"
         )
         self._node.create_subscription(msg.ContactState, "contact_state", self._on_state, NEWEST)
+
+    def _on_diagnostics(self, array):
+        for status in array.status:
+            if status.name == "/manager_node":
+                self.managed = status.message
 
     def _on_state(self, message):
         self.state = message
@@ -130,6 +138,11 @@ class ContactClient(NodeClient):
         """Ask for a transition of contact_node's life, without waiting for its end."""
         self.wait(self._change.service_is_ready, HANGS_S, "change_state")
         self._change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+
+    def start_all(self):
+        """Ask the manager to bring all nodes up."""
+        start = self._node.create_client(Trigger, "manager_node/start")
+        return self._answer(start, Trigger.Request(), "manager_node/start")
 
     def set(self, **values):
         """Set parameters of contact_node, `limits__depth_m=1e-3`; why it refuses, empty where not."""

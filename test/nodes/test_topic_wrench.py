@@ -22,7 +22,6 @@ from spinning import spin_until
 from tactile_resonance.contact.cell_checks import samples_until_stuck
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.nodes import topic_wrench
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, FIRST_WITHIN_S, LATEST_S, TopicWrench
@@ -39,9 +38,10 @@ class Link:
     def __init__(self, monkeypatch):
         self.now_ns = 3_600 * 10**9
         clock = SimpleNamespace(
-            monotonic=lambda: self.now_ns * 1e-9, time_ns=lambda: self.now_ns + AHEAD_NS
+            simulated=False,
+            now_ns=lambda: self.now_ns,
+            own_ns=lambda ros_ns: ros_ns - AHEAD_NS,
         )
-        monkeypatch.setattr(topic_wrench, "time", clock)
         self._heard, takes = [], TopicWrench._on_wrench
 
         def take(source, message):
@@ -54,9 +54,7 @@ class Link:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._publisher = self.node.create_publisher(WrenchStamped, CONFIG.topic, 100)  # reliable
-        self.source = TopicWrench(
-            self.node, CONFIG, SimpleNamespace(own_ns=lambda ros_ns: ros_ns - AHEAD_NS)
-        )
+        self.source = TopicWrench(self.node, CONFIG, clock)
         self.source.start()
         self.wait(lambda: self._publisher.get_subscription_count() == 1)
 

@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`TwistArm`: an arm that somebody else's controller moves by geometry_msgs/TwistStamped (docs/twist.md)."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from geometry_msgs.msg import PoseStamped, TwistStamped
+
+from tactile_resonance.clock import Clock, WallClock
+from tactile_resonance.contact.command_limits import check_acceleration, checked_twist
+from tactile_resonance.contact.interfaces import ArmError, ArmFault, Cell, LoopClock
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    cross,
+    difference,
+    rotated,
+    scaled,
+    transposed,
+    turn_from_quaternion,
+    turn_product,
+    vector,
+    vector_from_turn,
+)
+from tactile_resonance.drivers.twist_config import TwistConfig
+from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.nodes.listener import Listener
+from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
+from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
+
+REST: Six = (*ZERO, *ZERO)
+VELOCITY_OVER_NS = 7_000_000
+"""A velocity is the difference of two poses at least so far apart [ns]."""
+FOLLOWED_NS = 1_000_000_000
+"""Over so long the way of the tip is compared with what was commanded [ns]."""
+COMMANDS_END_NS = 200_000_000
+"""Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""
+TURN_LEVER_M = 0.1
+"""Turns the limit of acceleration [m/s2] into one of rotation [rad/s2]."""
+
+
+class _Tool(NamedTuple):
+    """One pose of the tool, and the tip that it carries."""
+
+    time_ns: int
+    tool_m: Vector
+    tip_m: Vector
+    turn: Turn  # of the tip
+
+
+class _Way(NamedTuple):
+    """Where the tip has been and should have been, at one cycle."""
+
+    time_ns: int
+    tip_m: Vector
+    commanded_m: Vector
+    path_m: float  # length of the commanded way
+    slack_m: float  # what of it was commanded within `follow_s`
+
+
+class TwistArm:
+    """An arm behind two topics (a `contact.interfaces.NodeArm`): poses in, twists out.
+
+    Every fault of a contact stays until `connect` is called, which only a new start of the node and a call of
+    `retract` do; until then all that is published is zero. While no contact is under way nothing is published.
+
+    Parameters
+    ----------
+    node : ManagedNode
+        Until it is cleaned up the arm listens and commands, in a thread of its own.
+    config : TwistConfig
+    base_frame : str
+        Frame of poses and twists.
+
+    Attributes
+    ----------
+    listener : Listener
+    """
+
+    waits_for = ""
+    clock_uncertainty_s = 0.0
+    """The stamps are taken to be of this machine's clock, or of one that is kept with it."""
+
+    def __init__(self, node: ManagedNode, config: TwistConfig, base_frame: str) -> None:
+        self.config, self._base_frame = config, base_frame
+        self.listener = Listener(node)
+        self._lockstep = Lockstep(self.listener.node, self._publish) if config.lockstep else None
+        self.clock: Clock = self._lockstep or WallClock()
+        self._arrivals = Arrivals()
+        self._offset_m = vector(config.tip_in_tool.position_m)
+        self._offset_turn = config.tip_in_tool.turn
+        self._lock = threading.Lock()  # of fault and twist: two threads may set them
+        self._fault: ArmError | None = None
+        self._tools: deque[_Tool] = deque(maxlen=64)
+        self._twist = REST  # of the tip, after the limit of acceleration
+        self._commanded_ns: int | None = None  # when the last command was given
+        self._moving = False
+        self._forget_way()
+        own = self.listener.node
+        self._publisher = own.create_publisher(TwistStamped, config.command_topic, COMMANDS)
+        own.create_subscription(PoseStamped, config.pose_topic, self._on_pose, SERIES)
+        own.create_timer(config.max_command_gap_s / 2, self._watch_commands, clock=STEADY)
+        node.resources.callback(self.listener.close)
+        self.listener.start()
+
+    # the contract
+
+    def connect(self) -> None:
+        """Forget the fault; nothing moves before the next command."""
+        with self._lock:
+            self._fault = None
+            self._tools.clear()
+            self._twist, self._moving, self._commanded_ns = REST, False, None
+        self._forget_way()
+
+    def state(self) -> ArmSample:
+        """Newest state, without waiting.
+
+        Raises
+        ------
+        ArmError
+            LINK_LOST where no pose has come yet, or nobody listens to the commands; STALE, LATE, INVALID,
+            NOT_FOLLOWED, which stay until `connect`.
+        """
+        if self._fault is not None:
+            raise self._fault
+        config, now_ns = self.config, self.clock.now_ns()
+        tools = list(self._tools)
+        if not tools:
+            text = f"no pose has come on {config.pose_topic}"
+            raise ArmError(ArmFault.LINK_LOST, text)
+        newest = tools[-1]
+        age_s = (now_ns - newest.time_ns) * 1e-9
+        if age_s > config.max_state_age_s:
+            text = (
+                f"the newest pose on {config.pose_topic} is {1e3 * age_s:.0f} ms old, accepted are "
+            )
+            text += f"{1e3 * config.max_state_age_s:g} ms"
+            if self._commanded_ns is None or now_ns - self._commanded_ns > COMMANDS_END_NS:
+                raise ArmError(ArmFault.STALE, text)  # nothing is under way that it could end
+            self._fail(ArmFault.STALE, text)
+        if self._moving:
+            self._check_followed(now_ns, newest.tip_m)
+        else:  # how hard it slows down is its controller's
+            self._forget_way()
+        return ArmSample(
+            time_ns=newest.time_ns,
+            robot_time_s=newest.time_ns * 1e-9,
+            position_m=newest.tip_m,
+            rotation_rad=vector_from_turn(newest.turn),
+            velocity=_velocity(tools),
+        )
+
+    recent = state
+
+    def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
+        """Move the tip with a twist (6,) in the base [m/s, rad/s], for one period.
+
+        Raises
+        ------
+        ArmError
+            As `state`; LATE where the last command while it moved is too long ago.
+        ValueError
+            Where a figure is beyond the limits of the configuration; nothing is sent then.
+        """
+        wanted = checked_twist(twist, self.config)
+        check_acceleration(acceleration_m_s2, self.config)
+        if not self._publisher.get_subscription_count():
+            self._fail(ArmFault.LINK_LOST, f"nobody listens to {self.config.command_topic}")
+        self._watch_commands()
+        now_ns, period_s = self.clock.now_ns(), 1 / self.config.rate_hz
+        with self._lock:
+            if self._fault is not None:
+                raise self._fault
+            since_s = 0.0 if self._commanded_ns is None else (now_ns - self._commanded_ns) * 1e-9
+            step = acceleration_m_s2 * (since_s if self._moving else period_s)
+            self._twist, self._moving = _towards(self._twist, wanted, step), True
+            self._commanded_ns = now_ns
+        self._send()
+
+    def stop(self, deceleration_m_s2: float) -> None:
+        """Command zero at once, also after a fault; how hard the arm slows down is its controller's."""
+        check_acceleration(deceleration_m_s2, self.config)
+        with self._lock:
+            self._twist, self._moving = REST, False
+            self._commanded_ns = self.clock.now_ns()
+        self._send()
+
+    def close(self) -> None:
+        """Command zero, where anything was commanded; never raises."""
+        if self._commanded_ns is not None:
+            self.stop(self.config.max_acceleration_m_s2)
+            if self._lockstep is not None:
+                self._publish(self.clock.now_ns())
+
+    def led_clock(self, cell: Cell, while_waiting: Callable[[], None]) -> LoopClock | None:
+        """Time in step with a simulated controller; None on the wall clock. See `NodeArm`."""
+        if self._lockstep is not None:
+            wrench = (cell.arrivals,) if isinstance(cell, TopicWrench) else ()
+            self._lockstep.awaited = (self._arrivals, *wrench)
+            self._lockstep.while_waiting = while_waiting
+        return self._lockstep
+
+    # faults
+
+    def _fail(self, fault: ArmFault, text: str) -> None:
+        """Command zero, and raise a fault that stays."""
+        with self._lock:
+            if self._fault is None:
+                self._fault = ArmError(fault, text)
+            self._twist, self._moving = REST, False
+        self._send()
+        raise self._fault
+
+    def _watch_commands(self) -> None:
+        """Whether commands come often enough; also called while the loop hangs, by a timer."""
+        with self._lock:
+            gap_s = 0.0
+            if self._moving and self._commanded_ns is not None:
+                gap_s = (self.clock.now_ns() - self._commanded_ns) * 1e-9
+            if gap_s <= self.config.max_command_gap_s:
+                return
+            if self._fault is None:
+                text = f"no command for {1e3 * gap_s:.0f} ms while the tip moved, accepted are "
+                text += f"{1e3 * self.config.max_command_gap_s:g} ms"
+                self._fault = ArmError(ArmFault.LATE, text)
+            self._twist, self._moving = REST, False
+        self._send()
+
+    def _check_followed(self, now_ns: int, tip_m: Vector) -> None:
+        """Whether the tip is where it was commanded to be within `follow_s`, give or take `follow_m`."""
+        config, velocity = self.config, self._way_m_s
+        self._way_m_s = vector(self._twist[:3])
+        if not self._ways:
+            self._ways.append(_Way(now_ns, tip_m, ZERO, 0.0, 0.0))
+            return
+        last = self._ways[-1]
+        step_s = (now_ns - last.time_ns) * 1e-9
+        if step_s <= 0:
+            return
+        x, y, z = scaled(step_s, velocity)
+        a, b, c = last.commanded_m
+        path_m = last.path_m + math.hypot(x, y, z)
+        oldest_ns = now_ns - 1e9 * config.follow_s
+        while (
+            self._ways[self._lag_from].time_ns < oldest_ns and self._lag_from < len(self._ways) - 1
+        ):
+            self._lag_from += 1
+        slack_m = path_m - self._ways[self._lag_from].path_m
+        newest = _Way(now_ns, tip_m, (a + x, b + y, c + z), path_m, slack_m)
+        self._ways.append(newest)
+        while self._ways[1].time_ns < now_ns - FOLLOWED_NS:
+            self._ways.popleft()
+            self._lag_from -= 1
+        first = self._ways[0]
+        gone_m = difference(tip_m, first.tip_m)
+        off_m = math.dist(gone_m, difference(newest.commanded_m, first.commanded_m))
+        allowed_m = config.follow_m + slack_m + first.slack_m
+        if off_m > allowed_m:
+            self._fail(
+                ArmFault.NOT_FOLLOWED,
+                f"the tip is {1e3 * off_m:.2f} mm from where it was commanded to be, accepted are "
+                f"{1e3 * allowed_m:.2f} mm: is the controller active, and the only one?",
+            )
+
+    def _forget_way(self) -> None:
+        self._ways: deque[_Way] = deque()
+        self._lag_from = 0  # the oldest of `follow_s`
+        self._way_m_s = ZERO  # commanded since the last cycle
+
+    # topics
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        """Take a pose, in the listener's thread."""
+        try:
+            self._take(message)
+        except ArmError:  # raised again by `state`
+            return
+
+    def _take(self, message: PoseStamped) -> None:
+        if self._fault is not None:
+            return
+        topic, header = self.config.pose_topic, message.header
+        stamp_ns = time_from_message(header.stamp)
+        if header.frame_id != self._base_frame:
+            text = f"poses on {topic} are in {header.frame_id!r}, accepted is {self._base_frame!r}"
+            self._fail(ArmFault.INVALID, text)
+        time_ns = self.clock.own_ns(stamp_ns)
+        early_s = (time_ns - self.clock.now_ns()) * 1e-9
+        if stamp_ns == 0 or (early_s > EARLIEST_S and not self.clock.simulated):
+            text = f"the time stamp of a pose on {topic} is {early_s:.3g} s ahead, accepted are "
+            self._fail(ArmFault.INVALID, text + f"{EARLIEST_S:g} s, and not 0")
+        if self._tools and time_ns <= self._tools[-1].time_ns:
+            self._fail(ArmFault.INVALID, f"time stamps of poses on {topic} do not increase")
+        place, quaternion = message.pose.position, message.pose.orientation
+        x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+        if not 0.99 < math.hypot(x, y, z, w) < 1.01:
+            text = f"orientation on {topic}: {(x, y, z, w)}, expected a unit quaternion"
+            self._fail(ArmFault.INVALID, text)
+        turn = turn_from_quaternion(x, y, z, w)
+        a, b, c = rotated(turn, self._offset_m)
+        tip_m = (place.x + a, place.y + b, place.z + c)
+        tool = _Tool(
+            time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn)
+        )
+        self._tools.append(tool)
+        self._arrivals.add(stamp_ns)
+
+    def _send(self) -> None:
+        """Publish the command that holds; in lockstep the next step is answered with it."""
+        if self._lockstep is None:
+            self._publish(self.clock.now_ns())
+
+    def _publish(self, time_ns: int) -> None:
+        with self._lock:
+            x, y, z, *turn = self._twist
+            lever_m = ZERO
+            if self._tools:
+                lever_m = difference(self._tools[-1].tool_m, self._tools[-1].tip_m)
+            # of the tool's origin
+            a, b, c = cross(vector(turn), lever_m)
+            message = TwistStamped()
+            message.header.stamp = time_message(self.clock.ros_ns(time_ns))
+            message.header.frame_id = self._base_frame
+            linear, angular = message.twist.linear, message.twist.angular
+            linear.x, linear.y, linear.z = x + a, y + b, z + c
+            angular.x, angular.y, angular.z = turn
+            try:
+                self._publisher.publish(message)
+            except RCLError:
+                # once ROS has been shut down nobody listens, and the controller's own limit stops the arm
+                return
+
+
+def _velocity(tools: Sequence[_Tool]) -> Six:
+    """Velocity and angular velocity of the tip, from the newest pose and one far enough before it."""
+    newest = tools[-1]
+    before = newest
+    for before in reversed(tools):
+        if newest.time_ns - before.time_ns >= VELOCITY_OVER_NS:
+            break
+    seconds = (newest.time_ns - before.time_ns) * 1e-9
+    if seconds <= 0:
+        return REST
+    x, y, z = scaled(1 / seconds, difference(newest.tip_m, before.tip_m))
+    turned = vector_from_turn(turn_product(newest.turn, transposed(before.turn)))
+    return x, y, z, *scaled(1 / seconds, turned)
+
+
+def _towards(now: Six, wanted: Six, step: float) -> Six:
+    """Twist nearer to what is wanted, by a change of velocity of `step` [m/s] at most."""
+    change = tuple(b - a for a, b in zip(now, wanted, strict=True))
+    largest = max(math.hypot(*change[:3]), TURN_LEVER_M * math.hypot(*change[3:]))
+    if largest <= step:
+        return wanted
+    share = step / largest
+    a, b, c, d, e, f = (a + share * d for a, d in zip(now, change, strict=True))
+    return a, b, c, d, e, f
