@@ -41,11 +41,10 @@ def test_the_robot_is_released_taken_by_another_client_and_taken_back(bench, cli
     client.wait(
         lambda: bench.order("truth")["tip_m"][2] > held_m + 2e-3, HANGS_S, "the tip to leave"
     )
-    # before that the manager takes a node that was cleaned up for one that has failed, and brings it up
-    client.wait(lambda: client.managed == "held: contact_node", HANGS_S, "the manager to notice")
     assert bench.order("state")["rtde_connections"] > 0  # inactive it only rests
     client.change_state(Transition.TRANSITION_CLEANUP)
     released(bench, client)
+    client.wait(lambda: client.managed == "held: contact_node", HANGS_S, "the manager to report it")
     # another client: its program, its registers, its motion
     config = read_ur_config(share_path("config/devices/ur5e.yaml"))
     other = UrArm(

@@ -46,6 +46,9 @@ def lab(request, module_domain, tmp_path_factory):
             yield Lab(stub, client)
 
 
+at_125_hz = pytest.mark.parametrize("lab", [125.0], indirect=True)
+
+
 def test_one_centinewton_is_reached_and_held(lab):
     result = lab.client.result(lab.start())
     assert result.reached, result.message
@@ -69,6 +72,7 @@ def test_one_centinewton_is_reached_and_held(lab):
     assert np.ptp(lab.truth(idle_s)[2]) < STILL_M
 
 
+@at_125_hz
 def test_a_controller_that_was_switched_off_is_a_fault_and_nothing_moves_until_a_new_goal(lab):
     controller = lab.stub.controller
     handle = lab.start()
@@ -90,6 +94,7 @@ def test_a_controller_that_was_switched_off_is_a_fault_and_nothing_moves_until_a
     lab.client.until("idle")
 
 
+@at_125_hz
 def test_poses_that_stop_coming_are_a_fault_and_zero_within_the_deadline(lab):
     controller = lab.stub.controller
     handle = lab.start()
@@ -111,6 +116,7 @@ def test_poses_that_stop_coming_are_a_fault_and_zero_within_the_deadline(lab):
     lab.client.until("idle")
 
 
+@at_125_hz
 def test_a_node_that_is_shut_down_in_contact_draws_the_tip_back_and_commands_nothing_more(lab):
     result = lab.client.result(lab.start())
     assert result.reached, result.message
