@@ -283,21 +283,21 @@ class ScanNode(ManagedNode):
     def _find_surface(
         self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
     ) -> FoundSurface:
-        """Touch it; ValueError, PointFailed or ScanEnded where it is not found."""
+        """Touch it; ValueError where it is not found."""
         controls = self._controls
         assert controls is not None
         radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
 
         def touch(point: ScanPoint) -> Touch:
             tell(Progress(point, Phase.SURFACE, point.index, len(asked.xy_m)))
-            try:
-                return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
-            except PointFailed as error:
-                raise PointFailed(f"surface.touch: touch {point.index + 1}: {error}") from error
+            return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
 
         force_n = asked.force_n or scene.force_n
         self._hands.retract()
-        return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
+        try:
+            return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
+        except (ValueError, PointFailed, ScanEnded) as error:
+            raise ValueError(f"surface.touch: {error}") from error
 
     def _run_folder(self) -> Path:
         (folder,) = values(self, "run_folder")
