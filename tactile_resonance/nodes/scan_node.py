@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import math
 import os
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.action import Scan
+from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.configuration import share_path
+from tactile_resonance.fields import require
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -24,6 +27,7 @@ from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
+from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.goal import (
@@ -91,11 +95,11 @@ PARAMETERS = (
 )
 
 FEEDBACK_EVERY_S = 0.2
-RUNNING = "a scan is running, cancel it or wait for its result"
+RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 
 class ScanNode(ManagedNode):
-    """Action `scan`; services `pause`, `resume`, `skip_point`, `repeat_point` and `rejection` of `scan/`.
+    """Actions `scan` and `calibrate_table`; services `pause`, `resume`, `skip_point`, ... of `scan/`.
 
     Publishes `point_result` (latched).
     """
@@ -127,7 +131,12 @@ class ScanNode(ManagedNode):
         }.items():
             self.serve(Trigger, name, self._control(ask))
         self.serve(Trigger, "scan/rejection", self._on_rejection)
-        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel(), self._refusal)
+        busy = Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
+        self._act(Scan, "scan", self._scan, self._check_scan, busy)
+        busy = no_table(CalibrateTable.Result.FAILED, RUNNING)
+        self._act(
+            *(CalibrateTable, "calibrate_table", self._calibrate, self._check_calibration, busy)
+        )
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
@@ -140,6 +149,11 @@ class ScanNode(ManagedNode):
         if progress is None:
             return {}
         return {"phase": progress.phase.value, "points": f"{progress.finished} of {progress.points}"}
+
+    def _act(self, kind: type, name: str, work: Any, check: Any, busy: Any) -> None:
+        """Offer an action of which, with the others of this kind, one goal at a time is worked at."""
+        serve, refusal = partial(self._on_goal, work, busy), partial(self._refusal, check)
+        self.act(kind, name, serve, lambda _: self._cancel(), refusal)
 
     def _control(self, ask: Any) -> Any:
         def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -157,38 +171,50 @@ class ScanNode(ManagedNode):
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
 
-    def _refusal(self, message: Scan.Goal) -> str:
+    def _refusal(self, check: Callable[[Any], None], message: Any) -> str:
         """Why a goal is rejected, kept for who asks; empty where it is accepted."""
         try:
             if self._goal is not None:
                 raise ValueError(RUNNING)
-            goal = self._goal_of(message)
-            if goal.resume:
-                resumed_run(goal)
-            else:
-                self._new_run(goal)
+            check(message)
             self._rejection = ""
         except (ValueError, OSError) as error:
             self._rejection = " ".join(str(error).split())
             self.get_logger().warning(f"goal rejected: {self._rejection}")
         return self._rejection
 
+    def _check_scan(self, message: Scan.Goal) -> None:
+        goal = self._goal_of(message)
+        if goal.resume:
+            resumed_run(goal)
+        else:
+            self._new_run(goal)
+
+    def _check_calibration(self, message: CalibrateTable.Goal) -> None:
+        accepted = "robot: a table is calibrated by touch"
+        require(self._hands.free_air, "contact", "none", accepted)
+        request_of(message)
+
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Why the last goal was rejected: rclpy has no place for it in its answer to a goal."""
         response.success, response.message = bool(self._rejection), self._rejection
         return response
 
-    async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
+    async def _on_goal(
+        self, work: Callable[[ServerGoalHandle], Any], busy: Any, goal: ServerGoalHandle
+    ) -> Any:
         if self._goal is not None:
             goal.abort()
-            return Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
-        self._goal = goal
+            return busy
+        self._goal, self._controls = goal, Controls()
+        if goal.is_cancel_requested:  # before there were controls
+            self._cancel()
         try:
             with self._hands.listening():
-                result = await in_thread(self, lambda: self._scan(goal), "scan")
+                result = await in_thread(self, lambda: self._conduct(work, goal), "scan")
         finally:
             self._goal = None
-        if result.outcome == Scan.Result.COMPLETE:
+        if result.outcome in (Scan.Result.COMPLETE, CalibrateTable.Result.DONE):
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()
@@ -196,12 +222,29 @@ class ScanNode(ManagedNode):
             goal.abort()
         return result
 
-    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
-        result = Scan.Result(outcome=Scan.Result.REFUSED)
-        self._controls, tell = Controls(), self._tell_of(goal)
+    def _conduct(self, work: Callable[[ServerGoalHandle], Any], goal: ServerGoalHandle) -> Any:
+        """Result of a goal, worked at in its thread."""
         self._time.begin()
         try:
             self._hands.meet()
+            return work(goal)
+        finally:
+            self._time.end()
+            self._controls, self._progress, self._run_directory = None, None, ""
+
+    def _calibrate(self, goal: ServerGoalHandle) -> CalibrateTable.Result:
+        assert self._controls is not None
+        who = f"{self.get_fully_qualified_name()} on {socket.gethostname()}"
+        who += ", simulated" if self.time_server else ""
+        result = calibrate(goal, self._hands, self._controls.check_cancelled, self._frames, who)
+        if result.outcome != result.DONE:
+            self.health.error(result.message)
+        return result
+
+    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
+        result, tell = Scan.Result(outcome=Scan.Result.REFUSED), self._tell_of(goal)
+        assert self._controls is not None
+        try:
             scene, plan, run, seed = self._prepare(goal.request, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
             self._run_directory = result.run_directory
@@ -217,9 +260,6 @@ class ScanNode(ManagedNode):
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
-        finally:
-            self._time.end()
-            self._controls, self._progress, self._run_directory = None, None, ""
         return result
 
     def _publish(self, result: bytes) -> None:
@@ -323,10 +363,11 @@ class ScanNode(ManagedNode):
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
     def _tell_waiting(self, waited_for: str) -> None:
-        """Report a node that keeps a scan waiting, once, in the log and the feedback."""
+        """Report a node that keeps a scan waiting, once, in the log and a scan's feedback."""
         goal, progress = self._goal, self._progress
-        if waited_for and goal is not None and progress is not None:
+        if waited_for:
             self.get_logger().warning(f"the scan waits for {waited_for}")
+        if waited_for and goal is not None and progress is not None:
             waiting = replace(progress, waiting_for=waited_for)
             goal.publish_feedback(feedback_message(waiting, self._run_directory))
 

@@ -2,8 +2,8 @@
 """Where a table stands in the robot's base, from touches: height and tilts, with their covariance.
 
 A touch comes down along the table's normal as it is known, so its error is one of height, and the plane is the
-weighted least-squares fit of heights over x, y (`scan.touch`). x and y of the origin and the turn about the normal
-do not show in any height: they stay as they are known, and have no covariance.
+weighted least-squares fit of heights over x, y (`scan.touch`). x and y of the origin and the turn about the
+normal do not show in any height: they stay as they are known, and have no covariance.
 """
 
 from __future__ import annotations
@@ -113,6 +113,21 @@ class TableCalibration:
         """Of the residuals, expected 1; NaN where three touches leave nothing to check."""
         spare = self.residuals_m.size - 3
         return float(np.sum((self.residuals_m / self.std_m) ** 2)) / spare if spare else math.nan
+
+    def __str__(self) -> str:
+        """Correction and residuals in a sentence."""
+        (height, x, y), std = self.correction, self.std
+        text = (
+            f"height {1e3 * height:+.3f} +- {1e3 * std[0]:.3f} mm, tilt about x {1e3 * x:+.2f} +- "
+            f"{1e3 * std[1]:.2f} mrad, about y {1e3 * y:+.2f} +- {1e3 * std[2]:.2f} mrad"
+        )
+        if self.residuals_m.size == 3:
+            return f"{text}; three touches: no residual checks them"
+        worst = float(np.max(np.abs(self.residuals_m)))
+        return (
+            f"{text}; largest residual {1e6 * worst:.0f} um, reduced chi-square "
+            f"{self.reduced_chi_square:.2f}"
+        )
 
 
 def calibrate_table(

@@ -115,8 +115,8 @@ def test_a_surface_that_is_nowhere_in_reach_is_refused():
     with pytest.raises(PointFailed, match="touch 1: surface_missing below 0.0000"):
         find_surface(TouchRequest(SQUARE, "plane"), RADIUS_M, 0.0, contact_from(-3e-3))
     # a contact that searches less than a step meets the surface early instead of passing it by
+    timid = contact_from(-2.4e-3, searches_m=3e-4, early_m=5e-4)
     with pytest.raises(PointFailed, match="touch 1: surface_early"):
-        timid = contact_from(-2.4e-3, searches_m=3e-4, early_m=5e-4)
         find_surface(TouchRequest(SQUARE, "plane", search_m=5e-3), RADIUS_M, 0.0, timid)
 
 

@@ -126,7 +126,7 @@ def test_deviations_of_a_square_are_those_of_the_textbook():
 
 @pytest.mark.parametrize("top_m", [0.0, 0.03])
 def test_stated_covariance_is_that_of_the_error(top_m):
-    """Monte Carlo, unequal deviations: the error in its own covariance is chi-square of 3 degrees of freedom."""
+    """Monte Carlo, unequal deviations: the error in its covariance is chi-square of 3 degrees of freedom."""
     rng, count = np.random.default_rng(11), 1500
     std = np.array([2e-5, 4e-5, 1e-4, 3e-5, 6e-5, 2e-5])
     truth = np.array([2e-3, 0.02, -0.01])
