@@ -2,7 +2,9 @@
 """A table found by touch: exact from exact touches, and its covariance is that of the error."""
 
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ import yaml
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import ContactGoal
+from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.scan.surface_search import Touch
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, Touch
 from tactile_resonance.scan.table_calibration import (
     CalibrationRequest,
     calibrate_table,
@@ -19,7 +24,9 @@ from tactile_resonance.scan.table_calibration import (
 )
 from tactile_resonance.scan.table_file import NOT_ESTIMATED, ORDER, as_text, read_table
 
-RADIUS_M = 2.5e-3
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
+from contacts import RADIUS_M, contact
+
 KNOWN = Pose.from_vector(np.array([-0.49, -0.13, 0.2, 0.3, -0.2, -1.2]))
 TRIANGLE = ((0.0, 0.0), (0.05, 0.0), (0.01, 0.04))
 SIX = ((-0.02, -0.03), (0.03, -0.02), (0.02, 0.03), (-0.03, 0.02), (0.0, 0.0), (0.04, 0.04))
@@ -152,6 +159,32 @@ def test_stated_covariance_is_that_of_the_error(top_m):
     inside = sum(d < stats.chi2(3).ppf(0.95) for d in distances)
     low, high = stats.binom.interval(0.999, len(distances), 0.95)
     assert low <= inside <= high
+
+
+def test_touches_of_the_contact_keep_what_they_state():
+    """Control, load cell and estimation of the contact in virtual time, on soft tissue 0.5 mm and 1 deg off."""
+    height_m, tilt_rad, count = 5e-4, np.deg2rad(1.0), 6
+    square = ((-0.015, -0.015), (0.015, -0.015), (0.015, 0.015), (-0.015, 0.015), (0.0, 0.0))
+    known, distance, chi_square = Pose(np.zeros(3), np.zeros(3)), 0.0, 0.0
+    for seed in range(200, 200 + count):
+        bench = contact(height_m=height_m, tilt_rad=tilt_rad, start_m=4e-3, seed=seed)
+
+        def touch(point, bench=bench):
+            pose = touch_pose(point.position_m, point.normal, [1, 0, 0], RADIUS_M)
+            result = bench.loop.make(ContactGoal(pose, Aim(0.01)))
+            assert result.reached, result.message
+            bench.loop.retract()
+            x, y, z = point.position_m
+            std = max(result.surface_std_m, LEAST_TOUCH_STD_M)
+            return Touch((x, y, z + RADIUS_M + result.surface_m), std, result.force_n)
+
+        made = calibrate_table(request(square), known, RADIUS_M, touch)
+        error = made.correction - [height_m, 0.0, tilt_rad]  # towards x: about y
+        distance += error @ np.linalg.solve(made.covariance, error)
+        chi_square += 2 * made.reduced_chi_square
+    low, high = stats.chi2(3 * count).interval(0.998)
+    assert low < distance < high
+    assert chi_square < stats.chi2(2 * count).ppf(0.999)
 
 
 def test_a_touch_that_is_none_is_named():
