@@ -52,7 +52,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     for name, default, text in (
         ("height_m", 0.0, "of the touched surface above the table: a plate's thickness"),
         ("force_n", 0.01, "that ends each touch"),
-        ("search_m", 0.0, "so far above or below its place the first touch is searched for"),
+        ("search_m", 0.0, "so far above or below its place the surface may lie"),
         ("flatness_m", 0.0, "standard deviation of the surface about a plane"),
         ("most_tilt_rad", 0.05, "largest tilt that is accepted"),
         ("heading_rad", 0.0, "direction of the beam, clamp to tip, from the table's x axis"),
@@ -120,7 +120,12 @@ def ask(
     from tactile_resonance.client import Ending
     from tactile_resonance.nodes.scan_client import ScanClient
 
+    said = [-1]
+
     def tell(feedback: Any) -> None:
+        if feedback.point == said[0]:
+            return
+        said[0] = feedback.point
         before = f"; the one before at {1e3 * feedback.height_m:+.3f} mm"
         known = math.isfinite(feedback.height_m)
         print(

@@ -139,8 +139,8 @@ class TouchRequest:
     tolerance_m : float
         By which a touch may lie off the form fitted through all [m].
     search_m : float
-        So far above and below the expected height the first touch is searched for [m], from above in
-        steps; 0: as far as one contact searches.
+        So far above and below the expected height each of the first three touches is searched for [m], from
+        above in steps; 0: as far as one contact searches.
     """
 
     xy_m: tuple[tuple[float, float], ...]

@@ -85,8 +85,8 @@ def find_surface(
 ) -> FoundSurface:
     """Touch all places of a request and fit its form.
 
-    The first place is expected at the height that the request tells, or searched for about it, the others
-    where those before tell: on their plane as soon as it is known.
+    The first place is expected at the height that the request tells, the others where those before tell: on
+    their plane as soon as it is known. Before, surfaces are searched for as far as the request says.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def find_surface(
     for index, (x, y) in enumerate(request.xy_m):
         height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
         label = f"surface, touch {index + 1}"
-        search_m = 0.0 if touches else request.search_m
+        search_m = request.search_m if len(touches) < 3 else 0.0
         heights = height + np.linspace(search_m, -search_m, _steps(search_m))
         points = [ScanPoint(index, (x, y, z), UP, turn, label) for z in heights.tolist()]
         try:

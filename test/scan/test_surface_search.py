@@ -100,12 +100,32 @@ def test_a_surface_far_from_its_place_is_searched_for_from_above(off_m):
     request = TouchRequest(SQUARE, "plane", expected_height_m=0.01, search_m=5e-3)
     found = find_surface(request, RADIUS_M, 0.0, contact_from(0.01 + off_m, told))
     assert found.surface.height_m((0.0, 0.0)) == pytest.approx(0.01 + off_m)
-    searched = told[: len(told) - len(SQUARE) + 1]  # the rest come down once
-    assert searched[0] == pytest.approx(0.015)
-    # no step lower than the standoff of 3 mm, above which the tip travels; none where the surface was met
-    assert np.all(np.diff(searched) <= 0)
-    assert np.all(np.diff(searched) >= -2.000001e-3)
-    assert all(z - 2e-3 > 0.01 + off_m for z in searched[:-1])
+    assert told[0] == pytest.approx(0.015)
+    np.testing.assert_allclose(told[-2:], 0.01 + off_m)  # on the plane of three
+    steps = np.diff(told[:-2])
+    up = np.flatnonzero(steps > 0)
+    # no step as low as the standoff of 3 mm, above which the tip travels
+    assert np.all(steps >= -2.000001e-3)
+    # the next two are searched for about the height of the one before, each until it is met
+    assert len(up) == 2
+    np.testing.assert_allclose(np.array(told)[up + 1], 0.01 + off_m + 5e-3)
+    met = [*up, len(told) - 3]
+    assert all((abs(z - 0.01 - off_m) <= 2e-3) == (k in met) for k, z in enumerate(told[:-2]))
+
+
+def test_a_steep_table_is_found_before_its_plane_is_known():
+    """5 mm between two touches 20 mm apart: further than one contact searches."""
+    slope = np.array([0.15, -0.1])
+
+    def touch(point):
+        made = ball_on_plane(slope, 0.0)(point)
+        return contact_from(made.ball_m[2] - RADIUS_M)(point)
+
+    searched = TouchRequest(SQUARE, "plane", search_m=5e-3)
+    found = find_surface(searched, RADIUS_M, 0.0, touch)
+    np.testing.assert_allclose(found.surface.coefficients_m[1:] / found.surface.scale_m, slope)
+    with pytest.raises(PointFailed, match="touch 2: surface_early"):
+        find_surface(TouchRequest(SQUARE, "plane"), RADIUS_M, 0.0, touch)
 
 
 def test_a_surface_that_is_nowhere_in_reach_is_refused():
