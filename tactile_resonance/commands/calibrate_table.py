@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from tactile_resonance.commands.bench_scan import Job, node_parameters
+from tactile_resonance.commands.bench_scan import Job, node_parameters, require_packages
 from tactile_resonance.fields import numbers, require
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 from tactile_resonance.simulation.plant_defaults import HOST, TABLE_IN_BASE
@@ -114,6 +114,7 @@ def ask(
     namespace: str = "",
 ) -> CalibrationOutcome:
     """Outcome of a calibration by a scan_node that runs, or by the nodes that were started."""
+    require_packages("rclpy", "tactile_resonance.msg")
     # only here: the command answers --help without ROS
     from geometry_msgs.msg import Point
 
@@ -150,6 +151,7 @@ def _simulated(
     """Outcome on a bench whose table stands elsewhere than scan_node expects it."""
     from tactile_resonance.configuration import share_path
 
+    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can")
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     job = Job(share_path("config/scenes/inclusion_scan.yaml"), work / "run", host)
@@ -157,7 +159,10 @@ def _simulated(
     parameters["fake_hardware_node"]["table_in_base"] = f"[{','.join(map(str, true_table()))}]"
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters)
-        return ask(xys, height_m, wanted, nodes)
+        try:
+            return ask(xys, height_m, wanted, nodes)
+        except RuntimeError as error:  # a node ended, or did not come up
+            raise ValueError(str(error)) from error
 
 
 def true_table() -> list[float]:

@@ -15,6 +15,7 @@ from robot_at_hand import own_host, own_time
 from tactile_resonance.msg import ContactState
 
 from tactile_resonance.bringup import plan_bringup
+from tactile_resonance.cli import main
 from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, TRUTH, true_table
@@ -183,6 +184,35 @@ def test_one_goal_at_a_time_and_a_cancelled_one_draws_the_tip_back(ideal):
         client.wait(future.done, 60.0, "the end")
 
 
+def test_the_command_prints_what_was_found_or_why_it_was_not(ideal, capsys):
+    path = ideal.folder / "by_command.yaml"
+    points = ["calibrate-table", "--points", SIMULATED_POINTS]
+    assert main([*points, "--output", str(path)]) == 0
+    told = capsys.readouterr().out
+    lines = {line[:6].strip(): line.split() for line in told.splitlines()}
+    found = [float(lines[name][column]) for name, column in (("height", 1), ("tilt x", 2))]
+    np.testing.assert_allclose(found, [1e6 * TRUTH[0], 1e3 * TRUTH[1]], atol=1.0)
+    assert f"table_in_base:={path}" in told
+    assert "x, y and the turn about the normal: not estimated" in told
+    table = yaml.safe_load(path.read_text())["table_in_base"]
+    np.testing.assert_allclose(table, true_table(), atol=5e-5)
+    assert main(["calibrate-table", "--points", "[[0, 0], [0.01, 0]]"]) == 1
+    assert "points: got 2; accepted is three points or more" in capsys.readouterr().err
+
+
+def test_an_interrupt_has_the_tip_drawn_back_and_ends_the_goal(ideal):
+    heard, interrupts = [], [KeyboardInterrupt]
+
+    def check():
+        if len(heard) > 1 and interrupts:
+            raise interrupts.pop()
+
+    with ScanClient(check, "interrupted") as client, pytest.raises(KeyboardInterrupt):
+        client.calibrate_table(60.0, points=POINTS * 400, on_feedback=heard.append)
+    assert ideal.idle()
+    assert ideal.calibrate().ending is Ending.COMPLETE  # nothing is under way any more
+
+
 @pytest.mark.slow
 def test_robot_and_load_cell_find_a_table_that_stands_elsewhere(domain, tmp_path):
     pytest.importorskip("rtde_control", reason="ur-rtde is not here")
@@ -199,4 +229,6 @@ def test_robot_and_load_cell_find_a_table_that_stands_elsewhere(domain, tmp_path
     assert np.all(np.abs(error) < 4 * std), (error, std)
     # worth having: 3 mm are known to 0.05, 12 mrad to 2
     assert np.all(std < [5e-5, 2e-3, 2e-3])
-    assert outcome.reduced_chi_square < 18.5 / 2  # chi-square of 2 degrees of freedom, one in 10^4 above
+    assert (
+        outcome.reduced_chi_square < 18.5 / 2
+    )  # chi-square of 2 degrees of freedom, one in 10^4 above
