@@ -431,7 +431,8 @@ class TactileClient:
     def _hear_for(self, asked: _Asked) -> Callable[[Any], None]:
         def hear(message: Any) -> None:
             asked.heard_s = time.monotonic()
-            asked.run_directory = message.feedback.run_directory
+            if asked.kind is ScanOutcome:
+                asked.run_directory = message.feedback.run_directory
             if asked.on_feedback is not None:
                 asked.on_feedback(message.feedback)
 

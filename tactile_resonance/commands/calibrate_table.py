@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import tempfile
@@ -63,7 +64,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         )
     parser.add_argument("--sensor", default="bimorph", help="of config/sensors (default: bimorph)")
     parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="file of the result, on scan_node's machine"
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="new file of the result, in scan_node's run_folder",
     )
     parser.add_argument("--namespace", default="", help="of scan_node")
     parser.add_argument(
@@ -85,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
     xys = _points(options.points)
     names = ("force_n", "search_m", "flatness_m", "most_tilt_rad", "heading_rad", "sensor")
     wanted = {name: getattr(options, name) for name in names}
-    wanted["file"] = "" if options.output is None else options.output.absolute()
+    wanted["file"] = options.output or ""
     if options.simulated:
         with tempfile.TemporaryDirectory() as work:
             outcome = _simulated(options.robot_host, Path(work), xys, options.height_m, wanted)
@@ -157,6 +161,10 @@ def _simulated(
     job = Job(share_path("config/scenes/inclusion_scan.yaml"), work / "run", host)
     parameters = node_parameters(job, False, work)
     parameters["fake_hardware_node"]["table_in_base"] = f"[{','.join(map(str, true_table()))}]"
+    if wanted["file"]:
+        wanted["file"] = Path(wanted["file"]).absolute()
+        folder = json.dumps([str(wanted["file"].parent)])
+        parameters["scan_node"]["goal_folders"] = folder
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters)
         try:

@@ -51,6 +51,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest
 from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
+from tactile_resonance.scan.table_calibration import CalibrationRequest
 from tactile_resonance.simulation.parameters import read_sensor
 
 PARAMETERS = (
@@ -85,7 +86,7 @@ PARAMETERS = (
     Parameter(
         "goal_folders",
         [""],
-        "Folders in which scenes and run folders of goals may be, beside the package's scenes and run_folder; "
+        "Folders in which files and run folders of goals may be, beside the package's scenes and run_folder; "
         "/ for any.",
         read_only=True,
     ),
@@ -193,7 +194,15 @@ class ScanNode(ManagedNode):
     def _check_calibration(self, message: CalibrateTable.Goal) -> None:
         accepted = "robot: a table is calibrated by touch"
         require(self._hands.free_air, "contact", "none", accepted)
-        request_of(message)
+        self._calibration_of(message)
+
+    def _calibration_of(self, message: CalibrateTable.Goal) -> CalibrationRequest:
+        request = request_of(message)
+        if request.file:
+            path = self._path_of(request.file, "file")
+            require(not os.path.lexists(path), "file", str(path), "a new file")
+            request = replace(request, file=str(path))
+        return request
 
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Why the last goal was rejected: rclpy has no place for it in its answer to a goal."""
@@ -236,7 +245,8 @@ class ScanNode(ManagedNode):
         assert self._controls is not None
         who = f"{self.get_fully_qualified_name()} on {socket.gethostname()}"
         who += ", simulated" if self.time_server else ""
-        result = calibrate(goal, self._hands, self._controls.check_cancelled, self._frames, who)
+        request, check = self._calibration_of(goal.request), self._controls.check_cancelled
+        result = calibrate(goal, request, self._hands, check, self._frames, who)
         if result.outcome != result.DONE:
             self.health.error(result.message)
         return result
@@ -297,18 +307,26 @@ class ScanNode(ManagedNode):
 
     def _goal_of(self, message: Scan.Goal) -> ScanGoal:
         """A goal whose files are where goals may have them; a relative run folder is in `run_folder`."""
-        goal, (names,) = goal_of(message), values(self, "goal_folders")
-        others = [Path(name).expanduser() for name in names if name]
+        goal = goal_of(message)
         scene, scenes = scene_path(goal.scene), share_path("config")
         # what an installation has linked to elsewhere is the package's all the same
         if goal.scene and not Path(os.path.normpath(scene)).is_relative_to(scenes):
-            require_within(scene, "scene", [scenes, *others])
+            require_within(scene, "scene", [scenes, *self._goal_folders()])
         if goal.run_directory:
-            runs = self._run_folder()
-            path = runs / Path(goal.run_directory).expanduser()
-            require_within(path, "run_directory", [runs, *others])
+            path = self._path_of(goal.run_directory, "run_directory")
             goal = replace(goal, run_directory=str(path))
         return goal
+
+    def _path_of(self, given: str, name: str) -> Path:
+        """What a goal may write: in `run_folder`, as where it is relative, or in `goal_folders`."""
+        runs = self._run_folder()
+        path = runs / Path(given).expanduser()
+        require_within(path, name, [runs, *self._goal_folders()])
+        return path
+
+    def _goal_folders(self) -> list[Path]:
+        (names,) = values(self, "goal_folders")
+        return [Path(name).expanduser() for name in names if name]
 
     def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""

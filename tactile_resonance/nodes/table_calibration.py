@@ -12,7 +12,6 @@ from rclpy.action.server import ServerGoalHandle
 from tactile_resonance.action import CalibrateTable
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import require
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.scan.goal import Frames
 from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded
@@ -36,22 +35,24 @@ def request_of(message: CalibrateTable.Goal) -> CalibrationRequest:
     """What a goal asks for; ValueError where it is wrong."""
     given = {name: value for name in OPTIONS if (value := getattr(message, name))}
     points = tuple((point.x, point.y, point.z) for point in message.points)
-    request = CalibrationRequest(points, **given)
-    if request.file:
-        path = Path(request.file).expanduser()
-        good = path.parent.is_dir() and (path.is_file() or not path.exists())
-        require(good, "file", request.file, "a file in a folder that exists on scan_node's machine")
-    return request
+    return CalibrationRequest(points, **given)
 
 
 def calibrate(
-    goal: ServerGoalHandle, hands: NodeHands, check: Check, frames: Frames, who: str
+    goal: ServerGoalHandle,
+    request: CalibrationRequest,
+    hands: NodeHands,
+    check: Check,
+    frames: Frames,
+    who: str,
 ) -> CalibrateTable.Result:
     """Touch, fit and save, in a thread of its own.
 
     Parameters
     ----------
     goal : ServerGoalHandle
+    request : CalibrationRequest
+        What it asks for, its file where it may be.
     hands : NodeHands
     check : callable
         Raises `Interrupted` where the goal is cancelled.
@@ -60,7 +61,6 @@ def calibrate(
     who : str
         Made it, for the file.
     """
-    request = request_of(goal.request)
     radius_m = read_sensor(share_path(f"config/sensors/{request.sensor}.yaml")).tip.radius_m
     feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
 
@@ -90,8 +90,9 @@ def calibrate(
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "made_by": who,
         }
-        path = Path(request.file).expanduser().absolute()
+        path = Path(request.file)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, as_text(made, request, known).encode())
             result.file = str(path)
         except (OSError, ValueError) as error:

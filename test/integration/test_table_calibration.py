@@ -2,6 +2,7 @@
 """A table found by touch through the nodes, against the truth of the simulated bench."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.nodes.scan_node import RUNNING
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.scan.table_file import read_table
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")
 POINTS = [Point(x=float(x), y=float(y)) for x, y in yaml.safe_load(SIMULATED_POINTS)]
@@ -51,6 +53,7 @@ class Bench:
         parameters = node_parameters(Job(SCENE, folder / "run", host), False, folder)
         table = listed(true_table())
         parameters["fake_hardware_node"]["table_in_base"] = table
+        parameters["scan_node"]["run_folder"] = folder / "runs"
         if ideal:
             parameters["fake_hardware_node"].update(
                 serve_contact=True, robot_host="''", time_server=own_time(96)
@@ -112,6 +115,11 @@ def test_the_table_is_found_and_the_next_launch_takes_its_file(ideal):
     assert content["made_by"].startswith("/scan_node on ")
     assert content["made_by"].endswith(", simulated")
     # nothing changed in the running node: the same is found again, against the table as it was
+    refused = ideal.calibrate(file=path)
+    assert (refused.ending, refused.message[-10:]) == (Ending.REJECTED, "a new file")
+    beside = ideal.calibrate(file="tables/mine.yaml")
+    assert beside.file == str(ideal.folder / "runs" / "tables" / "mine.yaml")
+    assert read_table(Path(beside.file), "base") == launched
     again = ideal.calibrate()
     np.testing.assert_array_equal(correction(again), correction(outcome))
     assert again.file == ""
@@ -133,7 +141,9 @@ def test_three_touches_are_checked_by_none(ideal):
         ({"force_n": -0.01}, "force_n: got -0.01; accepted is a number above 0"),
         ({"force_n": math.nan}, "force_n: got nan; accepted is a finite number"),
         ({"sensor": "nose"}, "got 'nose'; accepted is one of config/sensors"),
-        ({"file": "/nowhere/table.yaml"}, "file: got '/nowhere/table.yaml'; accepted is a file in"),
+        ({"file": "/nowhere/table.yaml"}, "file: got '/nowhere/table.yaml'; accepted is a path in"),
+        ({"file": "../../../table.yaml"}, "accepted is a path in"),
+        ({"file": "."}, "accepted is a new file"),
     ],
 )
 def test_a_wrong_goal_is_rejected_with_the_reason(ideal, changes, reason):
