@@ -66,10 +66,6 @@ class Bench:
         self.client = ScanClient(self.nodes.check).__enter__()
         self.nodes.bring_up(self.names, self.parameters)
         self.client.wait_until_up(90.0)
-        self.states = []
-        self.client._node.create_subscription(
-            ContactState, "contact_state", self.states.append, STREAM
-        )
         return self
 
     def __exit__(self, *raised):
@@ -81,9 +77,12 @@ class Bench:
 
     def idle(self):
         """The tip is free, by what contact says from now on."""
-        self.states.clear()
-        self.client.wait(lambda: self.states, 30.0, "the state of the contact")
-        return self.states[-1].state == ContactState.STATE_IDLE
+        node, states = self.client._node, []
+        # a new one, which has nothing from before in its queue
+        topic = node.create_subscription(ContactState, "contact_state", states.append, STREAM)
+        self.client.wait(lambda: states, 30.0, "the state of the contact")
+        node.destroy_subscription(topic)
+        return states[-1].state == ContactState.STATE_IDLE
 
 
 @pytest.fixture(scope="module")
