@@ -74,7 +74,8 @@ def generate_launch_description():
         DeclareLaunchArgument(
             "table_in_base",
             default_value="",
-            description="Frame of scenes in the robot's base: [x, y, z, rx, ry, rz], m and rotation vector.",
+            description="Frame of scenes in the robot's base: [x, y, z, rx, ry, rz], m and rotation vector, or "
+            "the file of `tactile_resonance calibrate-table`.",
         ),
         DeclareLaunchArgument(
             "run_folder",

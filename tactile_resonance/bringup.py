@@ -19,6 +19,7 @@ import yaml
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
+from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.simulation.plant_defaults import HOST, STALLS_S, TABLE_IN_BASE
 
 NODES = (
@@ -49,6 +50,7 @@ FILES_OF_GOALS = ("scene", "run_directory")
 
 IN_BENCH_TIME = ("fake_hardware_node", "excitation_node", "contact_node", "scan_node")
 SIMULATED_CELL = "can_simulated.yaml"
+BASE_FRAME = "base"
 SCENE = "config/scenes/inclusion_scan.yaml"
 
 Parameters = dict[str, Any]
@@ -190,7 +192,8 @@ def plan_bringup(
         for node in its_nodes if argument in given else ():
             pass_on(node, argument, **{name: given[argument]})
     if "table_in_base" in given:
-        passed = _table(given["table_in_base"])
+        base_frame = value("scan_node", "base_frame") or BASE_FRAME
+        passed = _table_or_file(given["table_in_base"], base_frame)
         pass_on("scan_node", "table_in_base", table_in_base=passed)
     named = [Path(given[name]).expanduser() for name in FILES_OF_GOALS if name in given]
     if folders := [str(path.parent) for path in named if path.is_absolute()]:
@@ -215,7 +218,7 @@ def plan_bringup(
         for node, name in (("contact_node", "force_config"), ("scan_node", "table_in_base")):
             accepted = "one that argument or params_file states: a robot must not move by a default"
             require(value(node, name) is not None, name, None, accepted)
-    base_frame = value("scan_node", "base_frame") or "base"
+    base_frame = value("scan_node", "base_frame") or BASE_FRAME
     table_frame = value("scan_node", "table_frame") or "table"
     if (stands := value("scan_node", "table_in_base")) is not None:
         pass_on("pole_map_node", "base_frame", base_frame=base_frame)
@@ -269,6 +272,12 @@ def _robot(stated: Mapping[str, Parameters], mock: bool) -> str:
     return "ideal" if mock and stated["fake_hardware_node"].get("serve_contact") else "true"
 
 
+def _table_or_file(text: str, base_frame: str) -> list[float]:
+    """Six numbers as they stand, or of a file that `calibrate_table` wrote."""
+    path = Path(text).expanduser()
+    return read_table(path, base_frame) if path.is_file() else _table(text)
+
+
 def _table(value: object) -> list[float]:
     """Six finite numbers."""
     try:
@@ -276,5 +285,6 @@ def _table(value: object) -> list[float]:
     except (TypeError, ValueError, yaml.YAMLError):
         table = np.empty(0)
     good = table.shape == (6,) and bool(np.all(np.isfinite(table)))
-    require(good, "table_in_base", value, "[x, y, z, rx, ry, rz] in m and rad")
+    accepted = "[x, y, z, rx, ry, rz] in m and rad, or (launch argument) the file of a calibration"
+    require(good, "table_in_base", value, accepted)
     return [float(number) for number in table]

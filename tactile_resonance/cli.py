@@ -61,6 +61,7 @@ def _parser() -> OneLineParser:
     from tactile_resonance.commands import (
         analyze,
         benchmark,
+        calibrate_table,
         check_robot,
         demo,
         figures,
@@ -77,7 +78,7 @@ def _parser() -> OneLineParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
         *(demo, analyze, report, figures, benchmark),
-        *(scan, simulate_ur, simulate_cell, check_robot),
+        *(scan, calibrate_table, simulate_ur, simulate_cell, check_robot),
     ):
         command.add_parser(commands)
     return parser

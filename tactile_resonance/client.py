@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans for a node of your own: asked for, steered and followed without spinning or blocking."""
+"""Scans and calibrations for a node of your own: asked for and followed without spinning or blocking."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import uuid
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Pose, PoseArray
+from geometry_msgs.msg import Point, Pose, PoseArray
 from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
@@ -23,7 +24,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
-from tactile_resonance.action import Scan
+from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
 from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import drop
@@ -39,14 +40,14 @@ GONE_S = 10.0
 
 
 class Ending(Enum):
-    """How a scan ended."""
+    """How a scan or a calibration ended; a run that was begun and is not complete can be resumed."""
 
-    COMPLETE = "complete"  # every point of the plan is finished
-    ENDED = "ended"  # some are not; the run can be resumed
-    CANCELLED = "cancelled"  # on request; the run can be resumed
+    COMPLETE = "complete"  # every point of the plan is finished, the table is found
+    ENDED = "ended"  # some are not
+    CANCELLED = "cancelled"  # on request
     REJECTED = "rejected"  # the goal was not accepted
-    REFUSED = "refused"  # it was, and no point could be begun
-    LOST = "lost"  # scan_node went away; the run can be resumed
+    REFUSED = "refused"  # it was, and no point could be begun, or the touches determine no table
+    LOST = "lost"  # scan_node went away
 
 
 @dataclass(frozen=True)
@@ -75,21 +76,54 @@ class ScanOutcome:
     sensor_health: str = ""
 
 
-_ENDINGS = {
-    Scan.Result.COMPLETE: Ending.COMPLETE,
-    Scan.Result.ENDED: Ending.ENDED,
-    Scan.Result.REFUSED: Ending.REFUSED,
+@dataclass(frozen=True)
+class CalibrationOutcome:
+    """How a calibration ended; ``action/CalibrateTable.action`` gives unit and meaning of each field.
+
+    Attributes
+    ----------
+    ending : Ending
+    message : str
+        Why, in a sentence; of a table that was found correction and residuals.
+    """
+
+    ending: Ending
+    message: str
+    table_in_base: Sequence[float] = (math.nan,) * 6
+    height_m: float = math.nan
+    tilt_x_rad: float = math.nan
+    tilt_y_rad: float = math.nan
+    covariance: Sequence[float] = (math.nan,) * 9
+    residuals_m: Sequence[float] = ()
+    std_m: Sequence[float] = ()
+    reduced_chi_square: float = math.nan
+    file: str = ""
+
+
+_ENDINGS: dict[type, dict[int, Ending]] = {
+    ScanOutcome: {
+        Scan.Result.COMPLETE: Ending.COMPLETE,
+        Scan.Result.ENDED: Ending.ENDED,
+        Scan.Result.REFUSED: Ending.REFUSED,
+    },
+    CalibrationOutcome: {
+        CalibrateTable.Result.DONE: Ending.COMPLETE,
+        CalibrateTable.Result.FAILED: Ending.ENDED,
+        CalibrateTable.Result.REFUSED: Ending.REFUSED,
+    },
 }
 
 
 @dataclass
 class _Asked:
-    """A scan that is under way."""
+    """A goal that is under way."""
 
-    goal: Scan.Goal
+    client: GoalClient
+    kind: type  # of its outcome
+    goal: Any
     wait_s: float
-    on_feedback: Callable[[Scan.Feedback], None] | None
-    on_point: Callable[[PointResult], None] | None
+    on_feedback: Callable[[Any], None] | None
+    on_point: Callable[[PointResult], None] | None = None
     future: Future = field(default_factory=Future)
     handle: ClientGoalHandle | None = None
     cancelled: bool = False
@@ -115,7 +149,9 @@ class TactileClient:
         prefix = f"{namespace.rstrip('/')}/" if namespace else ""
         # of its own: a callback of the caller that awaits would keep all others of its group waiting
         group = MutuallyExclusiveCallbackGroup()
-        self._goals = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
+        self._scans = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
+        name = f"{prefix}calibrate_table"
+        self._calibrations = GoalClient(node, CalibrateTable, name, callback_group=group)
         self._services = {
             name: node.create_client(Trigger, f"{prefix}scan/{name}", callback_group=group)
             for name in ("pause", "resume", "skip_point", "repeat_point", "rejection")
@@ -171,12 +207,10 @@ class TactileClient:
         Raises
         ------
         RuntimeError
-            If a scan of this client is under way.
+            If a goal of this client is under way.
         ValueError
             If a value is not of the type or in the range of its field.
         """
-        if self._asked is not None:
-            raise RuntimeError("scan: one of this client is under way; cancel it or await its outcome")
         try:
             # unchecked, a value of a wrong type ends the process that sends it
             header = Header(check_fields=True, frame_id=frame)
@@ -194,13 +228,61 @@ class TactileClient:
             )
         except AssertionError as error:
             raise ValueError(f"scan: {error}") from error
-        self._asked = self._waiting = _Asked(goal, wait_s, on_feedback, on_point)
-        self._timer.reset()
-        self._begin.trigger()
-        return self._asked.future
+        return self._ask(_Asked(self._scans, ScanOutcome, goal, wait_s, on_feedback, on_point))
+
+    def calibrate_table(
+        self,
+        points: Sequence[Point],
+        *,
+        force_n: float = 0.0,
+        search_m: float = 0.0,
+        flatness_m: float = 0.0,
+        most_tilt_rad: float = 0.0,
+        heading_rad: float = 0.0,
+        sensor: str = "",
+        file: str | Path = "",
+        on_feedback: Callable[[CalibrateTable.Feedback], None] | None = None,
+        wait_s: float = 60.0,
+    ) -> Future:
+        """Ask for the table's place in the base, found by touch, for the next start of the nodes.
+
+        Parameters
+        ----------
+        points, force_n, search_m, flatness_m, most_tilt_rad, heading_rad, sensor, file
+            Fields of the goal (``action/CalibrateTable.action``).
+        on_feedback : callable
+            Called with each feedback.
+        wait_s : float
+            How long an active scan_node is waited for [s].
+
+        Returns
+        -------
+        Future
+            Its result is a `CalibrationOutcome`, whatever happens.
+
+        Raises
+        ------
+        RuntimeError, ValueError
+            As `scan`.
+        """
+        try:
+            goal = CalibrateTable.Goal(
+                check_fields=True,
+                points=list(points),
+                force_n=float(force_n),
+                search_m=float(search_m),
+                flatness_m=float(flatness_m),
+                most_tilt_rad=float(most_tilt_rad),
+                heading_rad=float(heading_rad),
+                sensor=sensor,
+                file=str(file),
+            )
+        except AssertionError as error:
+            raise ValueError(f"calibrate_table: {error}") from error
+        return self._ask(_Asked(self._calibrations, CalibrationOutcome, goal, wait_s, on_feedback))
 
     def cancel(self) -> None:
-        """End the scan after drawing the tip back; its future tells when that is done."""
+        """End the scan or calibration after drawing the tip back; its future tells when that is done."""
         if self._asked is not None:
             self._asked.cancelled = True
             if self._asked.handle is not None:
@@ -229,7 +311,18 @@ class TactileClient:
         self._node.destroy_subscription(self._points)
         for service in self._services.values():
             self._node.destroy_client(service)
-        self._goals.destroy()
+        self._scans.destroy()
+        self._calibrations.destroy()
+
+    def _ask(self, asked: _Asked) -> Future:
+        if self._asked is not None:
+            raise RuntimeError(
+                "goal: one of this client is under way; cancel it or await its outcome"
+            )
+        self._asked = self._waiting = asked
+        self._timer.reset()
+        self._begin.trigger()
+        return asked.future
 
     # in the executor
 
@@ -273,8 +366,8 @@ class TactileClient:
             self._asked = None
         asked.future.set_result(outcome)
 
-    async def _send(self, asked: _Asked) -> ScanOutcome | None:
-        """Send the goal until it is accepted, or return how that ended.
+    async def _send(self, asked: _Asked) -> Any:
+        """Send the goal until it is accepted, or return the outcome where it is not; None where it is.
 
         A goal whose answer is late, or lost, is sent again under its id, and accepted once.
         """
@@ -282,11 +375,11 @@ class TactileClient:
         waited_for = "no scan_node is there"
         deadline_s = time.monotonic() + asked.wait_s
         while not asked.cancelled and time.monotonic() < deadline_s:
-            if not self._goals.server_is_ready():
+            if not asked.client.server_is_ready():
                 await self._tick
                 continue
             hear = self._hear_for(asked)
-            answers.append(self._goals.send_goal_async(asked.goal, hear, goal_uuid=goal_id))
+            answers.append(asked.client.send_goal_async(asked.goal, hear, goal_uuid=goal_id))
             await self._until(partial(_any_done, answers), ASK_AGAIN_S)
             handles = [answer.result() for answer in answers if answer.done()]
             asked.handle = next((handle for handle in handles if handle.accepted), None)
@@ -302,17 +395,17 @@ class TactileClient:
                 drop(answers)
                 why = self._call("rejection")
                 if await self._until(why.done, ASK_AGAIN_S) and why.result().success:
-                    return ScanOutcome(Ending.REJECTED, why.result().message)
+                    return asked.kind(Ending.REJECTED, why.result().message)
                 waited_for = "scan_node is not active"
                 goal_id, answers = _new_id(), []
                 await self._tick
         drop(answers)
-        ClientGoalHandle(self._goals, goal_id, None).cancel_goal_async()
+        ClientGoalHandle(asked.client, goal_id, None).cancel_goal_async()
         if asked.cancelled:
-            return ScanOutcome(Ending.CANCELLED, "cancelled before it was accepted")
-        return ScanOutcome(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
+            return asked.kind(Ending.CANCELLED, "cancelled before it was accepted")
+        return asked.kind(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
 
-    async def _follow(self, asked: _Asked) -> ScanOutcome:
+    async def _follow(self, asked: _Asked) -> Any:
         """Outcome of a goal that was accepted."""
         assert asked.handle is not None
         results = list[Future]()
@@ -325,10 +418,12 @@ class TactileClient:
             while time.monotonic() - asked.heard_s < SILENT_S:
                 answer = next((r.result() for r in results if r.done()), None)
                 if answer is not None and answer.status != GoalStatus.STATUS_UNKNOWN:
-                    return _outcome(answer)
-                if self._goals.server_is_ready():
+                    return _outcome(answer, asked.kind)
+                if asked.client.server_is_ready():
                     seen_s = time.monotonic()
                 if answer is not None or time.monotonic() - seen_s > GONE_S:
+                    if asked.kind is CalibrationOutcome:
+                        return CalibrationOutcome(Ending.LOST, "scan_node went away")
                     text = "scan_node went away; the run can be resumed"
                     return ScanOutcome(Ending.LOST, text, asked.run_directory)
                 await self._tick
@@ -336,7 +431,8 @@ class TactileClient:
     def _hear_for(self, asked: _Asked) -> Callable[[Any], None]:
         def hear(message: Any) -> None:
             asked.heard_s = time.monotonic()
-            asked.run_directory = message.feedback.run_directory
+            if asked.kind is ScanOutcome:
+                asked.run_directory = message.feedback.run_directory
             if asked.on_feedback is not None:
                 asked.on_feedback(message.feedback)
 
@@ -351,10 +447,10 @@ def _new_id() -> UUID:
     return UUID(uuid=list(uuid.uuid4().bytes))
 
 
-def _outcome(answer: Any) -> ScanOutcome:
+def _outcome(answer: Any, kind: type) -> Any:
     """Outcome of the answer to a goal's result."""
-    result, ending = answer.result, _ENDINGS[answer.result.outcome]
+    result, ending = answer.result, _ENDINGS[kind][answer.result.outcome]
     if answer.status == GoalStatus.STATUS_CANCELED:
         ending = Ending.CANCELLED
-    names = [f.name for f in fields(ScanOutcome) if f.name != "ending"]
-    return ScanOutcome(ending, **{name: getattr(result, name) for name in names})
+    names = [f.name for f in fields(kind) if f.name != "ending"]
+    return kind(ending, **{name: getattr(result, name) for name in names})

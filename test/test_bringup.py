@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from tactile_resonance.bringup import NODES, plan_bringup, read_parameter_file, stated_for
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.scan.table_file import FORMAT
 
 MOCK = {"use_mock_hardware": "true"}
 REAL = {
@@ -160,6 +162,19 @@ def test_the_table_of_scans_is_that_of_the_bench():
         np.testing.assert_array_equal(plan.table.vector, [1, 2, 3, 0, 0, 0.5])
         for node in ("scan_node", "fake_hardware_node"):
             assert nodes[node]["table_in_base"] == [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]
+
+
+def test_a_calibrated_table_is_read_from_its_file(tmp_path):
+    path, table = tmp_path / "table.yaml", [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]
+    content = {"format": FORMAT, "table_in_base": table, "base_frame": "arm"}
+    path.write_text(yaml.safe_dump(content | {"covariance": np.eye(3).tolist()}))
+    given = REAL | {"table_in_base": str(path)}
+    assert heard(given | {"base_frame": "arm"})[1]["scan_node"]["table_in_base"] == table
+    with pytest.raises(ValueError, match=r"base_frame: got 'arm'; accepted is 'base'"):
+        heard(given)
+    nowhere = str(tmp_path / "none.yaml")
+    with pytest.raises(ValueError, match=r"table_in_base: got '.*none.yaml'.*file of a calibration"):
+        heard(given | {"table_in_base": nowhere})
 
 
 @pytest.mark.parametrize(

@@ -120,12 +120,7 @@ def run_job(job: Job) -> int:
 
     Returns 0 where every point of the plan is finished and one at least has poles, else 1.
     """
-    for package in ("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags"):
-        if find_spec(package) is None:
-            raise ValueError(
-                f"{package} not found: a scan needs ROS 2, ur-rtde, python-can and rosbags; use "
-                "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
-            )
+    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags")
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
     from tactile_resonance.scan.run_directory import RunDirectory
@@ -166,6 +161,16 @@ def run_job(job: Job) -> int:
     report.run(argparse.Namespace(run_folder=job.output))
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
     return 0 if result.ending is Ending.COMPLETE and result.done else 1
+
+
+def require_packages(*packages: str) -> None:
+    """``ValueError`` where one is not installed."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ValueError(
+                f"{package} not found: this needs ROS 2, ur-rtde, python-can and rosbags; use "
+                "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
+            )
 
 
 class _Ended:

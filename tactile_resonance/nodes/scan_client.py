@@ -9,10 +9,11 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from tactile_resonance.client import ScanOutcome, TactileClient
+from tactile_resonance.client import CalibrationOutcome, ScanOutcome, TactileClient
 from tactile_resonance.nodes.client import NodeClient
 
 SCAN_WITHIN_S = 24 * 3600.0
+CANCELLED_WITHIN_S = 130.0  # as long as a tip may take to be drawn back
 
 
 class ScanClient(NodeClient):
@@ -24,6 +25,8 @@ class ScanClient(NodeClient):
         Called while waiting; raises when waiting has become pointless.
     name : str
         Of its node.
+    namespace : str
+        Of scan_node.
 
     Attributes
     ----------
@@ -32,14 +35,17 @@ class ScanClient(NodeClient):
         What each node's diagnostics told last, by its name.
     """
 
-    def __init__(self, check: Callable[[], None], name: str = "scan_client") -> None:
+    def __init__(
+        self, check: Callable[[], None], name: str = "scan_client", namespace: str = ""
+    ) -> None:
         super().__init__(name, check)
+        self._namespace = namespace
         self.states: dict[str, str] = {}
         self._details: dict[str, dict[str, str]] = {}
 
     def join(self) -> None:
         """The client, and a reader of the diagnostics."""
-        self.tactile = TactileClient(self._node)
+        self.tactile = TactileClient(self._node, self._namespace)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
 
     def why(self) -> str:
@@ -69,6 +75,17 @@ class ScanClient(NodeClient):
         """Ask for a scan as `TactileClient.scan` does, and wait for its outcome."""
         future = self.tactile.scan(**wanted)
         self.wait(future.done, timeout_s, "the scan")
+        return future.result()
+
+    def calibrate_table(self, timeout_s: float, **wanted: Any) -> CalibrationOutcome:
+        """As `TactileClient.calibrate_table`, waiting for its outcome; an interrupt has the tip drawn back."""
+        future = self.tactile.calibrate_table(**wanted)
+        try:
+            self.wait(future.done, timeout_s, "the calibration")
+        except KeyboardInterrupt:
+            self.tactile.cancel()
+            self.wait(future.done, CANCELLED_WITHIN_S, "the calibration to end")
+            raise
         return future.result()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

@@ -40,7 +40,7 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.surface_search import Touch
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, Touch
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
@@ -50,11 +50,10 @@ NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
 DISCOVERED_WITHIN_S = 10.0
+NOT_MOVED = "the tip is not moved (parameter contact is none)"
 RECORDERS = 1  # of the subscribers of tcp_pose: the scan's own
 MET_WITHIN_S = 1.0
 """Nodes of this package give a sign of life much sooner, those of other packages never."""
-# Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
-LEAST_TOUCH_STD_M = 2e-5
 
 
 class NodeHands:
@@ -161,7 +160,7 @@ class NodeHands:
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
         """Touch a point of the surface as it is expected and draw back; return where the ball met it."""
         if self._tip is None:
-            raise ScanEnded("surface.touch: the tip is not moved (parameter contact is none)")
+            raise ScanEnded(NOT_MOVED)
         poll = self._poll_of([STATE_TOPIC])
         result = self._tip.touch(self._pose_of(point), force_n, check, poll)
         way = np.array(point.normal) * (ball_radius_m + result.surface_m)

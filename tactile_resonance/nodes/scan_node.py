@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import math
 import os
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.action import Scan
+from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.configuration import share_path
+from tactile_resonance.fields import require
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -24,6 +27,7 @@ from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
+from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.goal import (
@@ -47,6 +51,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest
 from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
+from tactile_resonance.scan.table_calibration import CalibrationRequest
 from tactile_resonance.simulation.parameters import read_sensor
 
 PARAMETERS = (
@@ -81,7 +86,7 @@ PARAMETERS = (
     Parameter(
         "goal_folders",
         [""],
-        "Folders in which scenes and run folders of goals may be, beside the package's scenes and run_folder; "
+        "Folders in which files and run folders of goals may be, beside the package's scenes and run_folder; "
         "/ for any.",
         read_only=True,
     ),
@@ -91,11 +96,11 @@ PARAMETERS = (
 )
 
 FEEDBACK_EVERY_S = 0.2
-RUNNING = "a scan is running, cancel it or wait for its result"
+RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 
 class ScanNode(ManagedNode):
-    """Action `scan`; services `pause`, `resume`, `skip_point`, `repeat_point` and `rejection` of `scan/`.
+    """Actions `scan` and `calibrate_table`; services `pause`, `resume`, `skip_point`, ... of `scan/`.
 
     Publishes `point_result` (latched).
     """
@@ -127,7 +132,12 @@ class ScanNode(ManagedNode):
         }.items():
             self.serve(Trigger, name, self._control(ask))
         self.serve(Trigger, "scan/rejection", self._on_rejection)
-        self.act(Scan, "scan", self._on_goal, lambda _: self._cancel(), self._refusal)
+        busy = Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
+        self._act(Scan, "scan", self._scan, self._check_scan, busy)
+        busy = no_table(CalibrateTable.Result.FAILED, RUNNING)
+        self._act(
+            *(CalibrateTable, "calibrate_table", self._calibrate, self._check_calibration, busy)
+        )
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
@@ -140,6 +150,11 @@ class ScanNode(ManagedNode):
         if progress is None:
             return {}
         return {"phase": progress.phase.value, "points": f"{progress.finished} of {progress.points}"}
+
+    def _act(self, kind: type, name: str, work: Any, check: Any, busy: Any) -> None:
+        """Offer an action of which, with the others of this kind, one goal at a time is worked at."""
+        serve, refusal = partial(self._on_goal, work, busy), partial(self._refusal, check)
+        self.act(kind, name, serve, lambda _: self._cancel(), refusal)
 
     def _control(self, ask: Any) -> Any:
         def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -157,38 +172,58 @@ class ScanNode(ManagedNode):
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
 
-    def _refusal(self, message: Scan.Goal) -> str:
+    def _refusal(self, check: Callable[[Any], None], message: Any) -> str:
         """Why a goal is rejected, kept for who asks; empty where it is accepted."""
         try:
             if self._goal is not None:
                 raise ValueError(RUNNING)
-            goal = self._goal_of(message)
-            if goal.resume:
-                resumed_run(goal)
-            else:
-                self._new_run(goal)
+            check(message)
             self._rejection = ""
         except (ValueError, OSError) as error:
             self._rejection = " ".join(str(error).split())
             self.get_logger().warning(f"goal rejected: {self._rejection}")
         return self._rejection
 
+    def _check_scan(self, message: Scan.Goal) -> None:
+        goal = self._goal_of(message)
+        if goal.resume:
+            resumed_run(goal)
+        else:
+            self._new_run(goal)
+
+    def _check_calibration(self, message: CalibrateTable.Goal) -> None:
+        accepted = "robot: a table is calibrated by touch"
+        require(self._hands.free_air, "contact", "none", accepted)
+        self._calibration_of(message)
+
+    def _calibration_of(self, message: CalibrateTable.Goal) -> CalibrationRequest:
+        request = request_of(message)
+        if request.file:
+            path = self._path_of(request.file, "file")
+            require(not os.path.lexists(path), "file", str(path), "a new file")
+            request = replace(request, file=str(path))
+        return request
+
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Why the last goal was rejected: rclpy has no place for it in its answer to a goal."""
         response.success, response.message = bool(self._rejection), self._rejection
         return response
 
-    async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
+    async def _on_goal(
+        self, work: Callable[[ServerGoalHandle], Any], busy: Any, goal: ServerGoalHandle
+    ) -> Any:
         if self._goal is not None:
             goal.abort()
-            return Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
-        self._goal = goal
+            return busy
+        self._goal, self._controls = goal, Controls()
+        if goal.is_cancel_requested:  # before there were controls
+            self._cancel()
         try:
             with self._hands.listening():
-                result = await in_thread(self, lambda: self._scan(goal), "scan")
+                result = await in_thread(self, lambda: self._conduct(work, goal), "scan")
         finally:
             self._goal = None
-        if result.outcome == Scan.Result.COMPLETE:
+        if result.outcome in (Scan.Result.COMPLETE, CalibrateTable.Result.DONE):
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()
@@ -196,12 +231,30 @@ class ScanNode(ManagedNode):
             goal.abort()
         return result
 
-    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
-        result = Scan.Result(outcome=Scan.Result.REFUSED)
-        self._controls, tell = Controls(), self._tell_of(goal)
+    def _conduct(self, work: Callable[[ServerGoalHandle], Any], goal: ServerGoalHandle) -> Any:
+        """Result of a goal, worked at in its thread."""
         self._time.begin()
         try:
             self._hands.meet()
+            return work(goal)
+        finally:
+            self._time.end()
+            self._controls, self._progress, self._run_directory = None, None, ""
+
+    def _calibrate(self, goal: ServerGoalHandle) -> CalibrateTable.Result:
+        assert self._controls is not None
+        who = f"{self.get_fully_qualified_name()} on {socket.gethostname()}"
+        who += ", simulated" if self.time_server else ""
+        request, check = self._calibration_of(goal.request), self._controls.check_cancelled
+        result = calibrate(goal, request, self._hands, check, self._frames, who)
+        if result.outcome != result.DONE:
+            self.health.error(result.message)
+        return result
+
+    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
+        result, tell = Scan.Result(outcome=Scan.Result.REFUSED), self._tell_of(goal)
+        assert self._controls is not None
+        try:
             scene, plan, run, seed = self._prepare(goal.request, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
             self._run_directory = result.run_directory
@@ -217,9 +270,6 @@ class ScanNode(ManagedNode):
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
-        finally:
-            self._time.end()
-            self._controls, self._progress, self._run_directory = None, None, ""
         return result
 
     def _publish(self, result: bytes) -> None:
@@ -257,18 +307,26 @@ class ScanNode(ManagedNode):
 
     def _goal_of(self, message: Scan.Goal) -> ScanGoal:
         """A goal whose files are where goals may have them; a relative run folder is in `run_folder`."""
-        goal, (names,) = goal_of(message), values(self, "goal_folders")
-        others = [Path(name).expanduser() for name in names if name]
+        goal = goal_of(message)
         scene, scenes = scene_path(goal.scene), share_path("config")
         # what an installation has linked to elsewhere is the package's all the same
         if goal.scene and not Path(os.path.normpath(scene)).is_relative_to(scenes):
-            require_within(scene, "scene", [scenes, *others])
+            require_within(scene, "scene", [scenes, *self._goal_folders()])
         if goal.run_directory:
-            runs = self._run_folder()
-            path = runs / Path(goal.run_directory).expanduser()
-            require_within(path, "run_directory", [runs, *others])
+            path = self._path_of(goal.run_directory, "run_directory")
             goal = replace(goal, run_directory=str(path))
         return goal
+
+    def _path_of(self, given: str, name: str) -> Path:
+        """What a goal may write: in `run_folder`, as where it is relative, or in `goal_folders`."""
+        runs = self._run_folder()
+        path = runs / Path(given).expanduser()
+        require_within(path, name, [runs, *self._goal_folders()])
+        return path
+
+    def _goal_folders(self) -> list[Path]:
+        (names,) = values(self, "goal_folders")
+        return [Path(name).expanduser() for name in names if name]
 
     def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
@@ -283,21 +341,21 @@ class ScanNode(ManagedNode):
     def _find_surface(
         self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
     ) -> FoundSurface:
-        """Touch it; ValueError, PointFailed or ScanEnded where it is not found."""
+        """Touch it; ValueError where it is not found."""
         controls = self._controls
         assert controls is not None
         radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
 
         def touch(point: ScanPoint) -> Touch:
             tell(Progress(point, Phase.SURFACE, point.index, len(asked.xy_m)))
-            try:
-                return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
-            except PointFailed as error:
-                raise PointFailed(f"surface.touch: touch {point.index + 1}: {error}") from error
+            return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
 
         force_n = asked.force_n or scene.force_n
         self._hands.retract()
-        return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
+        try:
+            return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
+        except (ValueError, PointFailed, ScanEnded) as error:
+            raise ValueError(f"surface.touch: {error}") from error
 
     def _run_folder(self) -> Path:
         (folder,) = values(self, "run_folder")
@@ -323,10 +381,11 @@ class ScanNode(ManagedNode):
         return run_facts(plan, seed, {"name": scene.name, "notes": notes, "scan_node": own})
 
     def _tell_waiting(self, waited_for: str) -> None:
-        """Report a node that keeps a scan waiting, once, in the log and the feedback."""
+        """Report a node that keeps a scan waiting, once, in the log and a scan's feedback."""
         goal, progress = self._goal, self._progress
-        if waited_for and goal is not None and progress is not None:
+        if waited_for:
             self.get_logger().warning(f"the scan waits for {waited_for}")
+        if waited_for and goal is not None and progress is not None:
             waiting = replace(progress, waiting_for=waited_for)
             goal.publish_feedback(feedback_message(waiting, self._run_directory))
 

@@ -26,6 +26,7 @@ from tactile_resonance.scan.hands import (
     PointFailed,
     ScanEnded,
     Stopped,
+    SurfaceMissing,
 )
 from tactile_resonance.scan.scene import Hold
 
@@ -192,4 +193,6 @@ def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:
     text = f"contact: {ended.cause}: {ended.message}"
     if ended.cause in FOREIGN_CAUSES:
         return PointDisturbed(text, ended.cause)
+    if ended.cause == Cause.SURFACE_MISSING.value:
+        return SurfaceMissing(text)
     return PointFailed(text)

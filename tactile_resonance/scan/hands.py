@@ -26,6 +26,10 @@ class PointFailed(Exception):
     """A point gave no result; the message says why. The scan may go on with the next."""
 
 
+class SurfaceMissing(PointFailed):
+    """Nothing was touched, as far down as the tip may search."""
+
+
 class PointDisturbed(PointFailed):
     """A point was spoiled by something that says nothing of it, a late sensor for example.
 

@@ -18,6 +18,7 @@ from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
 FORMS = ("plane", "height_field", "mesh", "touch")
+MOST_SEARCH_M = 0.02
 
 
 class Surface(Protocol):
@@ -137,6 +138,9 @@ class TouchRequest:
         That ends each touch [N]; None: that of the scene.
     tolerance_m : float
         By which a touch may lie off the form fitted through all [m].
+    search_m : float
+        So far above and below the expected height each of the first three touches is searched for [m], from
+        above in steps; 0: as far as one contact searches.
     """
 
     xy_m: tuple[tuple[float, float], ...]
@@ -144,6 +148,7 @@ class TouchRequest:
     expected_height_m: float = 0.0
     force_n: float | None = None
     tolerance_m: float = 2e-4
+    search_m: float = 0.0
 
 
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:
@@ -200,7 +205,7 @@ def _read_height_field(content: Mapping[str, Any], folder: Path, where: str) -> 
 
 
 def _read_touch(content: Mapping[str, Any], where: str) -> TouchRequest:
-    options = ("expected_height_m", "force_n", "tolerance_m")
+    options = ("expected_height_m", "force_n", "tolerance_m", "search_m")
     known_keys(content, {"points_m", "form", *options}, where)
     form = content.get("form", "plane")
     require(form in ("plane", "quadric"), f"{where}.form", form, "plane or quadric")
@@ -213,7 +218,14 @@ def _read_touch(content: Mapping[str, Any], where: str) -> TouchRequest:
     given = {key: number(content[key], f"{where}.{key}") for key in options if key in content}
     for key in ("force_n", "tolerance_m"):
         require(given.get(key, 1.0) > 0, f"{where}.{key}", given.get(key), "a number above 0")
+    check_search(given.get("search_m", 0.0), f"{where}.search_m")
     return TouchRequest(tuple((x, y) for x, y in read), form, **given)
+
+
+def check_search(search_m: float, field: str) -> None:
+    """``ValueError`` where a search is not from 0 to `MOST_SEARCH_M`."""
+    accepted = f"a number from 0 to {MOST_SEARCH_M:g} [m]"
+    require(0 <= search_m <= MOST_SEARCH_M, field, search_m, accepted)
 
 
 def _file(content: Mapping[str, Any], folder: Path, where: str) -> Path:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.scan.hands import PointFailed, SurfaceMissing
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.surface import TouchRequest
@@ -19,6 +21,11 @@ FloatArray = npt.NDArray[np.float64]
 UP = (0.0, 0.0, 1.0)
 # Turns of the fit and of the normals along which the ball meets it; each leaves a hundredth of the error.
 _TURNS = 4
+# Pose of the arm and time of the forces leave so much of a touch's height unknown, whatever its noise.
+LEAST_TOUCH_STD_M = 2e-5
+# Less than the height from which a contact comes down: each step begins where the one before found nothing. A
+# contact that searches less than that finds the surface early and is refused.
+SEARCH_STEP_M = 2e-3
 
 
 @dataclass(frozen=True)
@@ -78,8 +85,8 @@ def find_surface(
 ) -> FoundSurface:
     """Touch all places of a request and fit its form.
 
-    The first places are expected at the height that the request tells, the others where those before
-    tell: on their plane as soon as it is known.
+    The first place is expected at the height that the request tells, the others where those before tell: on
+    their plane as soon as it is known. Before, surfaces are searched for as far as the request says.
 
     Parameters
     ----------
@@ -87,26 +94,34 @@ def find_surface(
     ball_radius_m, heading_rad : float
         Of the tip; direction of the beam, seen from above.
     touch : callable
-        Touches a point of the surface as it is expected, from above; what it raises is passed on.
+        Touches a point of the surface as it is expected, from above.
 
     Raises
     ------
     ValueError
         If the touches do not determine the form, or do not lie on it.
+    PointFailed
+        That `touch` raised, with the number of the touch.
     """
     turn = tuple(tip_orientation(UP, heading_rad).tolist())
     touches: list[Touch] = []
     for index, (x, y) in enumerate(request.xy_m):
         height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
         label = f"surface, touch {index + 1}"
-        touches.append(touch(ScanPoint(index, (x, y, height), UP, turn, label)))
+        search_m = request.search_m if len(touches) < 3 else 0.0
+        heights = height + np.linspace(search_m, -search_m, _steps(search_m))
+        points = [ScanPoint(index, (x, y, z), UP, turn, label) for z in heights.tolist()]
+        try:
+            touches.append(_first_found(points, touch))
+        except PointFailed as error:
+            raise PointFailed(f"touch {index + 1}: {error}") from error
     found = fit_touches(touches, request.form, ball_radius_m)
     worst = int(np.argmax(np.abs(found.surface.residuals_m)))
     off = float(found.surface.residuals_m[worst])
     if abs(off) > request.tolerance_m:
         x, y = request.xy_m[worst]
         raise ValueError(
-            f"surface.touch: the touch at x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm lies {1e3 * off:+.2f} mm off "
+            f"the touch at x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm lies {1e3 * off:+.2f} mm off "
             f"the {request.form} through all; accepted are {1e3 * request.tolerance_m:g} mm (tolerance_m). "
             "Another form, or a touch that was none?"
         )
@@ -126,6 +141,21 @@ def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> Fo
         surface = fit_surface(balls - ball_radius_m * normals, std, form)
         normals = surface.normal((balls - ball_radius_m * normals)[:, :2])
     return FoundSurface(surface, tuple(touches))
+
+
+def _first_found(points: Sequence[ScanPoint], touch: Callable[[ScanPoint], Touch]) -> Touch:
+    """Touch of the first of these points, from above, at which there is a surface."""
+    for point in points[:-1]:
+        try:
+            return touch(point)
+        except SurfaceMissing:
+            continue
+    return touch(points[-1])
+
+
+def _steps(search_m: float) -> int:
+    """Heights at which a surface is searched for."""
+    return 1 + math.ceil(2 * search_m / SEARCH_STEP_M)
 
 
 def _expected(

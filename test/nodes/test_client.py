@@ -269,6 +269,6 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
 def test_a_scan_node_in_a_namespace_is_named(stack):
     client = TactileClient(stack.user, namespace="left")
     outcome = stack.ended(client.scan(**GOAL, wait_s=0.3))
-    assert client._goals._action_name == "left/scan"
+    assert client._scans._action_name == "left/scan"
     assert outcome.ending is Ending.REJECTED
     client.destroy()

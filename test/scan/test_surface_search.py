@@ -11,6 +11,7 @@ import yaml
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
+from tactile_resonance.scan.hands import PointFailed, SurfaceMissing
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest
@@ -75,6 +76,68 @@ def test_each_touch_is_expected_where_those_before_tell():
     assert told[0] == 5e-4
     np.testing.assert_allclose(told[1:3], [true[0] + lift, true[1] + lift])
     np.testing.assert_allclose(told[3:], true[3:], atol=1e-7)
+
+
+def contact_from(height_m, told=None, searches_m=2e-3, early_m=2e-3):
+    """A level surface, as contact_node searches it about where it is expected."""
+
+    def touch(point):
+        x, y, z = point.position_m
+        if told is not None:
+            told.append(z)
+        if height_m < z - searches_m:
+            raise SurfaceMissing(f"surface_missing below {z:.4f}")
+        if height_m > z + early_m:
+            raise PointFailed("surface_early")
+        return Touch((x, y, height_m + RADIUS_M), 2e-5, 0.005)
+
+    return touch
+
+
+@pytest.mark.parametrize("off_m", [5e-3, 3e-3, -0.5e-3, -4.9e-3])
+def test_a_surface_far_from_its_place_is_searched_for_from_above(off_m):
+    told = []
+    request = TouchRequest(SQUARE, "plane", expected_height_m=0.01, search_m=5e-3)
+    found = find_surface(request, RADIUS_M, 0.0, contact_from(0.01 + off_m, told))
+    assert found.surface.height_m((0.0, 0.0)) == pytest.approx(0.01 + off_m)
+    assert told[0] == pytest.approx(0.015)
+    np.testing.assert_allclose(told[-2:], 0.01 + off_m)  # on the plane of three
+    steps = np.diff(told[:-2])
+    up = np.flatnonzero(steps > 0)
+    # no step as low as the standoff of 3 mm, above which the tip travels
+    assert np.all(steps >= -2.000001e-3)
+    # the next two are searched for about the height of the one before, each until it is met
+    assert len(up) == 2
+    np.testing.assert_allclose(np.array(told)[up + 1], 0.01 + off_m + 5e-3)
+    met = [*up, len(told) - 3]
+    assert all((abs(z - 0.01 - off_m) <= 2e-3) == (k in met) for k, z in enumerate(told[:-2]))
+
+
+def test_a_steep_table_is_found_before_its_plane_is_known():
+    """5 mm between two touches 20 mm apart: further than one contact searches."""
+    slope = np.array([0.15, -0.1])
+
+    def touch(point):
+        made = ball_on_plane(slope, 0.0)(point)
+        return contact_from(made.ball_m[2] - RADIUS_M)(point)
+
+    searched = TouchRequest(SQUARE, "plane", search_m=5e-3)
+    found = find_surface(searched, RADIUS_M, 0.0, touch)
+    np.testing.assert_allclose(found.surface.coefficients_m[1:] / found.surface.scale_m, slope)
+    with pytest.raises(PointFailed, match="touch 2: surface_early"):
+        find_surface(TouchRequest(SQUARE, "plane"), RADIUS_M, 0.0, touch)
+
+
+def test_a_surface_that_is_nowhere_in_reach_is_refused():
+    missing = contact_from(-8e-3)
+    with pytest.raises(PointFailed, match="touch 1: surface_missing below -0.0050"):
+        find_surface(TouchRequest(SQUARE, "plane", search_m=5e-3), RADIUS_M, 0.0, missing)
+    with pytest.raises(PointFailed, match="touch 1: surface_missing below 0.0000"):
+        find_surface(TouchRequest(SQUARE, "plane"), RADIUS_M, 0.0, contact_from(-3e-3))
+    # a contact that searches less than a step meets the surface early instead of passing it by
+    timid = contact_from(-2.4e-3, searches_m=3e-4, early_m=5e-4)
+    with pytest.raises(PointFailed, match="touch 1: surface_early"):
+        find_surface(TouchRequest(SQUARE, "plane", search_m=5e-3), RADIUS_M, 0.0, timid)
 
 
 def test_a_touch_beside_the_form_is_refused_with_its_place_and_distance():

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goal, work and result of the action `calibrate_table`."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+from rclpy.action.server import ServerGoalHandle
+
+from tactile_resonance.action import CalibrateTable
+from tactile_resonance.analysis import write_whole
+from tactile_resonance.configuration import share_path
+from tactile_resonance.nodes.scan_hands import NodeHands
+from tactile_resonance.scan.goal import Frames
+from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.surface_search import Touch
+from tactile_resonance.scan.table_calibration import (
+    CalibrationRequest,
+    TableCalibration,
+    calibrate_table,
+)
+from tactile_resonance.scan.table_file import NOT_ESTIMATED, as_text
+from tactile_resonance.simulation.parameters import read_sensor
+
+OPTIONS = (
+    *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
+    *("heading_rad", "sensor", "file"),
+)
+
+
+def request_of(message: CalibrateTable.Goal) -> CalibrationRequest:
+    """What a goal asks for; ValueError where it is wrong."""
+    given = {name: value for name in OPTIONS if (value := getattr(message, name))}
+    points = tuple((point.x, point.y, point.z) for point in message.points)
+    return CalibrationRequest(points, **given)
+
+
+def calibrate(
+    goal: ServerGoalHandle,
+    request: CalibrationRequest,
+    hands: NodeHands,
+    check: Check,
+    frames: Frames,
+    who: str,
+) -> CalibrateTable.Result:
+    """Touch, fit and save, in a thread of its own.
+
+    Parameters
+    ----------
+    goal : ServerGoalHandle
+    request : CalibrationRequest
+        What it asks for, its file where it may be.
+    hands : NodeHands
+    check : callable
+        Raises `Interrupted` where the goal is cancelled.
+    frames : Frames
+        With the table as it is known.
+    who : str
+        Made it, for the file.
+    """
+    radius_m = read_sensor(share_path(f"config/sensors/{request.sensor}.yaml")).tip.radius_m
+    feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
+
+    def touch(point: ScanPoint) -> Touch:
+        feedback.point = point.index
+        goal.publish_feedback(feedback)
+        found = hands.find(point, request.force_n, radius_m, check)
+        feedback.height_m = found.ball_m[2] - radius_m
+        return found
+
+    result = no_table(CalibrateTable.Result.FAILED)
+    try:
+        hands.retract()
+        made = calibrate_table(request, frames.table_in_base, radius_m, touch)
+    except (PointFailed, ScanEnded, Interrupted) as error:
+        result.message = str(error) or "cancelled"
+        return result
+    except ValueError as error:
+        result.outcome, result.message = result.REFUSED, str(error)
+        return result
+    _fill(result, made)
+    if request.file:
+        known = {
+            "base_frame": frames.base,
+            "table_frame": frames.table,
+            "known_table_in_base": frames.table_in_base.vector.tolist(),
+            "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "made_by": who,
+        }
+        path = Path(request.file)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, as_text(made, request, known).encode())
+            result.file = str(path)
+        except (OSError, ValueError) as error:
+            result.message += f". NOT WRITTEN: {error}"
+    return result
+
+
+def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:
+    """Result without a table: no figure of it is known."""
+    nan = math.nan
+    return CalibrateTable.Result(
+        outcome=outcome,
+        message=message,
+        table_in_base=[nan] * 6,
+        height_m=nan,
+        tilt_x_rad=nan,
+        tilt_y_rad=nan,
+        covariance=[nan] * 9,
+        reduced_chi_square=nan,
+    )
+
+
+def _fill(result: CalibrateTable.Result, made: TableCalibration) -> None:
+    result.outcome = result.DONE
+    result.message = f"{made}. {', '.join(NOT_ESTIMATED)}: as they were known"
+    result.table_in_base = made.table_in_base.vector
+    result.height_m, result.tilt_x_rad, result.tilt_y_rad = made.correction.tolist()
+    result.covariance = made.covariance.ravel()
+    result.residuals_m = made.residuals_m.tolist()
+    result.std_m = made.std_m.tolist()
+    result.reduced_chi_square = made.reduced_chi_square

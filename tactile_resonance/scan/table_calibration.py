@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a table stands in the robot's base, from touches: height and tilts, with their covariance.
+
+A touch comes down along the table's normal as it is known, so its error is one of height, and the plane is the
+weighted least-squares fit of heights over x, y (`scan.touch`). x and y of the origin and the turn about the
+normal do not show in any height: they stay as they are known, and have no covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import number, require
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import SensorUse
+from tactile_resonance.scan.surface import TouchRequest, check_search
+from tactile_resonance.scan.surface_search import (
+    LEAST_TOUCH_STD_M,
+    FoundSurface,
+    Touch,
+    find_surface,
+    fit_touches,
+)
+from tactile_resonance.scan.touch import TouchedSurface, fit_surface
+
+FloatArray = npt.NDArray[np.float64]
+MOST_TILT_STD_RAD = 5e-3
+"""Standard deviation of the tilt about any axis; beyond it the points lie too close together or to one line."""
+
+
+@dataclass(frozen=True)
+class CalibrationRequest:
+    """What is touched and what is accepted; ``action/CalibrateTable.action`` gives unit and meaning."""
+
+    points_m: tuple[tuple[float, float, float], ...]
+    force_n: float = 0.01
+    search_m: float = 0.0
+    flatness_m: float = 0.0
+    most_tilt_rad: float = 0.05
+    heading_rad: float = 0.0
+    sensor: str = SensorUse.name
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        SensorUse(name=self.sensor)
+        for name in ("force_n", "search_m", "flatness_m", "most_tilt_rad", "heading_rad"):
+            number(getattr(self, name), name)
+        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        check_search(self.search_m, "search_m")
+        require(0 <= self.flatness_m <= 1e-3, "flatness_m", self.flatness_m, "0 to 0.001 [m]")
+        require(
+            0 < self.most_tilt_rad <= 0.2, "most_tilt_rad", self.most_tilt_rad, "up to 0.2 [rad]"
+        )
+        require(len(self.points_m) >= 3, "points", len(self.points_m), "three points or more")
+        for index, point in enumerate(self.points_m):
+            for value, name in zip(point, "xyz", strict=True):
+                number(value, f"points[{index}].{name}")
+        heights = sorted({z for _, _, z in self.points_m})
+        require(len(heights) == 1, "points: z", heights, "one height, that of the touched surface")
+        # what even the best touches there would not determine is not touched
+        least = math.hypot(LEAST_TOUCH_STD_M, self.flatness_m)
+        try:
+            best = fit_surface(self.points_m, least)
+        except ValueError as error:
+            raise ValueError(f"points: {error}") from error
+        _covariance(best, self.height_m)
+
+    @property
+    def height_m(self) -> float:
+        """Of the touched surface above the table."""
+        return self.points_m[0][2]
+
+
+@dataclass(frozen=True, eq=False)
+class TableCalibration:
+    """A table found by touch.
+
+    Attributes
+    ----------
+    table_in_base : Pose
+    correction : (3,) float
+        Height of the origin along z [m] and rotation vector about x and y [rad], against the table as it was
+        known and in its frame.
+    covariance : (3, 3) float
+        Of the correction [m^2, m rad, rad^2].
+    touches : tuple of Touch
+        In the frame of the table as it was known.
+    residuals_m, std_m : (n,) float
+        Of each touch, along z: against the plane, and its standard deviation, flatness included.
+    """
+
+    table_in_base: Pose
+    correction: FloatArray
+    covariance: FloatArray
+    touches: tuple[Touch, ...]
+    residuals_m: FloatArray
+    std_m: FloatArray
+
+    @property
+    def std(self) -> FloatArray:
+        """(3,) standard deviations of the correction [m, rad, rad]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Of the residuals, expected 1; NaN where three touches leave nothing to check."""
+        spare = self.residuals_m.size - 3
+        return float(np.sum((self.residuals_m / self.std_m) ** 2)) / spare if spare else math.nan
+
+    def __str__(self) -> str:
+        """Correction and residuals in a sentence."""
+        (height, x, y), std = self.correction, self.std
+        text = (
+            f"height {1e3 * height:+.3f} +- {1e3 * std[0]:.3f} mm, tilt about x {1e3 * x:+.2f} +- "
+            f"{1e3 * std[1]:.2f} mrad, about y {1e3 * y:+.2f} +- {1e3 * std[2]:.2f} mrad"
+        )
+        if self.residuals_m.size == 3:
+            return f"{text}; three touches: no residual checks them"
+        worst = float(np.max(np.abs(self.residuals_m)))
+        return (
+            f"{text}; largest residual {1e6 * worst:.0f} um, reduced chi-square "
+            f"{self.reduced_chi_square:.2f}"
+        )
+
+
+def calibrate_table(
+    request: CalibrationRequest,
+    table_in_base: Pose,
+    ball_radius_m: float,
+    touch: Callable[[ScanPoint], Touch],
+) -> TableCalibration:
+    """Touch all points of a request and find the table.
+
+    Parameters
+    ----------
+    request : CalibrationRequest
+    table_in_base : Pose
+        As it is known: points and touches are in its frame.
+    ball_radius_m : float
+    touch : callable
+        Touches a point of the surface as it is expected, from above.
+
+    Raises
+    ------
+    ValueError
+        As `table_from_touches`.
+    PointFailed
+        That `touch` raised, with the number of the touch.
+    """
+    xy = tuple((x, y) for x, y, _ in request.points_m)
+    wanted = TouchRequest(
+        xy, "plane", request.height_m, request.force_n, math.inf, request.search_m
+    )
+    found = find_surface(wanted, ball_radius_m, request.heading_rad, touch)
+    return table_from_touches(request, table_in_base, ball_radius_m, found.touches)
+
+
+def table_from_touches(
+    request: CalibrationRequest,
+    table_in_base: Pose,
+    ball_radius_m: float,
+    touches: Sequence[Touch],
+) -> TableCalibration:
+    """Table whose surface all balls touch.
+
+    Raises
+    ------
+    ValueError
+        If the touches do not determine the tilts or contradict a plane, or the table is tilted further than
+        accepted.
+    """
+    wider = [replace(t, std_m=math.hypot(t.std_m, request.flatness_m)) for t in touches]
+    found = fit_touches(wider, "plane", ball_radius_m)
+    surface = found.surface
+    covariance = _covariance(surface, request.height_m)
+    if not surface.consistent:
+        raise ValueError(f"touches: {_contradiction(found, ball_radius_m)}")
+    slope_x, slope_y = surface.coefficients_m[1:] / surface.scale_m
+    slope = math.hypot(slope_x, slope_y)
+    tilt = math.atan(slope)
+    accepted = f"up to {request.most_tilt_rad:g} rad (most_tilt_rad)"
+    require(tilt <= request.most_tilt_rad, "tilt of the table [rad]", round(tilt, 5), accepted)
+    # the turn without twist from z to the normal (-slope_x, -slope_y, 1)
+    turn = np.array([slope_y, -slope_x]) * (tilt / slope if slope else 1.0)
+    # the touched surface lies height_m along the normal above the table
+    height = float(surface.height_m((0.0, 0.0))) - request.height_m * math.hypot(1.0, slope)
+    rotation = table_in_base.rotation
+    position = table_in_base.position_m + rotation.apply([0.0, 0.0, height])
+    turned = rotation * Rotation.from_rotvec([*turn, 0.0])
+    return TableCalibration(
+        Pose(position, turned.as_rotvec()),
+        np.array([height, *turn]),
+        covariance,
+        tuple(touches),
+        surface.residuals_m,
+        np.array([touch.std_m for touch in wider]),
+    )
+
+
+def _covariance(surface: TouchedSurface, height_m: float) -> FloatArray:
+    """(3, 3) of height and tilts, to first order in the tilt; ValueError where the tilts are not determined."""
+    center, scale = surface.center_m, surface.scale_m
+    slope_x, slope_y = surface.coefficients_m[1:] / scale
+    secant = math.hypot(1.0, slope_x, slope_y)
+    jacobian = np.array(  # of height, tilt_x, tilt_y by the coefficients of 1, x, y
+        [
+            [
+                1.0,
+                (-center[0] - height_m * slope_x / secant) / scale,
+                (-center[1] - height_m * slope_y / secant) / scale,
+            ],
+            [0.0, 0.0, 1.0 / scale],
+            [0.0, -1.0 / scale, 0.0],
+        ]
+    )
+    covariance = jacobian @ surface.covariance_m2 @ jacobian.T
+    worst = math.sqrt(float(np.linalg.eigvalsh(covariance[1:, 1:])[-1]))
+    accepted = f"up to {MOST_TILT_STD_RAD:g}: points further apart, not on one line"
+    where = "points: standard deviation of the tilt they tell [rad]"
+    require(worst <= MOST_TILT_STD_RAD, where, round(worst, 5), accepted)
+    return covariance
+
+
+def _contradiction(found: FoundSurface, ball_radius_m: float) -> str:
+    """What residuals that are improbably large mean: the one touch without which the others lie on a plane."""
+    touches = found.touches
+    worst = float(np.max(np.abs(found.surface.residuals_m)))
+    text = f"they lie up to {1e3 * worst:.3f} mm off a plane, which their standard deviations do not explain"
+    alone = []
+    for index, touch in enumerate(touches if len(touches) > 4 else ()):
+        others = (*touches[:index], *touches[index + 1 :])
+        try:
+            rest = fit_touches(others, "plane", ball_radius_m)
+        except ValueError:  # they lie on one line
+            continue
+        if rest.surface.consistent:
+            plane = rest.surface
+            foot = touch.ball_m - ball_radius_m * plane.normal(touch.ball_m[:2])
+            alone.append((index, float(foot[2] - plane.height_m(foot[:2]))))
+    if len(alone) == 1:
+        index, off = alone[0]
+        return f"{text}: touch {index + 1} lies {1e3 * off:+.3f} mm off the plane of the others"
+    if alone:
+        numbers = ", ".join(str(index + 1) for index, _ in alone)
+        return f"{text}: one of {numbers} is off, more touches tell which"
+    return f"{text}: more touches tell which is off, or the surface is not flat (flatness_m)"
