@@ -17,6 +17,8 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import Scan
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed, look_up
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -30,6 +32,7 @@ from tactile_resonance.scan.goal import (
     Frames,
     ScanGoal,
     WantedScan,
+    named_frames,
     read_goal,
     require_within,
     resumed_run,
@@ -61,16 +64,17 @@ PARAMETERS = (
     Parameter(
         "table_in_base",
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
+        "The table in the robot's base: position [m] and rotation vector [rad].",
         read_only=True,
     ),
     Parameter(
         "table_frame",
         "table",
-        "Name of that frame in a scan of poses without a scene file; a scene names its own.",
+        "Frame of the table: of poses without a scene, and of scenes that name none.",
         read_only=True,
     ),
     Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    BROADCAST_TF,
     Parameter(
         "run_folder",
         "",
@@ -109,10 +113,11 @@ class ScanNode(ManagedNode):
         contact, table, table_frame, base_frame = values(self, *names)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
-        self._hands = NodeHands(
-            self, table_in_base, base_frame, robot, self._time, self._tell_waiting
-        )
+        self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
         self._frames = Frames(table_frame, base_frame, table_in_base)
+        self._frames_of: dict[int, Frames] = {}  # as they stood when a goal arrived, by its message
+        broadcast_fixed(self, base_frame, {table_frame: table_in_base})
+        self._asked: ScanGoal | None = None
         self._rejection = ""
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
@@ -157,21 +162,29 @@ class ScanNode(ManagedNode):
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
 
-    def _refusal(self, message: Scan.Goal) -> str:
+    async def _refusal(self, message: Scan.Goal) -> str:
         """Why a goal is rejected, kept for who asks; empty where it is accepted."""
+        reason, frames = "", self._frames
+        self._asked = asked = goal_of(message)
         try:
+            goal = self._goal_of(message)
+            if self._goal is None and not goal.resume:
+                names = named_frames(goal, frames)
+                found = await look_up(self, frames.base, names, message.poses.header.stamp)
+                frames = replace(frames, others=found.poses, no_others=found.missing)
             if self._goal is not None:
                 raise ValueError(RUNNING)
-            goal = self._goal_of(message)
             if goal.resume:
                 resumed_run(goal)
             else:
-                self._new_run(goal)
-            self._rejection = ""
+                self._new_run(goal, frames)
+            self._frames_of[id(message)] = frames
         except (ValueError, OSError) as error:
-            self._rejection = " ".join(str(error).split())
-            self.get_logger().warning(f"goal rejected: {self._rejection}")
-        return self._rejection
+            reason = " ".join(str(error).split())
+            self.get_logger().warning(f"goal rejected: {reason}")
+        if self._asked == asked:  # no other came while its frames were looked up
+            self._rejection = reason
+        return reason
 
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Why the last goal was rejected: rclpy has no place for it in its answer to a goal."""
@@ -179,13 +192,14 @@ class ScanNode(ManagedNode):
         return response
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Scan.Result:
+        frames = self._frames_of.pop(id(goal.request))
         if self._goal is not None:
             goal.abort()
             return Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
         self._goal = goal
         try:
             with self._hands.listening():
-                result = await in_thread(self, lambda: self._scan(goal), "scan")
+                result = await in_thread(self, lambda: self._scan(goal, frames), "scan")
         finally:
             self._goal = None
         if result.outcome == Scan.Result.COMPLETE:
@@ -196,13 +210,13 @@ class ScanNode(ManagedNode):
             goal.abort()
         return result
 
-    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
+    def _scan(self, goal: ServerGoalHandle, frames: Frames) -> Scan.Result:
         result = Scan.Result(outcome=Scan.Result.REFUSED)
         self._controls, tell = Controls(), self._tell_of(goal)
         self._time.begin()
         try:
             self._hands.meet()
-            scene, plan, run, seed = self._prepare(goal.request, tell)
+            scene, plan, run, seed = self._prepare(goal.request, frames, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
             self._run_directory = result.run_directory
             result.outcome = Scan.Result.ENDED
@@ -227,7 +241,7 @@ class ScanNode(ManagedNode):
             self._results.publish(result)
 
     def _prepare(
-        self, request: Scan.Goal, tell: Callable[[Progress], None]
+        self, request: Scan.Goal, frames: Frames, tell: Callable[[Progress], None]
     ) -> tuple[ScanScene, Plan, RunDirectory, int]:
         """Scene, plan and the open run of a goal; ValueError where it is refused."""
         goal = self._goal_of(request)
@@ -235,13 +249,15 @@ class ScanNode(ManagedNode):
             run = RunDirectory.open(resumed_run(goal))
             try:
                 scene = read_scan_scene(run.path / "scene.yaml")
+                others = _frames_of_run(run, scene, frames)
+                scene = self._place(scene, replace(frames, others=others))
                 plan = plan_points(scene, run.content.points)
                 return scene, plan, run, int(run.content.facts["seed"])
             except BaseException:
                 run.close()
                 raise
-        wanted, where, needed = self._new_run(goal)
-        scene, plan = wanted.scene, wanted.plan
+        wanted, where, needed = self._new_run(goal, frames)
+        scene, plan = self._place(wanted.scene, frames), wanted.plan
         (seed,) = values(self, "seed")
         seed = goal.seed or seed
         found: FoundSurface | None = None
@@ -250,6 +266,7 @@ class ScanNode(ManagedNode):
             found = self._find_surface(scene, scene.surface, tell)
             plan = make_plan(scene, found.surface)
         facts = self._facts(scene, plan, seed)
+        facts["frames"] = {name: pose.vector.tolist() for name, pose in frames.others.items()}
         if found is not None:
             facts["surface"] = found.as_json()
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
@@ -270,9 +287,15 @@ class ScanNode(ManagedNode):
             goal = replace(goal, run_directory=str(path))
         return goal
 
-    def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
+    def _place(self, scene: ScanScene, frames: Frames) -> ScanScene:
+        """Tell the hands where the scene's frame stands, and return it with that frame's name."""
+        frame_id = frames.of_scene(scene.frame_id)
+        self._hands.frame_in_base = frames.in_base(frame_id, "frame_id")
+        return replace(scene, frame_id=frame_id)
+
+    def _new_run(self, goal: ScanGoal, frames: Frames) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
-        wanted = read_goal(goal, self._frames)
+        wanted = read_goal(goal, frames)
         where = Path(goal.run_directory) if goal.run_directory else self._unused_folder()
         design = design_measurement(wanted.scene)
         blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
@@ -344,6 +367,14 @@ class ScanNode(ManagedNode):
             goal.publish_feedback(feedback_message(progress, self._run_directory))
 
         return tell
+
+
+def _frames_of_run(run: RunDirectory, scene: ScanScene, frames: Frames) -> dict[str, Pose]:
+    """Other frames in the base, as they stood when a run began."""
+    noted = run.content.facts.get("frames")
+    if noted is None:  # of an earlier version, where every scene's frame was the table
+        return {scene.frame_id: frames.table_in_base}
+    return {name: Pose.from_vector(vector) for name, vector in noted.items()}
 
 
 def main() -> None:
