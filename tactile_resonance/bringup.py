@@ -276,8 +276,8 @@ def _pass_frames(plan: _Decisions, namespace: str, robot: str) -> None:
             plan.pass_on(node, "", **{parameter: f"{namespace}/{name}"})
     tip = plan.value("contact_node", "frame_id") or "tip"
     plan.pass_on("pole_map_node", "tip_frame", tip_frame=tip)
-    for argument, its_nodes in BROADCASTS.items():
-        for node in its_nodes if argument in plan.given else ():
+    for argument, broadcasters in BROADCASTS.items():
+        for node in broadcasters if argument in plan.given else ():
             plan.pass_on(node, argument, broadcast_tf=plan.given[argument] == "true")
     if robot == "false":  # nobody knows where table and tip are
         for node in ("scan_node", "pole_map_node"):

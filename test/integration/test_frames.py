@@ -8,17 +8,18 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
-tf2_ros = pytest.importorskip(
-    "tf2_ros", reason="tf2_ros is not here: it comes with a full ROS 2"
-)
+pytest.importorskip("tf2_ros", reason="tf2_ros is not here: it comes with a full ROS 2")
 
 import rclpy
+import tf2_ros
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped
-from robot_at_hand import own_time
+from robot_at_hand import RobotAtHand, own_host, own_time
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.client import Ending
+from tactile_resonance.configuration import share_path
+from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
@@ -145,3 +146,48 @@ def test_a_scan_stays_where_its_scene_stood_when_it_began(nodes, tmp_path):
     content = assert_on_the_phantom(run, 2)
     assert {result.frame_id for result in content.results} == {"phantom"}
     assert [point.position_m for point in content.points] == [tuple(place) for place in PLACES]
+
+
+def matrix(place, turn):
+    """(4, 4) of a frame."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = turn.as_matrix(), place
+    return result
+
+
+def test_the_tree_has_tip_and_flange_where_the_robot_has_them(domain, tmp_path):
+    """The robot's flange and tip as its controller tells them, beside what TF holds."""
+    (tmp_path / "dish.yaml").write_text(SCENE)
+    host, robot = own_host(95), {"time_server": own_time(95), "robot_host": own_host(95)}
+    parameters = {
+        "fake_hardware_node": {**robot, "scene": tmp_path / "dish.yaml"},
+        "contact_node": {**robot, "force_host": host, "frame_id": "left/tip", "tool_frame": "flange"},
+        "pole_map_node": {"tip_frame": "left/tip"},
+    }
+    names = ("left/tip", "flange", "sensor")
+    with NodeProcesses(tmp_path / "log") as started:
+        started.bring_up(tuple(parameters), parameters)
+        with ScanClient(started.check) as client:
+            buffer = tf2_ros.Buffer()
+            listener = tf2_ros.TransformListener(buffer, client._node)
+            newest = rclpy.time.Time()
+            client.wait(
+                lambda: all(buffer.can_transform("base", name, newest) for name in names),
+                120.0,
+                "the frames",
+            )
+            told = RobotAtHand(host).order("state")["tcp_pose"]
+            found = {}
+            for name in names:
+                there = buffer.lookup_transform("base", name, newest).transform
+                to, turn = there.translation, there.rotation
+                turn = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+                found[name] = matrix([to.x, to.y, to.z], turn)
+            listener.unregister()
+    tip = matrix(told[:3], Rotation.from_rotvec(told[3:]))
+    np.testing.assert_allclose(found["left/tip"], tip, atol=1e-6)  # it rests
+    offset = read_ur_config(share_path("config/devices/ur5e.yaml")).tip_in_flange
+    tip_in_flange = matrix(offset.position_m, offset.rotation)
+    np.testing.assert_allclose(found["flange"] @ tip_in_flange, found["left/tip"], atol=1e-9)
+    beam_m = np.linalg.norm(found["sensor"][:3, 3] - found["left/tip"][:3, 3])
+    assert beam_m == pytest.approx(0.064, abs=1e-9)
