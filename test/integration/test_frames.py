@@ -70,6 +70,7 @@ def nodes(domain, tmp_path):
         "excitation_node": {"record_folder": tmp_path / "records"},
         "scan_node": {"table_in_base": text(TABLE), "run_folder": tmp_path / "runs"},
     }
+    parameters["scan_node"]["goal_folders"] = json.dumps([str(tmp_path)])
     for name in ("fake_hardware_node", "excitation_node", "scan_node"):
         parameters[name]["time_server"] = TIME
     with NodeProcesses(tmp_path / "log") as started:
