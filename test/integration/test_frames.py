@@ -159,10 +159,20 @@ def matrix(place, turn):
 def test_the_tree_has_tip_and_flange_where_the_robot_has_them(domain, tmp_path):
     """The robot's flange and tip as its controller tells them, beside what TF holds."""
     (tmp_path / "dish.yaml").write_text(SCENE)
+    arm = share_path("config/devices/ur5e.yaml").read_text()
+    mounted = "[0.01, -0.02, 0.12, 0.1, 3.0, 0.2]  #"  # no symmetry between flange and tip
+    arm = arm.replace("[0.0, 0.0, 0.12, 0.0, 3.141592653589793, 0.0]  #", mounted)
+    (tmp_path / "arm.yaml").write_text(arm)
     host, robot = own_host(95), {"time_server": own_time(95), "robot_host": own_host(95)}
     parameters = {
         "fake_hardware_node": {**robot, "scene": tmp_path / "dish.yaml"},
-        "contact_node": {**robot, "force_host": host, "frame_id": "left/tip", "tool_frame": "flange"},
+        "contact_node": {
+            **robot,
+            "robot_config": tmp_path / "arm.yaml",
+            "force_host": host,
+            "frame_id": "left/tip",
+            "tool_frame": "flange",
+        },
         "pole_map_node": {"tip_frame": "left/tip"},
     }
     names = ("left/tip", "flange", "sensor")
@@ -187,7 +197,8 @@ def test_the_tree_has_tip_and_flange_where_the_robot_has_them(domain, tmp_path):
             listener.unregister()
     tip = matrix(told[:3], Rotation.from_rotvec(told[3:]))
     np.testing.assert_allclose(found["left/tip"], tip, atol=1e-6)  # it rests
-    offset = read_ur_config(share_path("config/devices/ur5e.yaml")).tip_in_flange
+    offset = read_ur_config(tmp_path / "arm.yaml").tip_in_flange
+    assert offset.vector.tolist() == [0.01, -0.02, 0.12, 0.1, 3.0, 0.2]
     tip_in_flange = matrix(offset.position_m, offset.rotation)
     np.testing.assert_allclose(found["flange"] @ tip_in_flange, found["left/tip"], atol=1e-9)
     beam_m = np.linalg.norm(found["sensor"][:3, 3] - found["left/tip"][:3, 3])
