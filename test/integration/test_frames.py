@@ -24,7 +24,7 @@ from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 
-TIME = own_time(94)
+TIME = own_time(96)
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "scan_node")
 PHANTOM = (np.array([-0.4, 0.1, 0.25]), Rotation.from_rotvec([0.0, 0.0, 0.3]))
 """In the base: where the bench has its tissue."""
@@ -163,7 +163,7 @@ def test_the_tree_has_tip_and_flange_where_the_robot_has_them(domain, tmp_path):
     mounted = "[0.01, -0.02, 0.12, 0.1, 3.0, 0.2]  #"  # no symmetry between flange and tip
     arm = arm.replace("[0.0, 0.0, 0.12, 0.0, 3.141592653589793, 0.0]  #", mounted)
     (tmp_path / "arm.yaml").write_text(arm)
-    host, robot = own_host(95), {"time_server": own_time(95), "robot_host": own_host(95)}
+    host, robot = own_host(97), {"time_server": own_time(97), "robot_host": own_host(97)}
     parameters = {
         "fake_hardware_node": {**robot, "scene": tmp_path / "dish.yaml"},
         "contact_node": {
