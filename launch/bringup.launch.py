@@ -85,8 +85,25 @@ def generate_launch_description():
         DeclareLaunchArgument(
             "table_frame",
             default_value="",
-            description="Frame of the table, of poses and of the map; by default table. With a namespace it is "
-            "best one of its own.",
+            description="Frame of the table, of poses and of the map; by default NAMESPACE/table.",
+        ),
+        DeclareLaunchArgument(
+            "tip_frame",
+            default_value="",
+            description="Frame of the sensor's tip; by default NAMESPACE/tip.",
+        ),
+        DeclareLaunchArgument(
+            "static_transforms",
+            default_value="",
+            choices=["", "true", "false"],
+            description="true (default): broadcast the table in the base, sensor and tool in the tip, where "
+            "tf2_ros is installed. false: the stack does so, a robot description for example.",
+        ),
+        DeclareLaunchArgument(
+            "tip_transform",
+            default_value="",
+            choices=["", "true", "false"],
+            description="The same of the tip in the base, from tcp_pose.",
         ),
         DeclareLaunchArgument(
             "base_frame",
@@ -136,24 +153,12 @@ def _nodes(context):
         )
         for name, parameters in plan.nodes.items()
     ]
-    wanted = []
-    if plan.table is not None and given.get("static_transforms") != "false":
-        wanted.append(_table_in_base(plan.table, plan.base_frame, plan.table_frame))
+    if not _installed("tf2_ros_py"):
+        text = "tf2_ros is not installed here: no frames are broadcast, goals are in table or base"
+        nodes.append(LogInfo(msg=text))
     if given["rviz"] == "true":
-        view = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "pole_map.rviz"])
-        wanted.append(
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                namespace=LaunchConfiguration("namespace"),
-                # the view's topics are relative: those of the namespace, which the title names
-                arguments=["-d", view, "-f", plan.table_frame, "-t", "Pole map of {NAMESPACE}"],
-                parameters=[{"use_sim_time": plan.simulated_time}],
-                remappings=[("/clock", "clock")],
-            )
-        )
-    for node in wanted:
-        nodes.append(node if _installed(node.node_package) else _left_out(node.node_package))
+        there = _installed("rviz2")
+        nodes.append(_rviz(plan) if there else LogInfo(msg="rviz2 is not installed here: left out"))
     if given["record"] == "true":
         nodes.append(_recorder(given["namespace"]))
     discovery = given["discovery"]
@@ -173,21 +178,16 @@ def _installed(package):
     return True
 
 
-def _left_out(package):
-    return LogInfo(msg=f"{package} is not installed here: left out")
-
-
-def _table_in_base(table, base_frame, table_frame):
-    """Static transform of the simulated table."""
-    numbers = [*table.position_m, *table.rotation.as_quat()]
-    values = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True))
-    arguments = [text for name, value in values.items() for text in (f"--{name}", str(value))]
+def _rviz(plan):
+    view = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "pole_map.rviz"])
     return Node(
-        package="tf2_ros",
-        executable="static_transform_publisher",
-        name="table_in_base",
+        package="rviz2",
+        executable="rviz2",
         namespace=LaunchConfiguration("namespace"),
-        arguments=[*arguments, "--frame-id", base_frame, "--child-frame-id", table_frame],
+        # the view's topics are relative: those of the namespace, which the title names
+        arguments=["-d", view, "-f", plan.table_frame, "-t", "Pole map of {NAMESPACE}"],
+        parameters=[{"use_sim_time": plan.simulated_time}],
+        remappings=[("/clock", "clock")],
     )
 
 

@@ -43,7 +43,6 @@ def _sensor(name):
                 launch_arguments={
                     "namespace": name,
                     "robot_ip": LaunchConfiguration(f"{name}_robot_ip"),
-                    "table_frame": f"{name}_table",
                     "base_frame": f"{name}_base",
                     "run_folder": f"runs/{name}",
                 }.items(),

@@ -27,12 +27,6 @@ def generate_launch_description():
             description="true: on the wall clock, for tests of load and limits. false (default): in simulated "
             "time (clock, use_sim_time), in which a slow machine takes longer and nothing else.",
         ),
-        DeclareLaunchArgument(
-            "static_transforms",
-            default_value="true",
-            choices=["true", "false"],
-            description="Publish where the table stands in the robot's base, where tf2_ros is installed.",
-        ),
     ]
     include = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(bringup),

@@ -17,7 +17,6 @@ import numpy as np
 import yaml
 
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.simulation.plant_defaults import HOST, STALLS_S, TABLE_IN_BASE
@@ -34,12 +33,15 @@ NODES = (
 )
 """All nodes, in the order in which the manager, the last, brings them up."""
 
+WITH_TIP = ("excitation_node", "contact_node", "fake_hardware_node")
+
 ARGUMENTS = {
     "robot_ip": ("robot_host", "contact_node"),
     "robot_config": ("robot_config", "contact_node"),
     "force_config": ("force_config", "contact_node"),
     "base_frame": ("base_frame", "contact_node", "scan_node", "fake_hardware_node"),
     "table_frame": ("table_frame", "scan_node"),
+    "tip_frame": ("frame_id", *WITH_TIP),
     "run_folder": ("run_folder", "scan_node"),
     "scene": ("scene", "fake_hardware_node"),
 }
@@ -47,6 +49,20 @@ ARGUMENTS = {
 
 FILES_OF_GOALS = ("scene", "run_directory")
 """Arguments whose files the goals of a scan may name."""
+
+OWN_FRAMES = {
+    "frame_id": ("tip", *WITH_TIP),
+    "table_frame": ("table", "scan_node"),
+    "sensor_frame": ("sensor", "contact_node"),
+    "tool_frame": ("tool", "contact_node"),
+}
+"""Parameters that name a frame of ours: its name, under the nodes' namespace, and the nodes that have it."""
+
+BROADCASTS = {
+    "static_transforms": ("scan_node", "contact_node"),
+    "tip_transform": ("pole_map_node",),
+}
+"""Arguments that say whether nodes broadcast their frames."""
 
 IN_BENCH_TIME = ("fake_hardware_node", "excitation_node", "contact_node", "scan_node")
 SIMULATED_CELL = "can_simulated.yaml"
@@ -66,15 +82,11 @@ class Bringup:
         The nodes to start, and the parameters that each is passed after the file.
     simulated_time : bool
         Whether they live in the time of the simulated bench.
-    table : Pose or None
-        Where the simulated table stands in the robot's base; None where there is none.
-    base_frame, table_frame : str
+    table_frame : str
     """
 
     nodes: dict[str, Parameters]
     simulated_time: bool
-    table: Pose | None
-    base_frame: str
     table_frame: str
 
 
@@ -209,15 +221,12 @@ def plan_bringup(
     }
     nodes = [node for node in NODES if node not in left_out]
     pass_on("manager_node", "", nodes=nodes[:-1])
-    simulated_time, table = False, None
-    if mock:
-        simulated_time = _pass_mock(plan, robot, priority)
-        if robot != "false":
-            table = _table(value("scan_node", "table_in_base"))
-    elif robot == "true":
+    simulated_time = _pass_mock(plan, robot, priority) if mock else False
+    if not mock and robot == "true":
         for node, name in (("contact_node", "force_config"), ("scan_node", "table_in_base")):
             accepted = "one that argument or params_file states: a robot must not move by a default"
             require(value(node, name) is not None, name, None, accepted)
+    _pass_frames(plan, namespace.strip("/"), robot)
     base_frame = value("scan_node", "base_frame") or BASE_FRAME
     table_frame = value("scan_node", "table_frame") or "table"
     if (stands := value("scan_node", "table_in_base")) is not None:
@@ -229,8 +238,6 @@ def plan_bringup(
     return Bringup(
         nodes={node: plan.passed[node] for node in nodes},
         simulated_time=simulated_time,
-        table=None if table is None else Pose.from_vector(np.array(table)),
-        base_frame=base_frame,
         table_frame=table_frame,
     )
 
@@ -263,6 +270,21 @@ def _pass_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
     if not (simulated_time or priority):
         pass_on("contact_node", "", simulated_stalls_s=STALLS_S)
     return simulated_time
+
+
+def _pass_frames(plan: _Decisions, namespace: str, robot: str) -> None:
+    """Pass the names of our frames, and who broadcasts them."""
+    for parameter, (name, *its_nodes) in OWN_FRAMES.items():
+        for node in its_nodes if namespace else ():
+            plan.pass_on(node, "", **{parameter: f"{namespace}/{name}"})
+    tip = plan.value("contact_node", "frame_id") or "tip"
+    plan.pass_on("pole_map_node", "tip_frame", tip_frame=tip)
+    for argument, broadcasters in BROADCASTS.items():
+        for node in broadcasters if argument in plan.given else ():
+            plan.pass_on(node, argument, broadcast_tf=plan.given[argument] == "true")
+    if robot == "false":  # nobody knows where table and tip are
+        for node in ("scan_node", "pole_map_node"):
+            plan.pass_on(node, "", broadcast_tf=False)
 
 
 def _robot(stated: Mapping[str, Parameters], mock: bool) -> str:

@@ -193,7 +193,8 @@ class TactileClient:
         poses : sequence of Pose
             Points on the surface: +z out of the tissue, +x from clamp to tip.
         frame : str
-            Of the poses: the scene's (without a scene scan_node's ``table_frame``), or its ``base_frame``.
+            Of the poses: scan_node's ``table_frame`` or ``base_frame``; where tf2 is installed, any frame
+            that it connects with them.
         on_feedback, on_point : callable
             Called with each feedback and with each finished attempt at a point.
         wait_s : float

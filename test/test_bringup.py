@@ -158,8 +158,7 @@ def test_the_table_of_scans_is_that_of_the_bench():
         (MOCK, {"scan_node": {"table_in_base": [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]}}),
         (MOCK, {"fake_hardware_node": {"table_in_base": [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]}}),
     ):
-        plan, nodes = heard(arguments, file)
-        np.testing.assert_array_equal(plan.table.vector, [1, 2, 3, 0, 0, 0.5])
+        _, nodes = heard(arguments, file)
         for node in ("scan_node", "fake_hardware_node"):
             assert nodes[node]["table_in_base"] == [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]
 
@@ -213,7 +212,6 @@ def test_what_brings_the_tip_decides_which_nodes_there_are(
 
 def test_nodes_with_a_robot_are_told_nothing_that_is_simulated():
     plan, nodes = heard(REAL | {"robot_ip": "192.0.2.1"})
-    assert plan.table is None
     assert not plan.simulated_time
     assert plan.nodes["contact_node"] == {
         "robot_host": "192.0.2.1",
@@ -253,7 +251,7 @@ def test_the_file_of_the_page_is_enough_for_a_robot(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     plan, nodes = heard({"use_mock_hardware": "false"}, read_parameter_file(path), "/left")
-    assert plan.nodes["scan_node"] == {"contact": "robot"}
+    assert plan.nodes["scan_node"] == {"contact": "robot", "table_frame": "left/table"}
     assert nodes["excitation_node"]["device"] == "nidaqmx"
     assert nodes["contact_node"]["robot_config"].endswith("mine.yaml")
 
@@ -344,3 +342,57 @@ def test_the_map_lies_on_the_table_where_the_scan_has_it(own):
     assert nodes["pole_map_node"]["frame_id"] == "bed"
     _, nodes = heard({"use_mock_hardware": "false", "robot": "false"})
     assert "frame_id" not in nodes["pole_map_node"]
+
+
+def frames_of(nodes):
+    """Names of our frames, with the nodes that hear them."""
+    return {
+        "tip": {nodes[n].get("frame_id") for n in ("excitation_node", "contact_node")}
+        | {nodes["fake_hardware_node"].get("frame_id"), nodes["pole_map_node"].get("tip_frame")},
+        "table": {nodes["scan_node"].get("table_frame"), nodes["pole_map_node"].get("frame_id")},
+        "sensor": {nodes["contact_node"].get("sensor_frame")},
+        "tool": {nodes["contact_node"].get("tool_frame")},
+    }
+
+
+@pytest.mark.parametrize("namespace", ["/left", "/stack/left"])
+def test_frames_have_the_namespace_before_them(namespace):
+    plan, nodes = heard(MOCK, namespace=namespace)
+    prefix = namespace[1:]
+    names = {name: {f"{prefix}/{name}"} for name in ("tip", "table", "sensor", "tool")}
+    assert frames_of(nodes) == names
+    assert plan.table_frame == f"{prefix}/table"
+    assert nodes["pole_map_node"]["base_frame"] == "base"  # the driver's
+    given = MOCK | {"tip_frame": "needle", "table_frame": "bed"}
+    _, nodes = heard(given, namespace=namespace)
+    assert frames_of(nodes) == {**names, "tip": {"needle"}, "table": {"bed"}}
+    _, nodes = heard(MOCK, {"/**": {"frame_id": "needle", "tool_frame": "gripper"}}, namespace)
+    assert frames_of(nodes)["tip"] == {"needle"}
+    assert frames_of(nodes)["tool"] == {"gripper"}
+
+
+def test_without_a_namespace_frames_are_those_of_the_nodes():
+    plan, nodes = heard(MOCK)
+    assert plan.table_frame == "table"
+    assert nodes["pole_map_node"]["tip_frame"] == "tip"
+    assert not any(told.keys() & {"sensor_frame", "tool_frame"} for told in nodes.values())
+
+
+@pytest.mark.parametrize(
+    ("given", "file", "table", "sensor", "tip"),
+    [
+        ({}, {}, True, True, True),
+        ({"static_transforms": "false"}, {}, False, False, True),
+        ({"tip_transform": "false"}, {}, True, True, False),
+        ({"tip_transform": "true"}, {"/**": {"broadcast_tf": False}}, False, False, True),
+        # nobody knows where tip and table are
+        ({"robot": "false"}, {}, False, True, False),
+        ({"robot": "false", "static_transforms": "true"}, {}, True, True, False),
+    ],
+)
+def test_who_broadcasts(given, file, table, sensor, tip):
+    _, nodes = heard(MOCK | given, file)
+    names = ("scan_node", "contact_node", "pole_map_node")
+    # without the argument, the file and a reason the nodes do
+    told = [nodes.get(n, {}).get("broadcast_tf", True) for n in names]
+    assert told == [table, sensor, tip]

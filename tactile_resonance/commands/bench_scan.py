@@ -231,6 +231,7 @@ def node_parameters(
         },
         "scan_node": {
             "table_in_base": table,
+            "table_frame": map_frame,
             "goal_folders": json.dumps([str(job.scene.parent), str(job.output.parent)]),
             **time_server,
         },

@@ -56,11 +56,17 @@ class TipGeometry:
         require(0 <= self.housing_below_m < 1, "housing_below_m", self.housing_below_m, "0 to 1 m")
 
     @cached_property
-    def housing_m(self) -> Vector:
-        """Lower edge of the housing from the ball's centre, in the frame `tip` [m]."""
+    def sensor(self) -> Pose:
+        """Frame `sensor` in the frame `tip`: origin in the clamp, +x along the beam to the ball."""
         rise = self.beam_length_m * math.sin(self.beam_tilt_rad)
         run = self.beam_length_m * math.cos(self.beam_tilt_rad)
-        return -run, 0.0, rise - self.housing_below_m
+        return Pose(np.array([-run, 0.0, rise]), np.array([0.0, self.beam_tilt_rad, 0.0]))
+
+    @cached_property
+    def housing_m(self) -> Vector:
+        """Lower edge of the housing from the ball's centre, in the frame `tip` [m]."""
+        x, y, z = vector(self.sensor.position_m)
+        return x, y, z - self.housing_below_m
 
     def housing_height(self, turn: Turn, normal: Vector, height_m: float) -> float:
         """Height of the housing's lower edge above a plane [m].

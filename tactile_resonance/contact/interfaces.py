@@ -14,7 +14,7 @@ from typing import Protocol
 
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.command_limits import CommandLimits
-from tactile_resonance.contact.samples import ArmSample, CellSample, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import Six
 
 
@@ -208,6 +208,11 @@ class NodeArm(Arm, Protocol):
     @property
     def clock_uncertainty_s(self) -> float:
         """Standard deviation of `ArmSample.time_ns` against `clock` [s]. Raises `ArmError`."""
+        ...
+
+    @property
+    def tip_in_tool(self) -> Pose:
+        """Frame `tip` in that of the robot's tool."""
         ...
 
     @property

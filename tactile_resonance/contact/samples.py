@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.vectors import Six, Turn, Vector, turn_from_vector, vector
+from tactile_resonance.contact.vectors import (
+    Six,
+    Turn,
+    Vector,
+    rotated_back,
+    transposed,
+    turn_from_vector,
+    turn_product,
+    vector,
+    vector_from_turn,
+)
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -32,6 +42,11 @@ class Pose:
 
     position_m: NDArray[np.float64]
     rotation_rad: NDArray[np.float64]
+
+    @classmethod
+    def at_origin(cls) -> Pose:
+        """Return the pose of a frame in itself."""
+        return cls(np.zeros(3), np.zeros(3))
 
     @classmethod
     def from_vector(cls, vector: NDArray[np.float64]) -> Pose:
@@ -55,6 +70,12 @@ class Pose:
     def turn(self) -> Turn:
         """The same as a matrix of floats."""
         return turn_from_vector(vector(self.rotation_rad))
+
+    def seen_from(self, frame: Pose) -> Pose:
+        """Return the same pose in a frame whose pose is given where this one is."""
+        place = rotated_back(frame.turn, vector(self.position_m - frame.position_m))
+        turn = turn_product(transposed(frame.turn), self.turn)
+        return Pose(np.array(place), np.array(vector_from_turn(turn)))
 
 
 class CellSample(NamedTuple):

@@ -25,10 +25,6 @@ RANGES: dict[str, tuple[float, float]] = {
 """Accepted range of each number of `TwistConfig`, ends included."""
 
 
-def _at_tool() -> Pose:
-    return Pose(np.zeros(3), np.zeros(3))
-
-
 @dataclass(frozen=True)
 class TwistConfig:
     """What `TwistArm` needs to know; see ``config/devices/twist.yaml``.
@@ -65,7 +61,7 @@ class TwistConfig:
     max_turn_rad_s: float = 1.0
     max_acceleration_m_s2: float = 2.0
     lockstep: bool = False
-    tip_in_tool: Pose = field(default_factory=_at_tool)
+    tip_in_tool: Pose = field(default_factory=Pose.at_origin)
 
     def __post_init__(self) -> None:
         for name in ("command_topic", "pose_topic"):

@@ -49,7 +49,7 @@ class UrArm:
     """
 
     def __init__(self, config: UrArmConfig, time: str = "") -> None:
-        self.config = config
+        self.config, self.tip_in_tool = config, config.tip_in_flange
         self._time = ArmTime(time)
         self._dated = True  # False: states are dated once the loop knows the time again
         self._pending: Command | None = None  # sent with the next time that the loop waits for

@@ -25,10 +25,6 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _no_offset() -> Pose:
-    return Pose(np.zeros(3), np.zeros(3))
-
-
 @dataclass(frozen=True)
 class UrArmConfig:
     """What `UrArm` needs to know; see ``config/devices/ur5e.yaml``.
@@ -64,7 +60,7 @@ class UrArmConfig:
     """
 
     host: str
-    tip_in_flange: Pose = field(default_factory=_no_offset)
+    tip_in_flange: Pose = field(default_factory=Pose.at_origin)
     payload_kg: float | None = None
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_hz: float = 500.0

@@ -20,12 +20,14 @@ from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
 from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
+from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
@@ -63,6 +65,9 @@ PARAMETERS = (
     ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
+    Parameter("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True),
+    Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
+    BROADCAST_TF,
     *contact_parameters(),
 )
 
@@ -95,6 +100,9 @@ class ContactNode(ManagedNode):
         self._settings, self._limits = self._read_parameters()
         self.resources.callback(self._arm.close)
         self._tip = contact_devices.tip_geometry(self)
+        sensor_frame, tool_frame = values(self, "sensor_frame", "tool_frame")
+        flange = Pose.at_origin().seen_from(self._arm.tip_in_tool)
+        broadcast_fixed(self, frame_id, {sensor_frame: self._tip.sensor, tool_frame: flange})
         self._arm.connect()
         # not before: the arm has no clock but the machine's until it is connected
         self._force = contact_devices.make_force_source(self, self._arm)

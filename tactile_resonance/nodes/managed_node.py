@@ -17,6 +17,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
 from rclpy.exceptions import ParameterException
+from rclpy.executors import await_or_execute
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import QoSProfile
@@ -163,16 +164,16 @@ class ManagedNode(LifecycleNode):
         name: str,
         callback: Callable[[ServerGoalHandle], Awaitable[Any]],
         on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
-        refusal: Callable[[Any], str] = lambda _: "",
+        refusal: Callable[[Any], str | Awaitable[str]] = lambda _: "",
     ) -> None:
         """Action until the node is cleaned up.
 
-        Goals are accepted while the node is active, unless `refusal` has a reason against them. A request to
-        cancel is always accepted; the callback ends the goal.
+        Goals are accepted while the node is active, unless `refusal`, which may wait, has a reason
+        against them. A request to cancel is always accepted; the callback ends the goal.
         """
 
-        def on_request(goal: Any) -> GoalResponse:
-            accepted = self.active and not refusal(goal)
+        async def on_request(goal: Any) -> GoalResponse:
+            accepted = self.active and not await await_or_execute(refusal, goal) and self.active
             return GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
 
         def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:
@@ -186,6 +187,7 @@ class ManagedNode(LifecycleNode):
             callback,
             goal_callback=on_request,
             cancel_callback=on_cancel_request,
+            callback_group=ReentrantCallbackGroup(),  # as for services
             result_timeout=KEEP_RESULT_S,
         )
         self.resources.callback(server.destroy)

@@ -12,6 +12,7 @@ from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.conversions import poles_from_message
+from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.pole_map_messages import (
@@ -58,6 +59,8 @@ PARAMETERS = (
         "frame_id is given, poles in base_frame are shown in it.",
         read_only=True,
     ),
+    Parameter("tip_frame", "tip", "Frame of the tip that is broadcast.", read_only=True),
+    BROADCAST_TF,
     Parameter(
         "classes_file",
         "",
@@ -146,6 +149,7 @@ class PoleMapNode(ManagedNode):
         }[source]
         subscription = self.create_subscription(kind, source, callback, qos)
         self.resources.callback(self.destroy_subscription, subscription)
+        TipBroadcaster(self, *values(self, "tip_frame"))
         self.serve(Trigger, "pole_map/clear", self._on_clear)
         self.every(REPEAT_PERIOD_S, self._repeat)
 
@@ -173,7 +177,7 @@ class PoleMapNode(ManagedNode):
         result = from_message(message)
         if result.kind is not Kind.TISSUE or result.outcome is Outcome.DISCARDED:
             return
-        now = self._map.without(result.position_m)
+        now = self._map.without(result.position_m, result.frame_id)
         if result.outcome is not Outcome.SKIPPED and message.poles:
             point = self._point(message.poles[0])
             if point is not None:

@@ -62,10 +62,8 @@ class NodeHands:
     Parameters
     ----------
     node : ManagedNode
-    table_in_base : Pose
-        Frame of the scan's points in the robot's base.
     base_frame : str
-        Name of that base.
+        Name of the robot's base.
     with_robot : bool
         False: the tip is not moved; it is taken to be where the plan states, and its pose is published.
     tell_waiting : callable
@@ -75,19 +73,20 @@ class NodeHands:
     ----------
     free_air : bool
         Whether the tip can be lifted off the tissue: not without a robot.
+    frame_in_base : Pose
+        Frame of the scan's points in the robot's base, to be set before a scan.
     """
 
     def __init__(
         self,
         node: ManagedNode,
-        table_in_base: Pose,
         base_frame: str,
         with_robot: bool,
         scan_time: ScanTime,
         tell_waiting: Callable[[str], None],
     ) -> None:
         self._node = node
-        self._table = table_in_base
+        self.frame_in_base = Pose.at_origin()
         self._base_frame = base_frame
         self._time = scan_time
         self.free_air = with_robot
@@ -324,8 +323,8 @@ class NodeHands:
 
     def _pose_of(self, point: ScanPoint) -> PoseStamped:
         """The point on the surface, in the robot's base."""
-        turn = self._table.rotation
-        place = self._table.position_m + turn.apply(point.position_m)
+        turn = self.frame_in_base.rotation
+        place = self.frame_in_base.position_m + turn.apply(point.position_m)
         x, y, z, w = (turn * turn.from_quat(point.orientation_xyzw)).as_quat().tolist()
         return pose_to_message(
             Contact(

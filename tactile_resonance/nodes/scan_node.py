@@ -7,7 +7,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,9 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
+from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed, look_up
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
@@ -34,11 +36,11 @@ from tactile_resonance.scan.goal import (
     Frames,
     ScanGoal,
     WantedScan,
+    named_frames,
     read_goal,
-    require_within,
     resumed_run,
-    scene_path,
 )
+from tactile_resonance.scan.goal_files import GoalFiles
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
@@ -66,16 +68,17 @@ PARAMETERS = (
     Parameter(
         "table_in_base",
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
+        "The table in the robot's base: position [m] and rotation vector [rad].",
         read_only=True,
     ),
     Parameter(
         "table_frame",
         "table",
-        "Name of that frame in a scan of poses without a scene file; a scene names its own.",
+        "Frame of the table: of poses without a scene, and of scenes that name none.",
         read_only=True,
     ),
     Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    BROADCAST_TF,
     Parameter(
         "run_folder",
         "",
@@ -114,11 +117,12 @@ class ScanNode(ManagedNode):
         contact, table, table_frame, base_frame = values(self, *names)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
-        self._hands = NodeHands(
-            self, table_in_base, base_frame, robot, self._time, self._tell_waiting
-        )
+        self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
         self._frames = Frames(table_frame, base_frame, table_in_base)
-        self._rejection = ""
+        self._frames_of: dict[int, Frames] = {}  # as they stood when a goal arrived, by its message
+        broadcast_fixed(self, base_frame, {table_frame: table_in_base})
+        self._files = GoalFiles(*values(self, "run_folder", "goal_folders"))
+        self._asked = self._rejection = ""
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._controls: Controls | None = None
         self._goal: ServerGoalHandle | None = None
@@ -172,34 +176,47 @@ class ScanNode(ManagedNode):
         if self._controls is not None:
             self._controls.ask(Request.CANCEL)
 
-    def _refusal(self, check: Callable[[Any], None], message: Any) -> str:
+    async def _refusal(self, check: Callable[[Any], Awaitable[Frames]], message: Any) -> str:
         """Why a goal is rejected, kept for who asks; empty where it is accepted."""
+        reason = ""
+        self._asked = asked = str(message)
         try:
-            if self._goal is not None:
-                raise ValueError(RUNNING)
-            check(message)
-            self._rejection = ""
+            self._require_free()
+            frames = await check(message)
+            self._require_free()
+            self._frames_of[id(message)] = frames
         except (ValueError, OSError) as error:
-            self._rejection = " ".join(str(error).split())
-            self.get_logger().warning(f"goal rejected: {self._rejection}")
-        return self._rejection
+            reason = " ".join(str(error).split())
+            self.get_logger().warning(f"goal rejected: {reason}")
+        if self._asked == asked:  # no other came while its frames were looked up
+            self._rejection = reason
+        return reason
 
-    def _check_scan(self, message: Scan.Goal) -> None:
-        goal = self._goal_of(message)
+    def _require_free(self) -> None:
+        if self._goal is not None:
+            raise ValueError(RUNNING)
+
+    async def _check_scan(self, message: Scan.Goal) -> Frames:
+        goal, frames = self._files.checked(goal_of(message)), self._frames
         if goal.resume:
             resumed_run(goal)
-        else:
-            self._new_run(goal)
+            return frames
+        names = named_frames(goal, frames)
+        found = await look_up(self, frames.base, names, message.poses.header.stamp)
+        frames = replace(frames, others=found.poses, no_others=found.missing)
+        self._new_run(goal, frames)
+        return frames
 
-    def _check_calibration(self, message: CalibrateTable.Goal) -> None:
+    async def _check_calibration(self, message: CalibrateTable.Goal) -> Frames:
         accepted = "robot: a table is calibrated by touch"
         require(self._hands.free_air, "contact", "none", accepted)
         self._calibration_of(message)
+        return self._frames
 
     def _calibration_of(self, message: CalibrateTable.Goal) -> CalibrationRequest:
         request = request_of(message)
         if request.file:
-            path = self._path_of(request.file, "file")
+            path = self._files.to_write(request.file, "file")
             require(not os.path.lexists(path), "file", str(path), "a new file")
             request = replace(request, file=str(path))
         return request
@@ -210,8 +227,9 @@ class ScanNode(ManagedNode):
         return response
 
     async def _on_goal(
-        self, work: Callable[[ServerGoalHandle], Any], busy: Any, goal: ServerGoalHandle
+        self, work: Callable[[ServerGoalHandle, Frames], Any], busy: Any, goal: ServerGoalHandle
     ) -> Any:
+        frames = self._frames_of.pop(id(goal.request))
         if self._goal is not None:
             goal.abort()
             return busy
@@ -220,7 +238,7 @@ class ScanNode(ManagedNode):
             self._cancel()
         try:
             with self._hands.listening():
-                result = await in_thread(self, lambda: self._conduct(work, goal), "scan")
+                result = await in_thread(self, lambda: self._conduct(work, goal, frames), "scan")
         finally:
             self._goal = None
         if result.outcome in (Scan.Result.COMPLETE, CalibrateTable.Result.DONE):
@@ -231,31 +249,32 @@ class ScanNode(ManagedNode):
             goal.abort()
         return result
 
-    def _conduct(self, work: Callable[[ServerGoalHandle], Any], goal: ServerGoalHandle) -> Any:
+    def _conduct(self, work: Any, goal: ServerGoalHandle, frames: Frames) -> Any:
         """Result of a goal, worked at in its thread."""
         self._time.begin()
         try:
             self._hands.meet()
-            return work(goal)
+            return work(goal, frames)
         finally:
             self._time.end()
             self._controls, self._progress, self._run_directory = None, None, ""
 
-    def _calibrate(self, goal: ServerGoalHandle) -> CalibrateTable.Result:
+    def _calibrate(self, goal: ServerGoalHandle, frames: Frames) -> CalibrateTable.Result:
         assert self._controls is not None
         who = f"{self.get_fully_qualified_name()} on {socket.gethostname()}"
         who += ", simulated" if self.time_server else ""
         request, check = self._calibration_of(goal.request), self._controls.check_cancelled
-        result = calibrate(goal, request, self._hands, check, self._frames, who)
+        self._hands.frame_in_base = frames.table_in_base
+        result = calibrate(goal, request, self._hands, check, frames, who)
         if result.outcome != result.DONE:
             self.health.error(result.message)
         return result
 
-    def _scan(self, goal: ServerGoalHandle) -> Scan.Result:
+    def _scan(self, goal: ServerGoalHandle, frames: Frames) -> Scan.Result:
         result, tell = Scan.Result(outcome=Scan.Result.REFUSED), self._tell_of(goal)
         assert self._controls is not None
         try:
-            scene, plan, run, seed = self._prepare(goal.request, tell)
+            scene, plan, run, seed = self._prepare(goal.request, frames, tell)
             result.run_directory, result.points = str(run.path), len(plan.points)
             self._run_directory = result.run_directory
             result.outcome = Scan.Result.ENDED
@@ -277,21 +296,23 @@ class ScanNode(ManagedNode):
             self._results.publish(result)
 
     def _prepare(
-        self, request: Scan.Goal, tell: Callable[[Progress], None]
+        self, request: Scan.Goal, frames: Frames, tell: Callable[[Progress], None]
     ) -> tuple[ScanScene, Plan, RunDirectory, int]:
         """Scene, plan and the open run of a goal; ValueError where it is refused."""
-        goal = self._goal_of(request)
+        goal = self._files.checked(goal_of(request))
         if goal.resume:
             run = RunDirectory.open(resumed_run(goal))
             try:
                 scene = read_scan_scene(run.path / "scene.yaml")
+                others = _frames_of_run(run, scene, frames)
+                scene = self._place(scene, replace(frames, others=others))
                 plan = plan_points(scene, run.content.points)
                 return scene, plan, run, int(run.content.facts["seed"])
             except BaseException:
                 run.close()
                 raise
-        wanted, where, needed = self._new_run(goal)
-        scene, plan = wanted.scene, wanted.plan
+        wanted, where, needed = self._new_run(goal, frames)
+        scene, plan = self._place(wanted.scene, frames), wanted.plan
         (seed,) = values(self, "seed")
         seed = goal.seed or seed
         found: FoundSurface | None = None
@@ -300,38 +321,22 @@ class ScanNode(ManagedNode):
             found = self._find_surface(scene, scene.surface, tell)
             plan = make_plan(scene, found.surface)
         facts = self._facts(scene, plan, seed)
+        facts["frames"] = {name: pose.vector.tolist() for name, pose in frames.others.items()}
         if found is not None:
             facts["surface"] = found.as_json()
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
 
-    def _goal_of(self, message: Scan.Goal) -> ScanGoal:
-        """A goal whose files are where goals may have them; a relative run folder is in `run_folder`."""
-        goal = goal_of(message)
-        scene, scenes = scene_path(goal.scene), share_path("config")
-        # what an installation has linked to elsewhere is the package's all the same
-        if goal.scene and not Path(os.path.normpath(scene)).is_relative_to(scenes):
-            require_within(scene, "scene", [scenes, *self._goal_folders()])
-        if goal.run_directory:
-            path = self._path_of(goal.run_directory, "run_directory")
-            goal = replace(goal, run_directory=str(path))
-        return goal
+    def _place(self, scene: ScanScene, frames: Frames) -> ScanScene:
+        """Tell the hands where the scene's frame stands, and return it with that frame's name."""
+        frame_id = frames.of_scene(scene.frame_id)
+        self._hands.frame_in_base = frames.in_base(frame_id, "frame_id")
+        return replace(scene, frame_id=frame_id)
 
-    def _path_of(self, given: str, name: str) -> Path:
-        """What a goal may write: in `run_folder`, as where it is relative, or in `goal_folders`."""
-        runs = self._run_folder()
-        path = runs / Path(given).expanduser()
-        require_within(path, name, [runs, *self._goal_folders()])
-        return path
-
-    def _goal_folders(self) -> list[Path]:
-        (names,) = values(self, "goal_folders")
-        return [Path(name).expanduser() for name in names if name]
-
-    def _new_run(self, goal: ScanGoal) -> tuple[WantedScan, Path, int]:
+    def _new_run(self, goal: ScanGoal, frames: Frames) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
-        wanted = read_goal(goal, self._frames)
-        where = Path(goal.run_directory) if goal.run_directory else self._unused_folder()
+        wanted = read_goal(goal, frames)
+        where = Path(goal.run_directory) if goal.run_directory else self._files.unused()
         design = design_measurement(wanted.scene)
         blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)
         needed = expected_bytes(len(wanted.scene.positions_m), blocks, samples, design.lines)
@@ -356,21 +361,6 @@ class ScanNode(ManagedNode):
             return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
         except (ValueError, PointFailed, ScanEnded) as error:
             raise ValueError(f"surface.touch: {error}") from error
-
-    def _run_folder(self) -> Path:
-        (folder,) = values(self, "run_folder")
-        if folder:
-            return Path(folder).expanduser().absolute()
-        home = os.environ.get("ROS_HOME")
-        return (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "runs"
-
-    def _unused_folder(self) -> Path:
-        """For a run that names none."""
-        parent = self._run_folder()
-        stamp, number = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()), 1
-        while (path := parent / (stamp if number == 1 else f"{stamp}-{number}")).exists():
-            number += 1
-        return path
 
     def _facts(self, scene: ScanScene, plan: Plan, seed: int) -> dict[str, Any]:
         """What a reader of the run should know beside its plan."""
@@ -403,6 +393,14 @@ class ScanNode(ManagedNode):
             goal.publish_feedback(feedback_message(progress, self._run_directory))
 
         return tell
+
+
+def _frames_of_run(run: RunDirectory, scene: ScanScene, frames: Frames) -> dict[str, Pose]:
+    """Other frames in the base, as they stood when a run began."""
+    noted = run.content.facts.get("frames")
+    if noted is None:  # of an earlier version, where every scene's frame was the table
+        return {scene.frame_id: frames.table_in_base}
+    return {name: Pose.from_vector(vector) for name, vector in noted.items()}
 
 
 def main() -> None:

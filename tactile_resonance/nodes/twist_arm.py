@@ -97,6 +97,7 @@ class TwistArm:
         self._lockstep = Lockstep(self.listener.node, self._publish) if config.lockstep else None
         self.clock: Clock = self._lockstep or WallClock()
         self._arrivals = Arrivals()
+        self.tip_in_tool = config.tip_in_tool
         self._offset_m = vector(config.tip_in_tool.position_m)
         self._offset_turn = config.tip_in_tool.turn
         self._lock = threading.Lock()  # of fault and twist: two threads may set them

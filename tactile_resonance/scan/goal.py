@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +45,41 @@ class ScanGoal:
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in which poses may be given.
+    """Frames in which poses and scenes may be given, as they stand for one scan.
 
     Attributes
     ----------
     table : str
-        Name of the frame of a scan without a scene file; a scene names its own.
+        Name of the table: the frame of poses without a scene, and of scenes that name none.
     base : str
         Name of the robot's base.
     table_in_base : Pose
+    others : mapping of str to Pose
+        Other frames in the base.
+    no_others : str
+        Why there are no more of them.
     """
 
     table: str
     base: str
     table_in_base: Pose
+    others: Mapping[str, Pose] = field(default_factory=dict)
+    no_others: str = ""
+
+    def of_scene(self, frame_id: str) -> str:
+        """Name of a scene's frame: `table` there is the table, whatever its name here."""
+        return self.table if frame_id == ScanScene.frame_id else frame_id
+
+    def in_base(self, name: str, what: str) -> Pose:
+        """Where a frame stands in the base; ``ValueError`` that says of what, where that is not known."""
+        known = {
+            **self.others,
+            self.base: Pose.at_origin(),
+            self.table: self.table_in_base,
+        }
+        reason = f" ({self.no_others})" if self.no_others else ""
+        require(name in known, what, name, f"{self.table!r} or {self.base!r}{reason}")
+        return known[name]
 
 
 @dataclass(frozen=True)
@@ -81,6 +101,19 @@ class WantedScan:
     plan: Plan | None
 
 
+def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
+    """Frames beside table and base in which a goal has its poses or its scene.
+
+    Raises
+    ------
+    ValueError, OSError
+        If its scene cannot be read.
+    """
+    scene = read_yaml(scene_path(goal.scene)).get("frame_id") if goal.scene else None
+    named = (scene and frames.of_scene(str(scene)), goal.frame_id if goal.poses else None)
+    return tuple({name for name in named if name and name not in (frames.table, frames.base)})
+
+
 def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     """What a goal for a new run asks for.
 
@@ -92,15 +125,16 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
         If its scene cannot be read.
     """
     path = scene_path(goal.scene) if goal.scene else Path("goal")
-    content = read_yaml(path) if goal.scene else _without_file(goal, frames)
+    content = read_yaml(path) if goal.scene else _without_file(goal)
     changes = _changes(goal)
-    frame_id = str(content.get("frame_id", ScanScene.frame_id))
-    poses = _poses_in_table(goal, frame_id, frames)
+    frame_id = frames.of_scene(str(content.get("frame_id", ScanScene.frame_id)))
+    place = frames.in_base(frame_id, f"{path.name}: frame_id")
+    poses = _poses_in_scene(goal, frame_id, place, frames)
     if len(poses):
         content.pop("surface", None)
         changes["positions"] = {"list": poses[:, :3].tolist()}
     content = {**content, **changes}
-    scene = parse_scan_scene(content, path)
+    scene = replace(parse_scan_scene(content, path), frame_id=frame_id)
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     if goal.scene and not changes:
         text = path.read_text(encoding="utf-8")
@@ -136,19 +170,11 @@ def scene_path(scene: str) -> Path:
     return path if path.is_absolute() else share_path(path)
 
 
-def require_within(path: Path, name: str, folders: Sequence[Path]) -> None:
-    """Raise ``ValueError`` where a path of a goal leads out of all of some folders, by a link or ``..`` too."""
-    real = Path(os.path.realpath(path))
-    within = any(real.is_relative_to(os.path.realpath(folder)) for folder in folders)
-    listed = " or ".join(map(str, folders))
-    require(within, name, str(path), f"a path in {listed} (goal_folders of scan_node adds others)")
-
-
-def _without_file(goal: ScanGoal, frames: Frames) -> dict[str, Any]:
+def _without_file(goal: ScanGoal) -> dict[str, Any]:
     require(len(goal.poses) > 0, "scene", goal.scene, "a scene file, or poses and force_n")
     wanted = goal.force_n != 0 and not math.isnan(goal.force_n)
     require(wanted, "force_n", goal.force_n, "a number above 0 where no scene has one")
-    return {"name": "poses", "frame_id": frames.table}
+    return {"name": "poses"}
 
 
 def _changes(goal: ScanGoal) -> dict[str, Any]:
@@ -170,23 +196,23 @@ def _changes(goal: ScanGoal) -> dict[str, Any]:
     return changes
 
 
-def _poses_in_table(goal: ScanGoal, table: str, frames: Frames) -> npt.NDArray[np.float64]:
-    """(n, 7) places [m] and unit quaternions of the goal's poses, in the frame of the scene."""
+def _poses_in_scene(
+    goal: ScanGoal, frame_id: str, place: Pose, frames: Frames
+) -> npt.NDArray[np.float64]:
+    """(n, 7) places [m] and unit quaternions of the goal's poses, in the frame of the scene, of that place."""
     if not goal.poses:
         return np.zeros((0, 7))
-    accepted = f"{table!r} or {frames.base!r}"
-    good = goal.frame_id in (table, frames.base)
-    require(good, "poses.header.frame_id", goal.frame_id, accepted)
+    given = frames.in_base(goal.frame_id, "poses.header.frame_id")
     for index, pose in enumerate(goal.poses):
         for value, name in zip(pose, "xyzxyzw", strict=True):
             number(value, f"poses[{index}]: {name}")
         good = 0.99 < math.hypot(*pose[3:]) < 1.01
         require(good, f"poses[{index}].orientation", tuple(pose[3:]), "a unit quaternion")
     poses = np.array(goal.poses, dtype=float)
-    if goal.frame_id != table:
-        back = frames.table_in_base.rotation.inv()
-        places = back.apply(poses[:, :3] - frames.table_in_base.position_m)
-        turns = (back * Rotation.from_quat(poses[:, 3:])).as_quat()
+    if goal.frame_id != frame_id:
+        seen = given.seen_from(place)
+        places = seen.position_m + seen.rotation.apply(poses[:, :3])
+        turns = (seen.rotation * Rotation.from_quat(poses[:, 3:])).as_quat()
         poses = np.concatenate([places, turns], axis=1)
     return poses
 

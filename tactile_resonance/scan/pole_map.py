@@ -53,6 +53,8 @@ class MapPoint:
     simulated : bool
     place_m : (3,) float, optional
         What identifies the place, a point as it was planned; None: `position_m` does.
+    place_frame : str
+        Frame of `place_m`: the same numbers in another one are another place.
     """
 
     position_m: FloatArray
@@ -68,6 +70,7 @@ class MapPoint:
     measurement_id: int = 0
     simulated: bool = False
     place_m: FloatArray | None = None
+    place_frame: str = ""
 
     @property
     def place(self) -> FloatArray:
@@ -128,7 +131,7 @@ def map_point(
 
 def accepted_point(result: PointResult, point: MapPoint) -> MapPoint:
     """Point of a result and of the poles that came with it; without a pole where the result says it failed."""
-    point = replace(point, place_m=result.position_m)
+    point = replace(point, place_m=result.position_m, place_frame=result.frame_id)
     if result.outcome is Outcome.DONE:
         return point
     return replace(point, estimate=np.full(2, np.nan), reason=result.reason)
@@ -186,14 +189,17 @@ class PoleMap:
 
     def with_point(self, point: MapPoint) -> PoleMap:
         """The same with one point more; it replaces what its own measurement or place had before."""
-        kept = (
-            p for p in self.without(point.place).points if p.measurement_id != point.measurement_id
-        )
+        rest = self.without(point.place, point.place_frame).points
+        kept = (p for p in rest if p.measurement_id != point.measurement_id)
         return replace(self, points=(*kept, point))
 
-    def without(self, place_m: FloatArray) -> PoleMap:
+    def without(self, place_m: FloatArray, frame: str = "") -> PoleMap:
         """The same with nothing at a place (3,) [m]."""
-        kept = (p for p in self.points if np.linalg.norm(p.place - place_m) > SAME_PLACE_M)
+        kept = (
+            p
+            for p in self.points
+            if p.place_frame != frame or np.linalg.norm(p.place - place_m) > SAME_PLACE_M
+        )
         return replace(self, points=tuple(kept))
 
     @cached_property

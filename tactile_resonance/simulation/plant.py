@@ -113,7 +113,7 @@ class CellMounting:
     """
 
     mount: Mount = Mount.TABLE
-    frame: Pose = field(default_factory=lambda: Pose(np.zeros(3), np.zeros(3)))
+    frame: Pose = field(default_factory=Pose.at_origin)
     carried_kg: float = 0.0
     centre_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 

@@ -114,6 +114,10 @@ def used(module_domain, tmp_path_factory):
             read_until(lambda: True, node, namespace, nodes, used)
             for node in nodes.values():
                 node.destroy_node()
+    # with tf2: frames broadcast, for those who listen, and those of a goal looked up
+    used["contact_node"].add(("publish", "/tf_static"))
+    used["pole_map_node"] |= {("publish", "/tf"), ("subscribe", "/tcp_pose")}
+    used["scan_node"] |= {("publish", "/tf_static"), *product(["subscribe"], ["/tf", "/tf_static"])}
     # a sensor of another driver: its topic is that of the configuration
     topic = read_force_config(share_path("config/force/topic.yaml")).topic
     used["contact_node"].add(("subscribe", f"/{topic}"))

@@ -199,34 +199,29 @@ def test_each_node_has_an_enclave_of_its_own_where_enclaves_are_given(file):
     assert not any("--enclave" in n.command for n in start(f"{file}.launch.py", **given).values())
 
 
-@pytest.fixture
-def tf2_ros(tmp_path, monkeypatch):
-    (tmp_path / "share/ament_index/resource_index/packages").mkdir(parents=True)
-    (tmp_path / "share/ament_index/resource_index/packages/tf2_ros").touch()
-    executable = tmp_path / "lib/tf2_ros/static_transform_publisher"
-    executable.parent.mkdir(parents=True)
-    executable.touch(0o755)
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ['AMENT_PREFIX_PATH']}")
+def test_frames_have_the_namespace_before_them():
+    stack = PushLaunchConfigurations(), PushRosNamespace("stack")
+    nodes = start("mock.launch.py", *stack, namespace="left", static_transforms="false")
+    scan, contact = nodes["/stack/left/scan_node"], nodes["/stack/left/contact_node"]
+    assert scan.hears()["table_frame"] == "stack/left/table"
+    assert scan.hears()["broadcast_tf"] is False
+    heard = contact.hears()
+    assert heard["frame_id"] == "stack/left/tip"
+    assert heard["sensor_frame"] == "stack/left/sensor"
+    assert nodes["/stack/left/pole_map_node"].hears()["frame_id"] == "stack/left/table"
 
 
-def test_the_transform_is_that_of_the_table(tf2_ros):
-    from scipy.spatial.transform import Rotation
-
-    given = {
-        "table_in_base": "[1, 2, 3, 0.3, -0.2, 0.5]",
-        "base_frame": "arm",
-        "table_frame": "bed",
-    }
-    nodes = start("mock.launch.py", **given)
-    command = nodes["/table_in_base"].command[1:19]
-    values = dict(zip(command[::2], command[1::2], strict=True))
-    turn = Rotation.from_quat([float(values[f"--q{axis}"]) for axis in "xyzw"])
-    assert turn.as_rotvec() == pytest.approx([0.3, -0.2, 0.5])
-    assert [float(values[f"--{axis}"]) for axis in "xyz"] == [1, 2, 3]
-    assert (values["--frame-id"], values["--child-frame-id"]) == ("arm", "bed")
-    assert "/table_in_base" not in start("mock.launch.py", static_transforms="false")
-    assert "/table_in_base" not in start("mock.launch.py", robot="false")
-    assert "/table_in_base" not in start("ur.launch.py", **REAL)
+@pytest.mark.parametrize("file", ["mock", "ur"])
+def test_names_and_broadcasts_of_frames_can_be_given(file):
+    given = {"tip_frame": "needle", "table_frame": "bed", "tip_transform": "false"}
+    options = given | {"namespace": "left"} | (REAL if file == "ur" else {})
+    nodes = start(f"{file}.launch.py", **options)
+    assert nodes["/left/contact_node"].hears()["frame_id"] == "needle"
+    assert nodes["/left/scan_node"].hears()["table_frame"] == "bed"
+    told = nodes["/left/pole_map_node"].hears()
+    assert (told["tip_frame"], told["frame_id"]) == ("needle", "bed")
+    assert told["broadcast_tf"] is False
+    assert "broadcast_tf" not in nodes["/left/scan_node"].hears()
 
 
 def test_the_demo_scans_what_lies_on_the_table():
@@ -240,3 +235,5 @@ def test_the_stack_has_two_robots():
     assert nodes["/left/contact_node"].hears()["robot_host"] == "127.0.1.2"
     assert nodes["/right/contact_node"].hears()["robot_host"] == "127.0.91.9"
     assert "poles:=/stack/tissue/right/poles" in nodes["/right/poles_node"].command
+    map_node = nodes["/right/pole_map_node"].hears()
+    assert (map_node["frame_id"], map_node["base_frame"]) == ("right/table", "right_base")

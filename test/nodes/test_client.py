@@ -12,14 +12,18 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.task import Future
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import PointResult
 
 from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
+from tactile_resonance.nodes import scan_node
+from tactile_resonance.nodes.frames import Found
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
 from tactile_resonance.processes import free_domain_id
@@ -225,6 +229,34 @@ def test_an_outcome_can_be_awaited(stack):
 
     task = stack.executor.create_task(palpate)
     assert stack.ended(task).ending is Ending.REJECTED
+
+
+def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypatch):
+    asked, over = [], Future()
+
+    async def look_up(node, base, names, stamp):
+        if not names:
+            return Found()
+        asked.append((base, names, stamp))
+        await over
+        return Found(missing="there is none")
+
+    monkeypatch.setattr(scan_node, "look_up", look_up)
+    stack.activate()
+    waiting = stack.client.scan(**{**GOAL, "frame": "camera"})
+    stack.until(lambda: asked)
+    assert asked[0] == ("base", ("camera",), Time())  # the newest
+    other = TactileClient(stack.user)
+    outcome = stack.ended(other.scan(**{**GOAL, "force_n": -1.0}))
+    assert "force_n: got -1.0" in outcome.message
+    assert not waiting.done()
+    over.set_result(None)
+    assert stack.ended(waiting).ending is Ending.REJECTED
+    # the reason that is told is that of the latest goal
+    asking = stack.client._call("rejection")
+    stack.until(asking.done)
+    assert "force_n: got -1.0" in asking.result().message
+    other.destroy()
 
 
 def test_a_node_that_is_not_active_is_waited_for(stack):

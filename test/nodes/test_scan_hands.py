@@ -4,7 +4,6 @@
 import os
 import threading
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
@@ -12,7 +11,6 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.executors import SingleThreadedExecutor
 
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import initialised
@@ -31,9 +29,8 @@ class Scanning(ManagedNode):
         super().__init__("scan_node", ())
 
     def configure(self):
-        at_base = Pose(np.zeros(3), np.zeros(3))
         scan_time = ScanTime("", 60.0)
-        self.hands = NodeHands(self, at_base, "base", False, scan_time, lambda _: None)
+        self.hands = NodeHands(self, "base", False, scan_time, lambda _: None)
 
 
 def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place():

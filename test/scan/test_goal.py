@@ -3,7 +3,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.decision import Precise
-from tactile_resonance.scan.goal import Frames, ScanGoal, read_goal, require_within, resumed_run
+from tactile_resonance.scan.goal import (
+    Frames,
+    ScanGoal,
+    named_frames,
+    read_goal,
+    resumed_run,
+)
 from tactile_resonance.scan.scene import read_scan_scene
 
 TABLE_IN_BASE = Pose(np.array([-0.49, -0.13, 0.2]), np.array([0.3, -0.2, -1.5]))
-FRAMES = Frames("table", "base", TABLE_IN_BASE)
+FRAMES = Frames("table", "base", TABLE_IN_BASE, {"phantom": TABLE_IN_BASE})
 TILTED = Rotation.from_rotvec([0.1, -0.2, 0.7])
 POSES = ((0.0, 0.001, 0.0, 0.0, 0.0, 0.0, 1.0), (0.004, -0.003, 0.0021, *TILTED.as_quat().tolist()))
 GOAL = ScanGoal(poses=POSES, frame_id="table", force_n=0.012)
@@ -53,13 +58,9 @@ def test_poses_need_no_scene_and_give_points_at_exactly_these_places(tmp_path):
 
 
 def test_poses_in_the_base_are_those_places_in_the_frame_of_the_scene(scene):
-    turn, place = TABLE_IN_BASE.rotation, TABLE_IN_BASE.position_m
-    in_base = tuple(
-        (*(place + turn.apply(pose[:3])), *(turn * Rotation.from_quat(pose[3:])).as_quat())
-        for pose in POSES
-    )
     for named in ("", scene):
-        goal = ScanGoal(scene=named, poses=in_base, frame_id="base", force_n=0.012)
+        poses = in_base(TABLE_IN_BASE, POSES)
+        goal = ScanGoal(scene=named, poses=poses, frame_id="base", force_n=0.012)
         for point, pose in zip(read_goal(goal, FRAMES).plan.points, POSES, strict=True):
             assert point.position_m == pytest.approx(pose[:3], abs=1e-12)
             turned = Rotation.from_quat(point.orientation_xyzw) * Rotation.from_quat(pose[3:]).inv()
@@ -114,23 +115,60 @@ def test_a_goal_that_is_wrong_is_refused_with_the_field_its_value_and_what_is_ac
         read_goal(replace(GOAL, **changes), FRAMES)
 
 
-def test_the_frame_of_poses_is_that_of_the_scene(scene):
-    with pytest.raises(ValueError, match="got 'table'; accepted is 'phantom' or 'base'"):
-        read_goal(replace(GOAL, scene=scene), FRAMES)
+def in_base(frame, poses):
+    """Poses (n, 7) of a frame in the base, by rotation matrices."""
+    return tuple(
+        (
+            *(frame.position_m + frame.rotation.as_matrix() @ pose[:3]),
+            *(frame.rotation * Rotation.from_quat(pose[3:])).as_quat(),
+        )
+        for pose in poses
+    )
 
 
-def test_a_path_that_leads_out_of_the_folders_is_refused(tmp_path):
-    folders = [tmp_path / "runs", tmp_path / "more"]
-    for folder in folders:
-        folder.mkdir()
-    (tmp_path / "runs" / "link").symlink_to(tmp_path)
-    (tmp_path / "linked").symlink_to(tmp_path / "more")
-    for inside in ("runs/a/b", "more/../runs/c", "linked/d", "runs"):
-        require_within(tmp_path / inside, "run_directory", folders)
-    for outside in ("runs/../a", "runs/link/a", "runs2", ""):
-        with pytest.raises(ValueError, match="^run_directory: got .*; accepted is a path in .*runs or"):
-            require_within(tmp_path / outside, "run_directory", folders)
-    require_within(tmp_path, "run_directory", [Path("/")])
+def test_poses_in_a_third_frame_are_the_same_points_wherever_the_frame_stands(scene):
+    """The places of POSES in the table, told in the camera's frame and in that of the scene."""
+    camera = Pose(np.array([0.2, 0.3, 0.9]), np.array([2.0, -1.0, 0.5]))
+    phantom = Pose(np.array([-0.4, 0.1, 0.25]), np.array([0.1, 0.0, 0.3]))
+    frames = replace(FRAMES, others={"camera": camera, "phantom": phantom})
+    places = in_base(TABLE_IN_BASE, POSES)
+    seen = []
+    for pose in places:
+        back = camera.rotation.inv()
+        turn = (back * Rotation.from_quat(pose[3:])).as_quat()
+        seen.append((*back.apply(np.array(pose[:3]) - camera.position_m), *turn))
+    for named, stands in (("", TABLE_IN_BASE), (scene, phantom)):
+        goal = ScanGoal(scene=named, poses=seen, frame_id="camera", force_n=0.012)
+        wanted = read_goal(goal, frames)
+        assert wanted.scene.frame_id == ("phantom" if named else "table")
+        points = [(*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points]
+        for found, pose in zip(in_base(stands, points), places, strict=True):
+            assert found[:3] == pytest.approx(pose[:3], abs=1e-12)
+            turned = Rotation.from_quat(found[3:]) * Rotation.from_quat(pose[3:]).inv()
+            assert turned.magnitude() < 1e-12
+
+
+def test_frames_beside_table_and_base_are_to_be_looked_up(scene, tmp_path):
+    assert named_frames(GOAL, FRAMES) == ()
+    assert named_frames(replace(GOAL, frame_id="base"), FRAMES) == ()
+    assert named_frames(replace(GOAL, frame_id="camera"), FRAMES) == ("camera",)
+    assert named_frames(ScanGoal(scene=scene, frame_id="camera"), FRAMES) == ("phantom",)
+    both = named_frames(replace(GOAL, scene=scene, frame_id="camera"), FRAMES)
+    assert set(both) == {"phantom", "camera"}
+    (tmp_path / "slope.yaml").write_text(SCENE.replace("phantom", "table"))
+    assert named_frames(ScanGoal(scene=scene), replace(FRAMES, table="left/table")) == ()
+
+
+def test_the_frame_of_a_scene_must_be_known(scene, tmp_path):
+    alone = Frames("left/table", "base", TABLE_IN_BASE, no_others="there is no tf2")
+    reason = "slope.yaml: frame_id: got 'phantom'; accepted is 'left/table' or 'base' .there is no"
+    with pytest.raises(ValueError, match=reason):
+        read_goal(ScanGoal(scene=scene), alone)
+    # `table` in a scene is the table, whatever it is called here; in a goal frames are those of tf2
+    (tmp_path / "slope.yaml").write_text(SCENE.replace("phantom", "table"))
+    assert read_goal(ScanGoal(scene=scene), alone).scene.frame_id == "left/table"
+    with pytest.raises(ValueError, match="poses.header.frame_id: got 'table'; accepted is 'left"):
+        read_goal(GOAL, alone)
 
 
 def test_a_run_is_resumed_as_it_was_asked_for(tmp_path):

@@ -16,6 +16,7 @@ from tactile_resonance.scan.pole_map import (
     EllipseScale,
     MapPoint,
     PoleMap,
+    accepted_point,
     map_point,
     point_of_result,
 )
@@ -81,6 +82,16 @@ def test_each_place_once_whatever_comes():
     assert [p.estimate[0] for p in found.points] == [250.5]
     found = found.with_point(repeated).with_point(elsewhere)
     assert [p.estimate[0] for p in found.points] == [251.0, 252.0]
+
+
+def test_the_same_numbers_in_two_frames_are_two_places():
+    shown = PoleMap()
+    for key, frame in enumerate(("table", "phantom", "phantom"), 1):
+        point = map_point(poles((250.0 + key,)), origin(x=0.1 * key, key=key))
+        result = PointResult(key, x_m=0.0, y_m=0.0, z_m=0.0, frame_id=frame)
+        shown = shown.with_point(accepted_point(result, point))
+    assert shown.f0_hz.tolist() == [251.0, 253.0]
+    assert shown.without(np.zeros(3), "phantom").f0_hz.tolist() == [251.0]
 
 
 def test_no_pose_is_refused_and_no_pole_is_a_failure():
