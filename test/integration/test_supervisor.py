@@ -28,7 +28,7 @@ regions:
   - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.0, 0.0], radius_m: 0.025}}
 positions:
   list: [[0.0, 0.0], [0.004, 0.0]]
-blocks: {least: 3, most: 3}
+blocks: {least: 24, most: 24}
 """
 TIME = own_time(17)
 WITHIN_S = 60.0

@@ -16,7 +16,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from runs import POLES, START_NS, blank, plan, result
+from run_tables import POLES, START_NS, blank, plan, result
 
 TRUTH = 100
 

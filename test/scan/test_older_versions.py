@@ -21,7 +21,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from runs import RECORD, START_NS, blank, plan, result
+from run_tables import RECORD, START_NS, blank, plan, result
 
 KEY, N = 7, 200
 LACKS_TODAY = ("contact_coverage", "contact_reason")

@@ -23,7 +23,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from runs import (
+from run_tables import (
     POLES,
     RECORD,
     START_NS,

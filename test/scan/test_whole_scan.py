@@ -17,7 +17,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from runs import assert_same, table_of
+from run_tables import assert_same, table_of
 from scanned import begin, go_on, true_poles
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")
