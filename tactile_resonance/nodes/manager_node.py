@@ -35,6 +35,8 @@ TICK_S = 0.1
 QUIET_S = 1.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
+# An answer may overtake the event that tells why a node is not active any more.
+EVENT_WITHIN_S = 0.2
 LONGEST_RETRY_S = 16.0
 
 _UP = {
@@ -68,6 +70,7 @@ class _Managed:
     refusals: int = 0
     worked: bool = False  # it has been active since it was last brought up
     held: bool = False  # somebody else has deactivated it
+    sure_s: float | None = None  # from when on an answer counts that it is not active any more
     due: bool = False  # its turn came while a question was under way
     next_try_s: float = field(default=0.0)
 
@@ -188,7 +191,14 @@ class ManagerNode(Node):
     def _take(self, node: _Managed, now_s: float) -> None:
         answer, node.pending = node.pending.result(), None
         if isinstance(answer, GetState.Response):
-            self._see(node, answer.current_state.id)
+            state = answer.current_state.id
+            if node.worked and self._wanted_up and state != State.PRIMARY_STATE_ACTIVE:
+                node.sure_s = now_s + EVENT_WITHIN_S if node.sure_s is None else node.sure_s
+                state = State.PRIMARY_STATE_UNKNOWN if now_s < node.sure_s else state
+            if state in _NAMES and state != State.PRIMARY_STATE_UNKNOWN:
+                self._see(node, state)
+            else:  # asked again, also one that is on its way
+                node.state = state
             return
         node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:
@@ -204,7 +214,7 @@ class ManagerNode(Node):
         )
 
     def _see(self, node: _Managed, state: int) -> None:
-        node.state = state
+        node.state, node.sure_s = state, None
         if state == State.PRIMARY_STATE_ACTIVE:
             node.worked, node.held = True, False
         elif node.worked and self._wanted_up:
