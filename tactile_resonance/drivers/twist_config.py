@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import numbers, read_dataclass, read_yaml, require
+
+TOPIC = r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
+"""As in ROS 2, without substitutions (https://design.ros2.org/articles/topic_and_service_names.html)."""
 
 RANGES: dict[str, tuple[float, float]] = {
     "rate_hz": (25.0, 1000.0),
@@ -33,6 +37,8 @@ class TwistConfig:
     ----------
     command_topic, pose_topic : str
         geometry_msgs/TwistStamped to the controller, geometry_msgs/PoseStamped of the tool.
+    tip_in_tool : Pose
+        Frame `tip` in the frame whose poses come.
     rate_hz : float
         Of the poses.
     max_state_age_s : float
@@ -46,12 +52,11 @@ class TwistConfig:
         Faster commands are refused.
     lockstep : bool
         Time is that of a simulated controller: each of its steps is answered by one command.
-    tip_in_tool : Pose
-        Frame `tip` in the frame whose poses come.
     """
 
     command_topic: str
     pose_topic: str
+    tip_in_tool: Pose
     rate_hz: float = 500.0
     max_state_age_s: float = 0.020
     max_command_gap_s: float = 0.040
@@ -61,12 +66,14 @@ class TwistConfig:
     max_turn_rad_s: float = 1.0
     max_acceleration_m_s2: float = 2.0
     lockstep: bool = False
-    tip_in_tool: Pose = field(default_factory=Pose.at_origin)
 
     def __post_init__(self) -> None:
         for name in ("command_topic", "pose_topic"):
             value = getattr(self, name)
-            require(bool(value), name, value, "the name of a topic")
+            good = re.fullmatch(TOPIC, value) is not None
+            require(good, name, value, "the name of a topic: letters, digits, _ and single /")
+        accepted = "another topic than command_topic"
+        require(self.pose_topic != self.command_topic, "pose_topic", self.pose_topic, accepted)
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             require(low <= value <= high, name, value, f"{low:g} to {high:g}")
@@ -89,7 +96,7 @@ def read_twist_config(path: Path) -> TwistConfig:
     fields, where = read_yaml(path), path.name
     kind = fields.pop("kind", None)
     require(kind == "twist", f"{where}.kind", kind, "twist")
-    offset = numbers(fields.pop("tip_in_tool", [0.0] * 6), f"{where}.tip_in_tool", 6)
+    offset = numbers(fields.pop("tip_in_tool", None), f"{where}.tip_in_tool", 6)
     return read_dataclass(
         TwistConfig, fields, where, tip_in_tool=Pose.from_vector(np.array(offset))
     )

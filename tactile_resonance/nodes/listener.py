@@ -10,6 +10,8 @@ from rclpy.node import Node
 
 from tactile_resonance.nodes.running import RCLError
 
+CLOSE_WITHIN_S = 2.0
+
 
 class Listener:
     """A second node beside one, spinning on its own; in its namespace.
@@ -46,7 +48,8 @@ class Listener:
         """Spin no more; all that was made on the node ends."""
         self._executor.shutdown()
         if self._thread.is_alive():
-            self._thread.join()
+            # where the context is being shut down, that holds what the thread waits for
+            self._thread.join(CLOSE_WITHIN_S)
         self.node.destroy_node()
 
     def _spin(self) -> None:

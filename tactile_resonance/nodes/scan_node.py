@@ -201,8 +201,11 @@ class ScanNode(ManagedNode):
         if goal.resume:
             resumed_run(goal)
             return frames
+        stamp = message.poses.header.stamp
+        good = stamp.sec >= 0 and stamp.nanosec < 1_000_000_000
+        require(good, "poses.header.stamp", (stamp.sec, stamp.nanosec), "a time, or 0")
         names = named_frames(goal, frames)
-        found = await look_up(self, frames.base, names, message.poses.header.stamp)
+        found = await look_up(self, frames.base, names, stamp)
         frames = replace(frames, others=found.poses, no_others=found.missing)
         self._new_run(goal, frames)
         return frames
@@ -303,6 +306,7 @@ class ScanNode(ManagedNode):
         if goal.resume:
             run = RunDirectory.open(resumed_run(goal))
             try:
+                self._require_same_table(run)
                 scene = read_scan_scene(run.path / "scene.yaml")
                 others = _frames_of_run(run, scene, frames)
                 scene = self._place(scene, replace(frames, others=others))
@@ -326,6 +330,13 @@ class ScanNode(ManagedNode):
             facts["surface"] = found.as_json()
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
+
+    def _require_same_table(self, run: RunDirectory) -> None:
+        """A run goes on where it began; where the table is known better now, that is another place."""
+        noted = run.content.facts.get("scan_node", {}).get("table_in_base")
+        (table,) = values(self, "table_in_base")
+        accepted = f"{noted}, with which the run began, to resume it"
+        require(noted in (None, list(table)), "table_in_base", list(table), accepted)
 
     def _place(self, scene: ScanScene, frames: Frames) -> ScanScene:
         """Tell the hands where the scene's frame stands, and return it with that frame's name."""

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance.action import CalibrateTable
-from tactile_resonance.analysis import write_whole
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.scan.goal import Frames
@@ -72,7 +73,9 @@ def calibrate(
         return found
 
     result = no_table(CalibrateTable.Result.FAILED)
+    file = None
     try:
+        file = _new_file(request.file) if request.file else None
         hands.retract()
         made = calibrate_table(request, frames.table_in_base, radius_m, touch)
     except (PointFailed, ScanEnded, Interrupted) as error:
@@ -81,8 +84,10 @@ def calibrate(
     except ValueError as error:
         result.outcome, result.message = result.REFUSED, str(error)
         return result
-    _fill(result, made)
-    if request.file:
+    else:
+        _fill(result, made)
+        if file is None:
+            return result
         known = {
             "base_frame": frames.base,
             "table_frame": frames.table,
@@ -90,14 +95,30 @@ def calibrate(
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "made_by": who,
         }
-        path = Path(request.file)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, as_text(made, request, known).encode())
-            result.file = str(path)
-        except (OSError, ValueError) as error:
+            file.write(as_text(made, request, known).encode())
+            file.flush()
+            os.fsync(file.fileno())
+            result.file = request.file
+        except OSError as error:
             result.message += f". NOT WRITTEN: {error}"
-    return result
+        return result
+    finally:
+        if file is not None:
+            file.close()
+            if not result.file:
+                Path(request.file).unlink()
+
+
+def _new_file(name: str) -> BinaryIO:
+    """Open a new file before anything is touched; ``ValueError`` where there can be none."""
+    path = Path(name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("xb")
+    except OSError as error:
+        accepted = f"a new file in a folder that can be written ({error.strerror})"
+        raise ValueError(f"file: got {name!r}; accepted is {accepted}") from error
 
 
 def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:

@@ -31,6 +31,7 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.scene import Hold
 
 STATE_TOPIC = "contact_state"
+TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
 # Faults of the devices, and what somebody else asked for, say nothing of the point: it is repeated.
@@ -111,20 +112,20 @@ class TipContact:
                 if not disturbed.again(error):
                     raise
             finally:
-                self.retract()
+                self.retract(TOUCH_RETRACT_WITHIN_S)
 
-    def retract(self) -> None:
+    def retract(self, within_s: float = RETRACT_WITHIN_S) -> None:
         """Draw the tip back and wait until it is free."""
         if not self.touching:
             return
-        deadline = time.monotonic() + RETRACT_WITHIN_S
+        deadline = time.monotonic() + within_s
         while time.monotonic() < deadline:
             self._end_if_hung()
             self._time.go()
             if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
                 self.touching = False
                 return
-        raise ScanEnded(f"the tip was not drawn back within {RETRACT_WITHIN_S:g} s")
+        raise ScanEnded(f"the tip was not drawn back within {within_s:g} s: is contact_node active?")
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""

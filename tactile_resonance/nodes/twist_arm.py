@@ -102,16 +102,16 @@ class TwistArm:
         self._offset_turn = config.tip_in_tool.turn
         self._lock = threading.Lock()  # of fault and twist: two threads may set them
         self._fault: ArmError | None = None
-        self._tools: deque[_Tool] = deque(maxlen=64)
+        self._tools = _no_tools()
         self._twist = REST  # of the tip, after the limit of acceleration
         self._commanded_ns: int | None = None  # when the last command was given
         self._moving = False
         self._forget_way()
         own = self.listener.node
+        node.resources.callback(self.listener.close)
         self._publisher = own.create_publisher(TwistStamped, config.command_topic, COMMANDS)
         own.create_subscription(PoseStamped, config.pose_topic, self._on_pose, SERIES)
         own.create_timer(config.max_command_gap_s / 2, self._watch_commands, clock=STEADY)
-        node.resources.callback(self.listener.close)
         self.listener.start()
 
     # the contract
@@ -120,7 +120,7 @@ class TwistArm:
         """Forget the fault; nothing moves before the next command."""
         with self._lock:
             self._fault = None
-            self._tools.clear()
+            self._tools = _no_tools()  # the listener's thread may be looking at the old ones
             self._twist, self._moving, self._commanded_ns = REST, False, None
         self._forget_way()
 
@@ -301,9 +301,13 @@ class TwistArm:
         if stamp_ns == 0 or (early_s > EARLIEST_S and not self.clock.simulated):
             text = f"the time stamp of a pose on {topic} is {early_s:.3g} s ahead, accepted are "
             self._fail(ArmFault.INVALID, text + f"{EARLIEST_S:g} s, and not 0")
-        if self._tools and time_ns <= self._tools[-1].time_ns:
+        tools = self._tools
+        if tools and time_ns <= tools[-1].time_ns:
             self._fail(ArmFault.INVALID, f"time stamps of poses on {topic} do not increase")
         place, quaternion = message.pose.position, message.pose.orientation
+        if not all(map(math.isfinite, (place.x, place.y, place.z))):
+            text = f"position on {topic}: {(place.x, place.y, place.z)}, expected finite numbers"
+            self._fail(ArmFault.INVALID, text)
         x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
         if not 0.99 < math.hypot(x, y, z, w) < 1.01:
             text = f"orientation on {topic}: {(x, y, z, w)}, expected a unit quaternion"
@@ -314,7 +318,7 @@ class TwistArm:
         tool = _Tool(
             time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn)
         )
-        self._tools.append(tool)
+        tools.append(tool)
         self._arrivals.add(stamp_ns)
 
     def _send(self) -> None:
@@ -325,9 +329,9 @@ class TwistArm:
     def _publish(self, time_ns: int) -> None:
         with self._lock:
             x, y, z, *turn = self._twist
-            lever_m = ZERO
-            if self._tools:
-                lever_m = difference(self._tools[-1].tool_m, self._tools[-1].tip_m)
+            tools, lever_m = self._tools, ZERO
+            if tools:
+                lever_m = difference(tools[-1].tool_m, tools[-1].tip_m)
             # of the tool's origin
             a, b, c = cross(vector(turn), lever_m)
             message = TwistStamped()
@@ -341,6 +345,10 @@ class TwistArm:
             except RCLError:
                 # once ROS has been shut down nobody listens, and the controller's own limit stops the arm
                 return
+
+
+def _no_tools() -> deque[_Tool]:
+    return deque(maxlen=64)
 
 
 def _velocity(tools: Sequence[_Tool]) -> Six:

@@ -153,7 +153,7 @@ def resumed_run(goal: ScanGoal) -> Path:
     ValueError
         If there is no run, or the goal asks for something else than the run does.
     """
-    path = Path(goal.run_directory).expanduser()
+    path = expanded(goal.run_directory, "run_directory")
     good = bool(goal.run_directory) and (path / "run.json").is_file()
     require(good, "run_directory", goal.run_directory, "the folder of a run, to resume it")
     only = ScanGoal(run_directory=goal.run_directory, resume=True)
@@ -164,9 +164,18 @@ def resumed_run(goal: ScanGoal) -> Path:
     return path
 
 
+def expanded(given: str, name: str) -> Path:
+    """Path with ``~`` in place; ``ValueError`` where nobody has that home."""
+    try:
+        return Path(given).expanduser()
+    except RuntimeError as error:
+        accepted = "a path; there is no such home"
+        raise ValueError(f"{name}: got {given!r}; accepted is {accepted}") from error
+
+
 def scene_path(scene: str) -> Path:
     """Path of a scene file, absolute or in the package's share folder."""
-    path = Path(scene).expanduser()
+    path = expanded(scene, "scene")
     return path if path.is_absolute() else share_path(path)
 
 

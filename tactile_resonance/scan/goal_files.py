@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import require
-from tactile_resonance.scan.goal import ScanGoal, scene_path
+from tactile_resonance.scan.goal import ScanGoal, expanded, scene_path
 
 
 class GoalFiles:
@@ -44,7 +44,7 @@ class GoalFiles:
 
     def to_write(self, given: str, name: str) -> Path:
         """Path of a file or folder that a goal wants written, relative to the folder of the runs."""
-        path = self._runs / Path(given).expanduser()
+        path = self._runs / expanded(given, name)
         require_within(path, name, [self._runs, *self._others])
         return path
 

@@ -49,7 +49,10 @@ class CalibrationRequest:
     file: str = ""
 
     def __post_init__(self) -> None:
-        SensorUse(name=self.sensor)
+        try:
+            SensorUse(name=self.sensor)
+        except ValueError as error:
+            raise ValueError(f"sensor: {error}") from error
         for name in ("force_n", "search_m", "flatness_m", "most_tilt_rad", "heading_rad"):
             number(getattr(self, name), name)
         require(self.force_n > 0, "force_n", self.force_n, "a number above 0")

@@ -26,11 +26,10 @@ def read(tmp_path):
 
 def test_the_file_of_the_package_states_the_defaults(read):
     config = read_twist_config(share_path("config/devices/twist.yaml"))
-    topics = {"kind", "command_topic", "pose_topic"}
-    least = read(**dict.fromkeys(set(GIVEN) - topics, "left out"))
+    needed = {"kind", "command_topic", "pose_topic", "tip_in_tool"}
+    least = read(**dict.fromkeys(set(GIVEN) - needed, "left out"))
     assert {**vars(config), "tip_in_tool": 0} == {**vars(least), "tip_in_tool": 0}
     assert not config.tip_in_tool.vector.any()
-    assert not least.tip_in_tool.vector.any()
     assert (config.rate_hz, config.lockstep) == (500.0, False)
 
 
@@ -59,6 +58,11 @@ def test_numbers_out_of_range_are_named(read, name, limits):
         ({"command_topic": ""}, "command_topic: got ''; accepted is the name of a topic"),
         ({"pose_topic": 3}, "pose_topic: got 3; accepted is text"),
         ({"pose_topic": ""}, "pose_topic: got ''"),
+        ({"pose_topic": "a//b"}, "pose_topic: got 'a//b'; accepted is the name of a topic"),
+        ({"command_topic": "a b"}, "command_topic: got 'a b'; accepted is the name of a topic"),
+        ({"command_topic": "1a"}, "command_topic: got '1a'"),
+        ({"pose_topic": GIVEN["command_topic"]}, "accepted is another topic than command_topic"),
+        ({"tip_in_tool": "left out"}, "tip_in_tool: got None; accepted is a"),
         ({"lockstep": 1}, "lockstep: got 1; accepted is true or false"),
         ({"tip_in_tool": [0.0] * 5}, "tip_in_tool: got [0.0, 0.0, 0.0, 0.0, 0.0]; accepted is a"),
         ({"tip_in_tool": [0.0] * 5 + [11.0]}, "tip_in_tool: got [0.0, 0.0, 0.0, 0.0, 0.0, 11.0]"),

@@ -166,6 +166,24 @@ def test_where_nothing_can_be_touched_nothing_is_known(ideal):
     assert not path.exists()
 
 
+def test_a_file_that_cannot_be_new_is_refused_before_anything_is_touched_and_never_replaced(ideal):
+    runs, heard = ideal.folder / "runs", []
+    runs.mkdir(exist_ok=True)
+    (runs / "afile").touch()
+    for name in ("afile/table.yaml", 300 * "x"):
+        outcome = ideal.calibrate(file=name, on_feedback=heard.append)
+        assert outcome.ending is Ending.REFUSED
+        assert outcome.message.startswith(f"file: got '{runs / name}'; accepted is a new file")
+    assert heard == []
+    target = ideal.folder / "elsewhere"
+    (runs / "mine.yaml.part").symlink_to(target)
+    outcome = ideal.calibrate(file="mine.yaml", on_feedback=heard.append)
+    assert outcome.file == str(runs / "mine.yaml")
+    assert not target.exists()
+    rejected = ideal.calibrate(file="~nobody-has-it/table.yaml")
+    assert (rejected.ending, "file: got '~nobody" in rejected.message) == (Ending.REJECTED, True)
+
+
 def test_one_goal_at_a_time_and_a_cancelled_one_draws_the_tip_back(ideal):
     client, heard = ideal.client, []
     scan = {"poses": [Pose()], "frame": "table", "force_n": 0.01}

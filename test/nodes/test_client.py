@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node of a user that asks scan_node for scans: what is rejected, and why; cancel, pause, skip."""
 
+import json
 import math
 import os
 import time
@@ -296,6 +297,22 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     # it can be resumed
     assert outcome.run_directory == heard[-1].run_directory
     assert Path(outcome.run_directory, "run.json").is_file()
+
+
+def test_a_run_that_began_with_another_table_is_not_resumed(stack):
+    stack.activate()
+    future = stack.begin([], run_directory="mine")
+    stack.client.cancel()
+    run = Path(stack.ended(future).run_directory)
+    facts = json.loads((run / "run.json").read_text())
+    table = facts["facts"]["scan_node"]["table_in_base"]
+    assert table == [0.0] * 6
+    table[2] = 0.1
+    (run / "run.json").write_text(json.dumps(facts))
+    outcome = stack.ended(stack.client.scan(run_directory="mine", resume=True))
+    assert outcome.ending is Ending.REFUSED
+    assert outcome.message.startswith("table_in_base: got [0.0, 0.0, 0.0, ")
+    assert "with which the run began" in outcome.message
 
 
 def test_a_scan_node_in_a_namespace_is_named(stack):

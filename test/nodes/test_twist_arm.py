@@ -82,13 +82,13 @@ class Controller:
         self.heard.clear()
         return newest
 
-    def pose(self, *, age_ns=0, frame="base", stamp_ns=None, quaternion=None):
+    def pose(self, *, age_ns=0, frame="base", stamp_ns=None, quaternion=None, place=None):
         """Publish where the tool is, and wait until that is known or refused."""
         message = PoseStamped()
         stamp = self.now_ns - age_ns + AHEAD_NS if stamp_ns is None else stamp_ns
         message.header.stamp, message.header.frame_id = time_message(stamp), frame
-        place, turn = message.pose.position, message.pose.orientation
-        place.x, place.y, place.z = self.place
+        at, turn = message.pose.position, message.pose.orientation
+        at.x, at.y, at.z = self.place if place is None else place
         turn.x, turn.y, turn.z, turn.w = self.turn.as_quat() if quaternion is None else quaternion
         before, arm = self.arm._arrivals.newest_ns, self.arm
         self._poses.publish(message)
@@ -346,6 +346,8 @@ def test_a_tip_that_somebody_else_moves_is_a_fault_only_while_we_move_it(make):
         ({"age_ns": 2_000_000}, "do not increase"),
         ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "expected a unit quaternion"),
         ({"quaternion": (math.nan, 0.0, 0.0, 1.0)}, "expected a unit quaternion"),
+        ({"place": (math.nan, 0.0, 0.0)}, "expected finite numbers"),
+        ({"place": (0.0, 0.0, math.inf)}, "expected finite numbers"),
     ],
 )
 def test_poses_that_say_nothing_are_zero_and_a_fault(make, how, message):

@@ -40,3 +40,10 @@ def test_scenes_are_those_of_the_package_and_of_the_folders(tmp_path):
     for scene in ("config/../setup.py", str(tmp_path / "runs" / "a.yaml"), "/etc/passwd"):
         with pytest.raises(ValueError, match="got .*; accepted is a path in"):
             files.checked(ScanGoal(scene=scene))
+
+
+def test_a_home_that_nobody_has_is_refused_by_field(tmp_path):
+    files = GoalFiles(str(tmp_path), [""])
+    for name in ("scene", "run_directory"):
+        with pytest.raises(ValueError, match=f"^{name}: got '~nobody-has-it/a'; accepted is a path"):
+            files.checked(ScanGoal(**{name: "~nobody-has-it/a"}))
