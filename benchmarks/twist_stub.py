@@ -136,7 +136,7 @@ def stub_parameters(folder: Path, rate_hz: float) -> dict[str, object]:
     """Parameters of a contact_node that commands the stub; its files go into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = {"kind": "twist", "command_topic": COMMAND_TOPIC, "pose_topic": POSE_TOPIC}
-    robot |= {"rate_hz": rate_hz, "lockstep": True}
+    robot |= {"tip_in_tool": [0.0] * 6, "rate_hz": rate_hz, "lockstep": True}
     force = yaml.safe_load(share_path("config/force/topic.yaml").read_text(encoding="utf-8"))
     force |= {"topic": WRENCH_TOPIC, "rate_hz": CELL_HZ, "latency_s": LATENCY_S}
     force["frame"] = {"position_m": [0.0] * 3, "rotation_rad": [0.0] * 3}

@@ -27,6 +27,8 @@ PARAMETER = Parameter(
 
 ANSWER_WITHIN_S = 0.25
 """Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
+DISCOVERED_WITHIN_S = 2.0
+"""A node that has just come up is not known to all yet: so long its service is waited for [s]."""
 POLL_S = 5e-4
 
 
@@ -54,6 +56,9 @@ class MeasuredContact:
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
         """See `ContactSource`."""
+        deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
+        while not self._client.service_is_ready() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
         if not self._client.service_is_ready():
             return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))

@@ -203,10 +203,10 @@ class NodeHands:
             reason = self._recorder.force_reason or "no record states why"
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if origin.contact.position_m is None:
-            text = "measurement: the place of the tip is unknown (tcp_pose)"
-            if self._tip is None:  # published here, to a bench that had not discovered this node
-                raise PointDisturbed(text, "place unknown")
-            raise PointFailed(text)
+            # a node that has just come up may not have discovered the one that knows it
+            reason = self._recorder.force_reason or "no record states why"
+            text = f"measurement: the place of the tip is unknown: {reason}"
+            raise PointDisturbed(text, "place unknown")
         return Measured(poles, origin)
 
     def retract(self) -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole scan from the launch file, a node killed in the middle of it and brought back, and the end."""
+"""Scans from the launch file: nodes killed in the middle, one that is mute, a cancelled one; and the end."""
 
 import os
 import signal
 import tempfile
-import time
+import threading
 import unittest
 from pathlib import Path
 
@@ -19,7 +19,9 @@ import launch_testing.actions
 import launch_testing.asserts
 from launch.actions import IncludeLaunchDescription, SetEnvironmentVariable
 from launch.launch_description_sources import PythonLaunchDescriptionSource
+from rclpy.qos import qos_profile_sensor_data
 from tactile_resonance.action import Scan
+from tactile_resonance.msg import ContactState
 
 from launch import LaunchDescription
 from tactile_resonance.client import Ending
@@ -63,8 +65,8 @@ def generate_test_description():
     )
 
 
-def kill(node):
-    """As a crash would: SIGKILL."""
+def signal_to(node, number):
+    """Signal the process of a node of this launch."""
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             command, environment = (
@@ -74,36 +76,76 @@ def kill(node):
             continue
         ours = f"ROS_DOMAIN_ID={DOMAIN_ID}".encode() in environment
         if ours and any(part.endswith(node.encode()) for part in command[:3]):
-            os.kill(int(entry.name), signal.SIGKILL)
+            os.kill(int(entry.name), number)
             return
     raise AssertionError(f"no process of {node}")
 
 
+class Disturbed(ScanClient):
+    """A scan in whose second point something happens, once it is measured."""
+
+    def __init__(self, name, happens):
+        super().__init__(lambda: None)
+        self._run, self._happens, self._happened = FOLDER / name, happens, False
+        self.waited_for = set()
+
+    def outcome(self):
+        self.wait_until_up(120.0)
+        return self.scan(
+            300.0,
+            scene=FOLDER / "scene.yaml",
+            run_directory=self._run,
+            on_feedback=self._hear,
+        )
+
+    def results(self):
+        """Of a scan whose two points were measured, the second once more."""
+        outcome = self.outcome()
+        assert self._happened
+        assert outcome.ending is Ending.COMPLETE, outcome.message
+        results = read_run(self._run).results
+        told = outcome.message, [result.reason for result in results]
+        assert (outcome.done, outcome.failed) == (2, 0), told
+        assert [(r.index, r.attempt) for r in results] == [(0, 0), (1, 0)], told
+        return results
+
+    def _hear(self, feedback):
+        if feedback.waiting_for:
+            self.waited_for.add(feedback.waiting_for)
+        measured = feedback.phase == Scan.Feedback.PHASE_MEASURE and feedback.point == 1
+        if measured and not self._happened:
+            self._happened = True
+            self._happens(self)
+
+
 class TestScan(unittest.TestCase):
     def test_a_scan_outlives_a_node_that_is_killed(self):
-        heard, killed = [], []
+        for node in ("frf_node", "contact_node"):
+            with Disturbed(f"without {node}", lambda _: signal_to(node, signal.SIGKILL)) as client:  # noqa: B023
+                # the point that lost its node was repeated
+                assert client.results()[1].repeats >= 1
 
-        def hear(feedback):
-            heard.append(feedback)
-            if feedback.phase == Scan.Feedback.PHASE_MEASURE and feedback.point == 1 and not killed:
-                killed.append(time.monotonic())
-                kill("frf_node")
+    def test_a_node_that_is_mute_for_a_while_is_named_and_waited_for(self):
+        def mute(_):
+            signal_to("poles_node", signal.SIGSTOP)
+            threading.Timer(8.0, lambda: signal_to("poles_node", signal.SIGCONT)).start()
 
-        with ScanClient(lambda: None) as client:
-            client.wait_until_up(120.0)
-            result = client.scan(
-                300.0,
-                scene=FOLDER / "scene.yaml",
-                run_directory=FOLDER / "run",
-                on_feedback=hear,
+        with Disturbed("mute", mute) as client:
+            client.results()
+            assert any("poles_node" in reason for reason in client.waited_for), client.waited_for
+
+    def test_a_cancelled_scan_leaves_the_tip_free(self):
+        states = []
+        with Disturbed("cancelled", lambda client: client.tactile.cancel()) as client:
+            client._node.create_subscription(
+                ContactState, "contact_state", states.append, qos_profile_sensor_data
             )
-        assert killed
-        assert result.ending is Ending.COMPLETE, result.message
-        assert (result.done, result.failed) == (2, 0), result.message
-        run = read_run(FOLDER / "run")
-        assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0)]
-        # the point that lost its node was repeated
-        assert run.results[1].repeats >= 1
+            outcome = client.outcome()
+            assert outcome.ending is Ending.CANCELLED, outcome.message
+            assert outcome.done == 1, outcome.message
+            del states[:]
+            client.wait(lambda: states, 30.0, "the state of the contact")
+            assert states[-1].state == ContactState.STATE_IDLE
 
 
 @launch_testing.post_shutdown_test()

@@ -101,6 +101,24 @@ def test_what_the_service_tells_of_exactly_this_block_arrives(monkeypatch):
     )
 
 
+def test_a_service_that_is_discovered_late_is_waited_for(monkeypatch):
+    """The first block of a scan whose nodes have just come up."""
+    monkeypatch.setattr(contact_source, "ANSWER_WITHIN_S", WITHIN_S)
+    monkeypatch.setattr(contact_source, "DISCOVERED_WITHIN_S", WITHIN_S)
+
+    def serve(_, response):
+        response.force_n, response.force_std_n, response.coverage = 0.01, 1e-5, 1.0
+        response.tip_pose = pose_at(START_NS)
+        return response
+
+    with asker() as (node, other):
+        later = threading.Timer(0.5, other.create_service, (ForceOver, "force_over", serve))
+        later.start()
+        told = node.source.over(START_NS, END_NS)
+        later.join()
+    assert (told.force_n, told.reason) == (0.01, "")
+
+
 def test_a_force_that_is_not_known_keeps_its_reason_and_its_place(monkeypatch):
     monkeypatch.setattr(contact_source, "ANSWER_WITHIN_S", WITHIN_S)
 
