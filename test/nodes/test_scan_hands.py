@@ -34,7 +34,9 @@ class Scanning(ManagedNode):
 
 
 def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place():
-    with initialised(domain_id=free_domain_id(os.environ)):
+    # names of its own: any other subscriber of tcp_pose would be taken for the bench
+    own = ["--ros-args", "-r", f"__ns:=/hands_{os.getpid()}"]
+    with initialised(args=own, domain_id=free_domain_id(os.environ)):
         executor = SingleThreadedExecutor()
         nodes = []
 
