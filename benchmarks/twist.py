@@ -132,7 +132,7 @@ def _contacts(lab: Lab, count: int) -> list[Held | str]:
     for number in range(count):
         lab.place_tissue(TISSUES[number % len(TISSUES)])
         handle = client.start(STEP_M * (number % 4), STEP_M * (number // 4), FORCE_N)
-        began_s = client.now_s
+        began_s = 1e-9 * client.told_ns
         result = client.result(handle)
         if result.reached:
             client.until("hold")

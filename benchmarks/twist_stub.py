@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 
+from benchmarks.twist_controller import TwistController
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
@@ -24,7 +25,6 @@ from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.plant import Plane
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.twist_controller import TwistController
 
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
 CLEAR_M = 0.02

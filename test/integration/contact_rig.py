@@ -14,125 +14,71 @@ import time
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.action import ActionClient
-from rclpy.time import Time
 from robot_at_hand import RobotAtHand, own_host
-from scipy.spatial.transform import Rotation
 from std_msgs.msg import Bool
-from std_srvs.srv import SetBool, Trigger
-from tactile_resonance.action import MakeContact
+from std_srvs.srv import SetBool
 
-from tactile_resonance import msg
+from benchmarks import contact_client
+from benchmarks.contact_client import HANGS_S
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import Demand, SimulatedClock
-from tactile_resonance.nodes.client import NoAnswer, NodeClient
+from tactile_resonance.nodes.client import NoAnswer
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses, end_with_parent
 from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
 
 HOST = own_host(13)
-HANGS_S = 60.0
 STEP_S = 0.002
-TURN = Rotation.from_rotvec(TABLE_IN_BASE[3:]).as_quat().tolist()
 
 
-class ContactClient(NodeClient):
-    """Asks for contacts and hears the state."""
+class ContactClient(contact_client.ContactClient):
+    """A client that also supervises the node; of states it hears only the newest."""
+
+    qos = NEWEST
 
     def __init__(self, check):
-        super().__init__("contact_client", check)
-        self.state = None
-        self.states = []
+        super().__init__(check)
         self.managed = ""  # what the manager reports
 
     def join(self):
+        super().join()
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        self._action = ActionClient(self._node, MakeContact, "make_contact")
-        self._retract = self._node.create_client(Trigger, "retract")
         self._stop = self._node.create_client(SetBool, "stop")
         self._stops = self._node.create_publisher(Bool, "stop", 10)
         self._change = self._node.create_client(ChangeState, "contact_node/change_state")
         self._set = self._node.create_client(
             SetParametersAtomically, "contact_node/set_parameters_atomically"
         )
-        self._node.create_subscription(msg.ContactState, "contact_state", self._on_state, NEWEST)
 
     def _on_diagnostics(self, array):
         for status in array.status:
             if status.name == "/manager_node":
                 self.managed = status.message
 
-    def _on_state(self, message):
-        self.state = message
-        if not self.states or self.states[-1] != message.state:
-            self.states.append(message.state)
-
-    @property
-    def told_ns(self):
-        """Of which time the newest state tells."""
-        return 0 if self.state is None else Time.from_msg(self.state.header.stamp).nanoseconds
-
-    def why(self):
-        return "" if self.state is None else f"{self.state.state}: {self.state.message}"
-
-    def idle(self, timeout_s=HANGS_S):
-        """Wait until the node is active and nothing is under way."""
+    def idle(self):
+        """Wait until the node is active and nothing is under way, by what it says from now on."""
         self.state = None
-        self.wait(
-            lambda: self.state is not None and self.state.state == "idle",
-            timeout_s,
-            "contact_node to be idle",
-        )
+        self.until("idle")
 
-    def back(self, timeout_s=HANGS_S):
+    def back(self):
         """Ask for a retraction while a fault stands, until nothing is under way."""
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + HANGS_S
         self.state = None
         while self.state is None or self.state.state != "idle":
             assert time.monotonic() < deadline, f"contact_node does not come back ({self.why()})"
             if self.state is not None and self.state.state == "fault":
                 with contextlib.suppress(NoAnswer):  # the node may be being made anew
-                    self.retract(timeout_s=5.0)
+                    self.ask("retract", 5.0)
                 self.state = None
             self.spin(0.2)
-
-    def start(self, xy_m=(0.0, 0.0), timeout_s=HANGS_S, **fields):
-        """Ask for a contact until the node takes it; return the goal's handle."""
-        goal = goal_message(xy_m, **fields)
-        deadline = time.monotonic() + timeout_s
-        while True:
-            if self._action.server_is_ready():
-                handle = self.send(goal)
-                if handle.accepted:
-                    return handle
-            assert time.monotonic() < deadline, f"no goal is taken ({self.why()})"
-            self.spin(0.05)
-
-    def send(self, goal):
-        """Send a goal once; return its handle."""
-        future = self._action.send_goal_async(goal)
-        self.wait(future.done, HANGS_S, "an answer to the goal")
-        return future.result()
-
-    def result(self, handle, timeout_s=HANGS_S):
-        future = handle.get_result_async()
-        self.wait(future.done, timeout_s, "the result")
-        return future.result().result
 
     def cancel(self, handle):
         future = handle.cancel_goal_async()
         self.wait(future.done, HANGS_S, "an answer to cancel")
-
-    def _answer(self, service, request, what, timeout_s=HANGS_S):
-        self.wait(service.service_is_ready, timeout_s, what)
-        future = service.call_async(request)
-        self.wait(future.done, timeout_s, f"an answer to {what}")
-        return future.result()
 
     def change_state(self, transition):
         """Ask for a transition of contact_node's life, without waiting for its end."""
@@ -141,8 +87,7 @@ class ContactClient(NodeClient):
 
     def start_all(self):
         """Ask the manager to bring all nodes up."""
-        start = self._node.create_client(Trigger, "manager_node/start")
-        return self._answer(start, Trigger.Request(), "manager_node/start")
+        return self.ask("manager_node/start")
 
     def set(self, **values):
         """Set parameters of contact_node, `limits__depth_m=1e-3`; why it refuses, empty where not."""
@@ -150,32 +95,20 @@ class ContactClient(NodeClient):
         for name, value in values.items():
             given = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
             request.parameters.append(Parameter(name=name.replace("__", "."), value=given))
-        result = self._answer(self._set, request, "parameters").result
+        result = self.answer(self._set, request).result
         return "" if result.successful else result.reason
 
     def stop(self, stopped):
         """By the service."""
-        return self._answer(self._stop, SetBool.Request(data=stopped), "stop")
+        return self.answer(self._stop, SetBool.Request(data=stopped))
 
     def publish_stop(self, stopped):
         """By the topic."""
         self.wait(self._stops.get_subscription_count, HANGS_S, "who listens to stop")
         self._stops.publish(Bool(data=stopped))
 
-    def retract(self, timeout_s=HANGS_S):
-        return self._answer(self._retract, Trigger.Request(), "retract", timeout_s)
-
-
-def goal_message(xy_m=(0.0, 0.0), **fields):
-    """1 cN at a place of the table."""
-    goal = MakeContact.Goal(force_n=0.01, **fields)
-    goal.pose = PoseStamped()
-    goal.pose.header.frame_id = "base"
-    place, turn = goal.pose.pose.position, goal.pose.pose.orientation
-    place.x, place.y = (float(a + b) for a, b in zip(TABLE_IN_BASE, xy_m, strict=False))
-    place.z = TABLE_IN_BASE[2]
-    turn.x, turn.y, turn.z, turn.w = TURN
-    return goal
+    def retract(self):
+        return self.ask("retract")
 
 
 class Bench(RobotAtHand):

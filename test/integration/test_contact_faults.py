@@ -166,7 +166,7 @@ def test_killed_nodes_leave_a_tip_that_stands_and_the_next_one_lifts_it_first(be
     bench.nodes.start("contact_node", bench.parameters)
     client.idle()
     at_s = bench.order("truth")["time_s"]
-    result = client.result(client.start(xy_m=(0.004, 0.0)))
+    result = client.result(client.start(0.004, 0.0))
     assert result.reached, result.message
     _, tip_m, force_n = bench.history(at_s)
     away = np.linalg.norm(tip_m[:, :2] - tip_m[0, :2], axis=1)

@@ -11,10 +11,11 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
+from benchmarks.contact_client import HANGS_S, goal_message
 from tactile_resonance.contact.parameters import read_contact
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contact_rig import HANGS_S, goal_message, height_m, last_way_down_s
+from contact_rig import height_m, last_way_down_s
 from lifecycle_msgs.msg import Transition
 
 PARAMETERS, LIMITS = read_contact()
@@ -103,7 +104,7 @@ def test_a_goal_that_is_cancelled_in_any_state_is_drawn_back(bench, client, stat
     assert client.set(**SLOW) == ""
     try:
         # travel is met from the other end of the table
-        handle = client.start(xy_m=(0.04, 0.0) if state == "travel" else (0.0, 0.0))
+        handle = client.start(0.04 if state == "travel" else 0.0)
         bench.until_state(client, state)
         at_s = bench.order("truth")["time_s"]
         client.cancel(handle)
@@ -130,7 +131,7 @@ def test_stop_of_the_robot_in_any_state_is_named_and_moves_nothing_later(
 ):
     assert client.set(**SLOW) == ""
     try:
-        handle = client.start(xy_m=(0.04, 0.0) if state == "travel" else (0.0, 0.0))
+        handle = client.start(0.04 if state == "travel" else 0.0)
         if state == "retract":
             bench.until_state(client, "hold")
             assert client.retract().success

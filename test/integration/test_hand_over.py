@@ -9,13 +9,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
-from contact_rig import HANGS_S
 from lifecycle_msgs.msg import Transition
 
+from benchmarks.contact_client import HANGS_S
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
@@ -66,7 +62,7 @@ def test_the_robot_is_released_taken_by_another_client_and_taken_back(bench, cli
     assert bench.order("state")["rtde_connections"] == 0
     assert client.start_all().success
     client.idle()
-    again = client.result(client.start(xy_m=(0.006, 0.0)))
+    again = client.result(client.start(0.006, 0.0))
     assert again.reached, again.message
     client.retract()
     client.idle()

@@ -66,7 +66,7 @@ def test_one_centinewton_is_reached_and_held(lab):
     _, force_n, height_m = lab.truth(0.0)
     assert force_n[-1] == 0
     # nothing is commanded while nothing is under way
-    idle_s = lab.client.now_s
+    idle_s = 1e-9 * lab.client.told_ns
     lab.client.let_pass(0.3)
     assert lab.commanded(idle_s) == 0
     assert np.ptp(lab.truth(idle_s)[2]) < STILL_M
@@ -81,7 +81,7 @@ def test_a_controller_that_was_switched_off_is_a_fault_and_nothing_moves_until_a
     result = lab.client.result(handle)
     assert not result.reached
     assert "is the controller active, and the only one" in result.message
-    # contact_node is brought up anew meanwhile; the controller is switched back, and is told zero
+    # contact_node is brought up anew meanwhile; the controller is switched back, and hears zero
     fault_s = controller.time_ns * 1e-9
     lab.client.until("idle")
     controller.active = True
@@ -125,7 +125,7 @@ def test_a_node_that_is_shut_down_in_contact_draws_the_tip_back_and_commands_not
     lab.client.wait(lambda: lab.stub.controller.force_n[-1][1] == 0, 60.0, "the tip to leave")
     lab.client.wait(lambda: not any(lab.stub.commands[-1][1]), 60.0, "zero")
     assert lab.stub.controller.height_m[-1] > held_m + 2e-3
-    lab.client.state = ""
+    lab.client.state = None
     assert lab.client.ask("manager_node/start").success
     lab.client.until("idle")  # a goal before that may be lost with the server that is being taken down
     again = lab.client.result(lab.start())

@@ -253,7 +253,7 @@ def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypat
     assert not waiting.done()
     over.set_result(None)
     assert stack.ended(waiting).ending is Ending.REJECTED
-    # the reason that is told is that of the latest goal
+    # `rejection` has the reason of the latest goal
     asking = stack.client._call("rejection")
     stack.until(asking.done)
     assert "force_n: got -1.0" in asking.result().message

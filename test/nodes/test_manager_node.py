@@ -83,7 +83,7 @@ def test_one_tick_brings_all_up_in_order(stack):
 
 
 def test_a_node_that_is_deactivated_and_cleaned_up_at_once_is_held(stack):
-    """Nobody asks it in between: it tells its changes by itself."""
+    """No question of the manager falls in between; the node publishes its transitions."""
     assert stack.bring_up(), stack.log
     # once it is known that the events are heard; the newest question may still be under way
     managed, node = stack.manager._nodes[1], stack.nodes["second"]

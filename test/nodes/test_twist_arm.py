@@ -36,7 +36,7 @@ HARD_M_S2 = 2.0
 
 
 class Controller:
-    """Somebody's controller: hears commands, publishes poses, moves the tool as it is told here."""
+    """A controller: takes commands, publishes poses; the tool moves as the test says."""
 
     def __init__(self, config):
         self.now_ns = 3_600 * 10**9

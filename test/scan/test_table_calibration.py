@@ -76,7 +76,7 @@ def test_exact_touches_give_the_table_exactly_through_ball_and_plate(xys, top_m)
 
 
 def test_what_no_touch_tells_stays_as_it_was_known():
-    """A table that is shifted in its plane and turned about its normal cannot be told from one that is not."""
+    """Touches are the same on a table that is shifted in its plane or turned about its normal."""
     true = moved(KNOWN, 1e-3, 0.01, 0.0)
     slid = Pose(
         true.position_m + true.rotation.apply([4e-3, -7e-3, 0.0]),
