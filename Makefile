@@ -12,8 +12,8 @@ help: ## Show this list
 demo: setup ## Run the demonstration on the simulated bench; ARGS go to `tactile_resonance demo`
 	@tools/run.sh tactile_resonance demo $(ARGS)
 
-test: setup ## Run all tests with coverage; ARGS go to pytest
-	@tools/run.sh python -m pytest --cov --cov-report=term:skip-covered $(ARGS)
+test: setup ## Run all tests; ARGS go to pytest (--cov: with coverage)
+	@tools/run.sh python -m pytest $(ARGS)
 
 load: setup ## Run the demonstration beside other work and on the wall clock; refuse where a result differs
 	@tools/run.sh tactile_resonance benchmark load $(ARGS)
