@@ -4,50 +4,24 @@
 from __future__ import annotations
 
 import math
-import threading
-import time
-import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
-from enum import Enum
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Point, Pose, PoseArray
-from rclpy.action.client import ClientGoalHandle
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
 from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import drop
-from tactile_resonance.nodes.running import RESULTS, STEADY
-
-TICK_S = 0.1
-ASK_AGAIN_S = 2.0
-"""An answer that has not come by then may be lost: it is asked for again."""
-SILENT_S = 5.0
-"""A scan that has told nothing for so long may have lost its node: its result is asked for again."""
-GONE_S = 10.0
-"""A node that nobody has seen for so long has gone."""
-
-
-class Ending(Enum):
-    """How a scan or a calibration ended; a run that was begun and is not complete can be resumed."""
-
-    COMPLETE = "complete"  # every point of the plan is finished, the table is found
-    ENDED = "ended"  # some are not
-    CANCELLED = "cancelled"  # on request
-    REJECTED = "rejected"  # the goal was not accepted
-    REFUSED = "refused"  # it was, and no point could be begun, or the touches determine no table
-    LOST = "lost"  # scan_node went away
+from tactile_resonance.nodes.goal_conduct import AskedGoal, Ending, GoalConduct
+from tactile_resonance.nodes.running import RESULTS
 
 
 @dataclass(frozen=True)
@@ -100,35 +74,16 @@ class CalibrationOutcome:
     file: str = ""
 
 
-_ENDINGS: dict[type, dict[int, Ending]] = {
-    ScanOutcome: {
-        Scan.Result.COMPLETE: Ending.COMPLETE,
-        Scan.Result.ENDED: Ending.ENDED,
-        Scan.Result.REFUSED: Ending.REFUSED,
-    },
-    CalibrationOutcome: {
-        CalibrateTable.Result.DONE: Ending.COMPLETE,
-        CalibrateTable.Result.FAILED: Ending.ENDED,
-        CalibrateTable.Result.REFUSED: Ending.REFUSED,
-    },
+_SCAN = {
+    Scan.Result.COMPLETE: Ending.COMPLETE,
+    Scan.Result.ENDED: Ending.ENDED,
+    Scan.Result.REFUSED: Ending.REFUSED,
 }
-
-
-@dataclass
-class _Asked:
-    """A goal that is under way."""
-
-    client: GoalClient
-    kind: type  # of its outcome
-    goal: Any
-    wait_s: float
-    on_feedback: Callable[[Any], None] | None
-    on_point: Callable[[PointResult], None] | None = None
-    future: Future = field(default_factory=Future)
-    handle: ClientGoalHandle | None = None
-    cancelled: bool = False
-    heard_s: float = 0.0
-    run_directory: str = ""  # as heard
+_CALIBRATION = {
+    CalibrateTable.Result.DONE: Ending.COMPLETE,
+    CalibrateTable.Result.FAILED: Ending.ENDED,
+    CalibrateTable.Result.REFUSED: Ending.REFUSED,
+}
 
 
 class TactileClient:
@@ -159,13 +114,7 @@ class TactileClient:
         self._points = node.create_subscription(
             PointResult, f"{prefix}point_result", self._on_point, RESULTS, callback_group=group
         )
-        self._begin = node.create_guard_condition(self._conduct, ReentrantCallbackGroup())
-        self._timer = node.create_timer(TICK_S, self._on_tick, callback_group=group, clock=STEADY)
-        self._timer.cancel()
-        self._tick = Future()
-        self._asked: _Asked | None = None
-        self._waiting: _Asked | None = None  # until it is begun, once
-        self._claim = threading.Lock()
+        self._conduct = GoalConduct(node, group, partial(self._call, "rejection"))
 
     def scan(
         self,
@@ -212,24 +161,23 @@ class TactileClient:
         ValueError
             If a value is not of the type or in the range of its field.
         """
-        try:
-            # unchecked, a value of a wrong type ends the process that sends it
-            header = Header(check_fields=True, frame_id=frame)
-            goal = Scan.Goal(
-                check_fields=True,
-                scene=str(scene),
-                poses=PoseArray(check_fields=True, header=header, poses=list(poses)),
-                force_n=float(force_n),
-                f0_std_hz=float(f0_std_hz),
-                damping_ratio_std=float(damping_ratio_std),
-                run_directory=str(run_directory),
-                resume=resume,
-                seed=seed,
-                notes=notes,
-            )
-        except AssertionError as error:
-            raise ValueError(f"scan: {error}") from error
-        return self._ask(_Asked(self._scans, ScanOutcome, goal, wait_s, on_feedback, on_point))
+        header = _checked(Header, frame_id=frame)
+        goal = _checked(
+            Scan.Goal,
+            scene=str(scene),
+            poses=_checked(PoseArray, header=header, poses=list(poses)),
+            force_n=float(force_n),
+            f0_std_hz=float(f0_std_hz),
+            damping_ratio_std=float(damping_ratio_std),
+            run_directory=str(run_directory),
+            resume=resume,
+            seed=seed,
+            notes=notes,
+        )
+        client, kind = self._scans, ScanOutcome
+        return self._conduct.begin(
+            AskedGoal(client, kind, _SCAN, goal, wait_s, on_feedback, on_point)
+        )
 
     def calibrate_table(
         self,
@@ -266,28 +214,23 @@ class TactileClient:
         RuntimeError, ValueError
             As `scan`.
         """
-        try:
-            goal = CalibrateTable.Goal(
-                check_fields=True,
-                points=list(points),
-                force_n=float(force_n),
-                search_m=float(search_m),
-                flatness_m=float(flatness_m),
-                most_tilt_rad=float(most_tilt_rad),
-                heading_rad=float(heading_rad),
-                sensor=sensor,
-                file=str(file),
-            )
-        except AssertionError as error:
-            raise ValueError(f"calibrate_table: {error}") from error
-        return self._ask(_Asked(self._calibrations, CalibrationOutcome, goal, wait_s, on_feedback))
+        goal = _checked(
+            CalibrateTable.Goal,
+            points=list(points),
+            force_n=float(force_n),
+            search_m=float(search_m),
+            flatness_m=float(flatness_m),
+            most_tilt_rad=float(most_tilt_rad),
+            heading_rad=float(heading_rad),
+            sensor=sensor,
+            file=str(file),
+        )
+        client, kind = self._calibrations, CalibrationOutcome
+        return self._conduct.begin(AskedGoal(client, kind, _CALIBRATION, goal, wait_s, on_feedback))
 
     def cancel(self) -> None:
         """End the scan or calibration after drawing the tip back; its future tells when that is done."""
-        if self._asked is not None:
-            self._asked.cancelled = True
-            if self._asked.handle is not None:
-                self._asked.handle.cancel_goal_async()
+        self._conduct.cancel()
 
     def pause(self) -> Future:
         """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`."""
@@ -307,23 +250,12 @@ class TactileClient:
 
     def destroy(self) -> None:
         """Take everything off the node again; a scan under way goes on, and is followed no longer."""
-        self._node.destroy_timer(self._timer)
-        self._node.destroy_guard_condition(self._begin)
+        self._conduct.destroy()
         self._node.destroy_subscription(self._points)
         for service in self._services.values():
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()
-
-    def _ask(self, asked: _Asked) -> Future:
-        if self._asked is not None:
-            raise RuntimeError(
-                "goal: one of this client is under way; cancel it or await its outcome"
-            )
-        self._asked = self._waiting = asked
-        self._timer.reset()
-        self._begin.trigger()
-        return asked.future
 
     # in the executor
 
@@ -336,122 +268,14 @@ class TactileClient:
         return answer
 
     def _on_point(self, message: PointResult) -> None:
-        asked = self._asked
+        asked = self._conduct.asked
         if asked is not None and asked.on_point is not None:
             asked.on_point(message)
 
-    def _on_tick(self) -> None:
-        tick, self._tick = self._tick, Future()
-        tick.set_result(None)
 
-    async def _until(self, holds: Callable[[], bool], within_s: float) -> bool:
-        """Let time pass until something holds, looked at with each tick; whether it does."""
-        deadline_s = time.monotonic() + within_s
-        while not holds():
-            if time.monotonic() > deadline_s:
-                return False
-            await self._tick
-        return True
-
-    async def _conduct(self) -> None:
-        """From the goal to the outcome; an executor of several threads may begin it more than once."""
-        with self._claim:
-            asked, self._waiting = self._waiting, None
-        if asked is None:
-            return
-        try:
-            ended = await self._send(asked)
-            outcome = await self._follow(asked) if ended is None else ended
-        finally:
-            self._timer.cancel()
-            self._asked = None
-        asked.future.set_result(outcome)
-
-    async def _send(self, asked: _Asked) -> Any:
-        """Send the goal until it is accepted, or return the outcome where it is not; None where it is.
-
-        A goal whose answer is late, or lost, is sent again under its id, and accepted once.
-        """
-        goal_id, answers = _new_id(), list[Future]()
-        waited_for = "no scan_node is there"
-        deadline_s = time.monotonic() + asked.wait_s
-        while not asked.cancelled and time.monotonic() < deadline_s:
-            if not asked.client.server_is_ready():
-                await self._tick
-                continue
-            hear = self._hear_for(asked)
-            answers.append(asked.client.send_goal_async(asked.goal, hear, goal_uuid=goal_id))
-            await self._until(partial(_any_done, answers), ASK_AGAIN_S)
-            handles = [answer.result() for answer in answers if answer.done()]
-            asked.handle = next((handle for handle in handles if handle.accepted), None)
-            # what was sent twice may be refused because it is known
-            if asked.handle is None and handles and len(answers) > 1:
-                result = handles[-1].get_result_async()
-                answered = await self._until(result.done, ASK_AGAIN_S)
-                if not answered or result.result().status != GoalStatus.STATUS_UNKNOWN:
-                    asked.handle = handles[-1]
-            if asked.handle is not None:
-                return None
-            if handles:
-                drop(answers)
-                why = self._call("rejection")
-                if await self._until(why.done, ASK_AGAIN_S) and why.result().success:
-                    return asked.kind(Ending.REJECTED, why.result().message)
-                waited_for = "scan_node is not active"
-                goal_id, answers = _new_id(), []
-                await self._tick
-        drop(answers)
-        ClientGoalHandle(asked.client, goal_id, None).cancel_goal_async()
-        if asked.cancelled:
-            return asked.kind(Ending.CANCELLED, "cancelled before it was accepted")
-        return asked.kind(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
-
-    async def _follow(self, asked: _Asked) -> Any:
-        """Outcome of a goal that was accepted."""
-        assert asked.handle is not None
-        results = list[Future]()
-        seen_s = time.monotonic()
-        while True:
-            if asked.cancelled:  # also before it was accepted, and again where that is lost
-                asked.handle.cancel_goal_async()
-            results.append(asked.handle.get_result_async())
-            asked.heard_s = time.monotonic()
-            while time.monotonic() - asked.heard_s < SILENT_S:
-                answer = next((r.result() for r in results if r.done()), None)
-                if answer is not None and answer.status != GoalStatus.STATUS_UNKNOWN:
-                    return _outcome(answer, asked.kind)
-                if asked.client.server_is_ready():
-                    seen_s = time.monotonic()
-                if answer is not None or time.monotonic() - seen_s > GONE_S:
-                    if asked.kind is CalibrationOutcome:
-                        return CalibrationOutcome(Ending.LOST, "scan_node went away")
-                    text = "scan_node went away; the run can be resumed"
-                    return ScanOutcome(Ending.LOST, text, asked.run_directory)
-                await self._tick
-
-    def _hear_for(self, asked: _Asked) -> Callable[[Any], None]:
-        def hear(message: Any) -> None:
-            asked.heard_s = time.monotonic()
-            if asked.kind is ScanOutcome:
-                asked.run_directory = message.feedback.run_directory
-            if asked.on_feedback is not None:
-                asked.on_feedback(message.feedback)
-
-        return hear
-
-
-def _any_done(futures: Sequence[Future]) -> bool:
-    return any(future.done() for future in futures)
-
-
-def _new_id() -> UUID:
-    return UUID(uuid=list(uuid.uuid4().bytes))
-
-
-def _outcome(answer: Any, kind: type) -> Any:
-    """Outcome of the answer to a goal's result."""
-    result, ending = answer.result, _ENDINGS[kind][answer.result.outcome]
-    if answer.status == GoalStatus.STATUS_CANCELED:
-        ending = Ending.CANCELLED
-    names = [f.name for f in fields(kind) if f.name != "ending"]
-    return kind(ending, **{name: getattr(result, name) for name in names})
+def _checked(kind: type, **values: Any) -> Any:
+    """Message with its fields checked: unchecked, a value of a wrong type ends the process that sends it."""
+    try:
+        return kind(check_fields=True, **values)
+    except AssertionError as error:
+        raise ValueError(f"goal: {error}") from error

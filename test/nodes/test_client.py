@@ -21,9 +21,8 @@ from rclpy.task import Future
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import PointResult
 
-from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
-from tactile_resonance.nodes import scan_node
+from tactile_resonance.nodes import goal_conduct, scan_node
 from tactile_resonance.nodes.frames import Found
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
@@ -131,7 +130,7 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
 def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
     """Unchecked, they end the executor, or the process."""
     field = "frame_id" if name == "frame" else name
-    with pytest.raises(ValueError, match=f"scan: The '{field}' field must be"):
+    with pytest.raises(ValueError, match=f"goal: The '{field}' field must be"):
         stack.client.scan(**{**GOAL, name: value})
     stack.activate()
     future = stack.begin([])  # another one is taken
@@ -142,18 +141,18 @@ def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
 def test_a_goal_is_sent_once_however_often_an_executor_begins(stack, monkeypatch):
     """One of several threads takes a guard condition that is still triggered."""
     stack.activate()
-    trigger, heard = stack.client._begin.trigger, []
+    trigger, heard = stack.client._conduct._begin.trigger, []
     monkeypatch.setattr(
-        stack.client, "_begin", SimpleNamespace(trigger=lambda: [trigger() for _ in range(9)])
+        stack.client._conduct, "_begin", SimpleNamespace(trigger=lambda: [trigger() for _ in range(9)])
     )
     begun = []
-    conduct = stack.client._send
+    conduct = stack.client._conduct._send
 
     def counted(asked):
         begun.append(asked)
         return conduct(asked)
 
-    monkeypatch.setattr(stack.client, "_send", counted)
+    monkeypatch.setattr(stack.client._conduct, "_send", counted)
     future = stack.begin(heard)
     for _ in range(9):
         trigger()
@@ -285,7 +284,7 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
 
 
 def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
-    monkeypatch.setattr(client_module, "GONE_S", 1.0)
+    monkeypatch.setattr(goal_conduct, "GONE_S", 1.0)
     stack.activate()
     heard = []
     future = stack.begin(heard, run_directory="named by the node")
