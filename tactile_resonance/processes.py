@@ -125,10 +125,10 @@ class NodeProcesses:
 
 
 def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
-    """ROS_DOMAIN_ID where it is set, else one whose first discovery port nobody uses.
+    """ROS_DOMAIN_ID where it is set, else one in which no participant is left, also none that is just ending.
 
     Ports follow the DDS interoperability wire protocol (OMG DDSI-RTPS 2.2, section 9.6.1.1): unicast
-    discovery of participant 0 listens on 7400 + 250 domain + 10.
+    discovery of participant n listens on 7400 + 250 domain + 10 + 2 n.
     """
     given = environment.get("ROS_DOMAIN_ID", "")
     if given:
@@ -138,13 +138,19 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
     first = os.getpid() % 100
     for step in range(100):
         domain = 1 + (first + step) % 100  # 1..100: portable, below the ephemeral ports
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("127.0.0.1", 7410 + 250 * domain))
-            except OSError:
-                continue
-        return domain
+        ports = range(7410 + 250 * domain, 7400 + 250 * (domain + 1), 2)
+        if all(map(_port_is_free, ports)):
+            return domain
     raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
+
+
+def _port_is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
 
 
 def may_take_priority(priority: int) -> bool:

@@ -3,6 +3,8 @@
 
 import os
 import threading
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,14 +13,19 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.executors import SingleThreadedExecutor
 
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.hands import PointDisturbed, PointFailed
+from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.scene import Hold, ScanScene
 from test.spinning import spin_until
 
 PLACE_M = (0.004, -0.003, 0.0)
@@ -33,8 +40,9 @@ class Scanning(ManagedNode):
         self.hands = NodeHands(self, "base", False, scan_time, lambda _: None)
 
 
-def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place():
-    # names of its own: any other subscriber of tcp_pose would be taken for the bench
+@pytest.fixture
+def alone():
+    """Nodes under names of their own: any other subscriber of tcp_pose would be taken for the bench."""
     own = ["--ros-args", "-r", f"__ns:=/hands_{os.getpid()}"]
     with initialised(args=own, domain_id=free_domain_id(os.environ)):
         executor = SingleThreadedExecutor()
@@ -48,18 +56,46 @@ def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place():
             return nodes[-1]
 
         try:
-            hands = start(Scanning).hands
-            point = ScanPoint(0, PLACE_M, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
-            touch = threading.Thread(target=hands.touch, args=(point, 0.01, Hold.FORCE, lambda: None))
-            with hands.listening():
-                touch.start()
-                assert not spin_until(executor, lambda: not touch.is_alive(), 0.5)
-                bench = start(FakeHardwareNode)
-                assert spin_until(executor, lambda: not touch.is_alive())
-            touch.join()
-            spin_until(executor, lambda: bench._stays.newest.pose.pose.position.x != 0.0, 1.0)
-            taken = bench._stays.newest.pose.pose.position
-            assert (taken.x, taken.y, taken.z) == PLACE_M
+            yield SimpleNamespace(start=start, executor=executor)
         finally:
             for node in nodes:
                 node.destroy_node()
+
+
+def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place(alone):
+    hands = alone.start(Scanning).hands
+    point = ScanPoint(0, PLACE_M, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
+    touch = threading.Thread(target=hands.touch, args=(point, 0.01, Hold.FORCE, lambda: None))
+    with hands.listening():
+        touch.start()
+        assert not spin_until(alone.executor, lambda: not touch.is_alive(), 0.5)
+        bench = alone.start(FakeHardwareNode)
+        assert spin_until(alone.executor, lambda: not touch.is_alive())
+    touch.join()
+    spin_until(alone.executor, lambda: bench._stays.newest.pose.pose.position.x != 0.0, 1.0)
+    taken = bench._stays.newest.pose.pose.position
+    assert (taken.x, taken.y, taken.z) == PLACE_M
+
+
+def test_a_measurement_at_an_unknown_place_is_disturbed_one_without_poles_has_failed(
+    alone, monkeypatch
+):
+    hands = alone.start(Scanning).hands
+    design = design_measurement(ScanScene("a", 0.01, (PLACE_M,)))
+    came = []
+    monkeypatch.setattr(hands, "_record", lambda goal, enough, check: came)
+
+    def measure():
+        recording = SimpleNamespace()
+        return hands.measure(design, "", 1, lambda poles, blocks: True, recording, lambda: None)
+
+    with hands.listening():
+        with pytest.raises(PointFailed, match="ended before its first block"):
+            measure()
+        nowhere = Origin()
+        came.append(poles_to_message(Poles(), nowhere))
+        with pytest.raises(PointDisturbed, match="place of the tip is unknown"):
+            measure()
+        there = replace(nowhere, contact=Contact(position_m=PLACE_M, frame_id="base"))
+        came.append(poles_to_message(Poles(), there))
+        assert measure().origin.contact.position_m == PLACE_M

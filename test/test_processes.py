@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which domain nodes are started in."""
+
+import socket
+
+import pytest
+
+from tactile_resonance.processes import free_domain_id
+
+
+@pytest.mark.parametrize("participant", [0, 3, 119])
+def test_a_domain_with_a_participant_left_is_not_chosen(participant):
+    """Nodes of a run before may be ending; the first of them need not be the last."""
+    chosen = free_domain_id({})
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as left:
+        left.bind(("127.0.0.1", 7410 + 250 * chosen + 2 * participant))
+        assert free_domain_id({}) != chosen
+    assert free_domain_id({}) == chosen
+
+
+def test_a_domain_that_is_given_is_taken():
+    assert free_domain_id({"ROS_DOMAIN_ID": "7"}) == 7
+    with pytest.raises(ValueError, match="ROS_DOMAIN_ID: '233', expected a number from 0 to 232"):
+        free_domain_id({"ROS_DOMAIN_ID": "233"})
