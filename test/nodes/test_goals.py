@@ -17,7 +17,8 @@ from rclpy.task import Future
 from tactile_resonance.action import Scan
 
 from tactile_resonance import client as client_module
-from tactile_resonance.client import SILENT_S, TICK_S, Ending, TactileClient
+from tactile_resonance.client import Ending, TactileClient
+from tactile_resonance.nodes import goal_conduct
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
 from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
@@ -267,18 +268,18 @@ def scan(monkeypatch):
     def make(answers=None):
         node = Node(answers or {})
         node.result_of = lambda _: Scan.Result(outcome=Scan.Result.COMPLETE)
-        monkeypatch.setattr(client_module, "time", node)
+        monkeypatch.setattr(goal_conduct, "time", node)
         monkeypatch.setattr(client_module, "GoalClient", lambda *_, **__: node)
         client = TactileClient(MagicMock())
-        future, conducted = client.scan(scene="x.yaml"), client._conduct()
+        future, conducted = client.scan(scene="x.yaml"), client._conduct._conduct()
 
         def go_on(seconds):
             until_s = node.now_s + seconds
             while not future.done() and node.now_s < until_s:
                 with contextlib.suppress(StopIteration):
                     conducted.send(None)
-                node.pause(TICK_S)
-                client._on_tick()
+                node.pause(goal_conduct.TICK_S)
+                client._conduct._on_tick()
 
         return node, client, future, go_on
 
@@ -319,7 +320,7 @@ def test_a_scan_whose_node_was_started_anew_is_lost(scan):
     go_on(60.0)
     assert not future.done()
     node.results.clear()
-    go_on(SILENT_S + 1.0)
+    go_on(goal_conduct.SILENT_S + 1.0)
     assert future.result().ending is Ending.LOST
 
 
