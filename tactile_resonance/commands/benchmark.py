@@ -10,7 +10,7 @@ from pathlib import Path
 
 NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot", "twist", "cell"),
-    *("recording", "pipeline", "live", "load"),
+    *("recording", "pipeline", "live", "load", "truth"),
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""

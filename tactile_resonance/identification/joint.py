@@ -10,6 +10,8 @@ sections 6.3.2 and 9.12). The bins between harmonics bring the level of the nois
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
@@ -151,7 +153,7 @@ def result_of(
         known = np.isfinite(fit.total)
         evidence = evidence.with_model_error(np.where(known, fit.total, fit.covariance))
     result = assemble(evidence, layout.structure, layout.band_hz, shape, method)
-    if evidence.suspect.any():
+    if fit.systematic.any():
         total = result.total_covariance
         total += fit.systematic.reshape(total.shape)
-    return result
+    return replace(result, remark=fit.remark.reshape(shape))

@@ -61,6 +61,8 @@ class JointFit:
     systematic : (batch, places, 2, 2) float
         What a model error moves (f0_hz, damping_ratio) by, as an outer product; 0 where there is no
         suspicion.
+    remark : (batch,) object
+        What else is to be told to people; empty: nothing.
     """
 
     theta: FloatArray
@@ -76,6 +78,7 @@ class JointFit:
     kind: npt.NDArray[np.str_]
     residual: ComplexArray
     systematic: FloatArray
+    remark: npt.NDArray[np.object_]
 
     def rows(self, which: npt.NDArray[np.int64]) -> JointFit:
         """Some of the points."""
@@ -214,6 +217,7 @@ def _fit(
         kind=kind,
         residual=residual,
         systematic=systematic,
+        remark=np.full(batch, "", object),
     )
 
 

@@ -28,8 +28,9 @@ class RealisationsPlan(JointPlan):
     """Poles from several records of one kind each; parameters are those of `JointLayout`.
 
     Of one period each there are no bins between harmonics: realisations then tell noise and
-    distortion together, and `covariance` and `total_covariance` both hold both. Input noise counts
-    as none, or as `input_noise_ratio` of that of the output where given.
+    distortion together, and `covariance` holds both. Input noise counts as none, or as
+    `input_noise_ratio` of that of the output where given. `total_covariance` holds also what the
+    poles of the realisations scatter by, see `realisations_spread`.
 
     Harmonics of the period that are not excited carry distortion and are not used. A single
     realisation cannot tell any of this, and is left to `JointPlan`.

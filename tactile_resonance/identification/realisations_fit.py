@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
 
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_fit import ROUNDED, JointFit, mean_power
@@ -21,6 +20,7 @@ from tactile_resonance.identification.joint_noise import JointNoise, NoiseBands
 from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
 from tactile_resonance.identification.noise_level import KINDS, are_flat
 from tactile_resonance.identification.realisations_level import Levels
+from tactile_resonance.identification.realisations_spread import Spread
 from tactile_resonance.identification.scatter import Pieces, smooth_variance
 from tactile_resonance.identification.shared_points import (
     SharedPoints,
@@ -30,7 +30,7 @@ from tactile_resonance.identification.shared_points import (
     start_shared,
 )
 from tactile_resonance.identification.solver import Solution
-from tactile_resonance.identification.whiteness import SMOOTH_RESIDUAL, are_smooth, whiteness
+from tactile_resonance.identification.whiteness import are_smooth
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -105,16 +105,16 @@ def fit_realisations(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> J
     levels = _levels(layout, first, pieces)
     changed = _weighted_wrongly(layout, first, levels, pieces)
     if not changed.any():
-        return _judged(layout, first, levels, usable)
+        return _judged(layout, first, first, pieces, usable)
     rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
-    second = first.rows(rows)
+    second = before = first.rows(rows)
     for _ in range(REWEIGHTINGS):
         second = _from_scatter(layout, second, pieces)
-    fit = _judged(layout, second, _levels(layout, second, pieces), usable[rows])
+    fit = _judged(layout, second, before, pieces, usable[rows])
     if not rest.size:
         return fit
     part = first.rows(rest)
-    others = _judged(layout, part, _levels(layout, part, pieces), usable[rest])
+    others = _judged(layout, part, part, pieces, usable[rest])
     order = np.argsort(np.concatenate([rows, rest]))
     return JointFit.joined([fit, others]).rows(order)
 
@@ -174,7 +174,7 @@ def _weighted_wrongly(
 
     By more than chance, on the whole or from line to line.
     """
-    changed = levels.distorted
+    changed = levels.distorted()
     if pieces.starts.size > 1:
         changed = changed | ~are_flat(pieces.means(levels.line_variance), pieces.dof)
     if layout.other_bins.size == 0 and layout.input_noise_ratio is None:
@@ -241,29 +241,30 @@ def _from_scatter(layout: JointLayout, fitted: _Round, pieces: Pieces) -> _Round
     return _Round(fitted.plain, fitted.u_others, data, solution, noise, kind, share)
 
 
-def _judged(layout: JointLayout, fitted: _Round, levels: Levels, usable: BoolArray) -> JointFit:
+def _judged(
+    layout: JointLayout, fitted: _Round, first: _Round, pieces: Pieces, usable: BoolArray
+) -> JointFit:
+    """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
     solution, data = fitted.solution, fitted.data
     excited = data[-1]
     batch, records, _ = solution.theta.shape
     a, b, _ = layout.problem.sizes
+    levels = _levels(layout, fitted, pieces)
     common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
-    drifting = _differ_smoothly(levels.scatter.turned, layout.structure.parameters)
-    suspect = are_smooth(common, layout.structure.parameters) | drifting
+    suspect = are_smooth(common, layout.structure.parameters)
     if suspect.any():  # what rounding leaves of exact data says nothing
         floor = ROUNDED * mean_power(excited.y).reshape(batch, records).mean(axis=1)
         variance = levels.excited[:, None] * _residual_variance(layout, fitted)
         suspect &= variance.min(axis=-1) > floor
     suspect |= levels.cost > levels.limit
-    covariance, total = levels.covariances(
-        suspect, None if fitted.share is None or len(data) == 1 else _noise_normal(layout, fitted)
-    )
+    covariance, total = _covariances(layout, fitted, levels, suspect)
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     if suspect.any():
         rows = np.flatnonzero(suspect)
         part = [values.rows(rows_of(rows, records)) for values in data]
         systematic[rows] = systematic_of(layout, part, solution.theta[rows])
     theta = solution.theta
-    return JointFit(
+    fit = JointFit(
         theta=np.concatenate(
             [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, -1)], axis=1
         ),
@@ -279,25 +280,81 @@ def _judged(layout: JointLayout, fitted: _Round, levels: Levels, usable: BoolArr
         kind=np.array(KINDS)[fitted.kind],
         residual=common,
         systematic=systematic,
+        remark=np.full(batch, "", object),
     )
+    return _each_by_itself(layout, fit, first, pieces)
 
 
-def _differ_smoothly(differing: ComplexArray, parameters: int) -> BoolArray:
-    """(batch,) whether a realisation (batch, M, K) departs from the others as another system would.
+def _each_by_itself(layout: JointLayout, fit: JointFit, first: _Round, pieces: Pieces) -> JointFit:
+    """With the scatter of the poles of each realisation in the total covariance.
 
-    Noise and distortion are independent from line to line. The chance of one in a thousand is
-    shared by the realisations.
+    Where lines are distorted the resonator is not linear. Then its poles are the mean of those of all
+    realisations, of the first round, weighted with the noise. Weighted with the distortion of each line
+    a resonance that differs would count least, and the bins between harmonics most, where the ringing up
+    of a resonator that is not linear tells of another system.
     """
-    limit = -special.ndtri(special.ndtr(-SMOOTH_RESIDUAL) / differing.shape[1])
-    return np.asarray((whiteness(differing, parameters) > limit).any(axis=1))
+    theta = first.solution.theta
+    records = theta.shape[1]
+    levels = _levels(layout, first, pieces)
+    # gradients as independent lines make them, each with the variance that it shows itself
+    line = levels.line_variance.repeat(records, axis=0)
+    inner = _normal_of_excited(layout, first, line)
+    if len(first.data) > 1:
+        inner = inner + levels.between[:, None, None, None] * first.solution.normal[:, :, 0]
+    points = SharedPoints(layout.problem, first.data, records)
+    spread = Spread.of(layout, points, theta, inner, levels.excited_dof)
+    distorted = levels.distorted() & spread.known
+    weight = np.where(distorted, 1.0, spread.weight)
+    of_first = _covariances(layout, first, levels, np.zeros(weight.size, bool))
+    covariance, total = (
+        np.where(distorted[:, None, None], one, other)
+        for one, other in zip(of_first, (fit.covariance, fit.total), strict=True)
+    )
+    changed, systematic = fit.theta.copy(), fit.systematic.copy()
+    shared = total.shape[1]
+    changed[distorted, :shared] = (theta[:, 0, :shared] + spread.step)[distorted]
+    more = spread.variance_of_mean(distorted) - spread.of_poles(total)
+    for k in (0, 1):
+        systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
+    odd, remark = spread.remarks()
+    differing = replace(
+        fit,
+        theta=changed,
+        covariance=covariance,
+        total=total,
+        suspect=fit.suspect | odd,
+        systematic=systematic,
+        remark=remark,
+    )
+    rows = weight > 0
+    return fit.replaced(rows, differing.rows(np.flatnonzero(rows)))
+
+
+def _covariances(
+    layout: JointLayout, fitted: _Round, levels: Levels, suspect: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
+    noise_alone = fitted.share is None or len(fitted.data) == 1
+    return levels.covariances(suspect, None if noise_alone else _noise_normal(layout, fitted))
 
 
 def _noise_normal(layout: JointLayout, fitted: _Round) -> FloatArray:
     """(batch, M, n, n) covariance of the gradient on excited lines from their noise alone."""
     assert fitted.share is not None
+    return _normal_of_excited(layout, fitted, fitted.share)
+
+
+def _normal_of_excited(layout: JointLayout, fitted: _Round, part: FloatArray) -> FloatArray:
+    """(batch, M, n, n) covariance of the gradient on excited lines.
+
+    Parameters
+    ----------
+    part : (batch M, K_e) float
+        Their variance, of that weighted with.
+    """
     records = fitted.solution.theta.shape[1]
     variance = _residual_variance(layout, fitted).repeat(records, axis=0)
     excited = fitted.data[-1]
-    changed = BinData(excited.y, excited.u, variance / fitted.share)
+    changed = BinData(excited.y, excited.u, variance / part)
     points = SharedPoints(layout.problem, [*fitted.data[:-1], changed], records)
     return points.normals(points.weight(points.evaluate(fitted.solution.theta)))[1][:, :, -1]

@@ -139,10 +139,9 @@ class Levels:
             np.where(by_piece, float(pieces.dof), 0.0),
         )
 
-    @property
-    def distorted(self) -> BoolArray:
+    def distorted(self, chance: float = DISTORTION_PROBABILITY) -> BoolArray:
         """(batch,) whether realisations differ by more than the noise between harmonics explains."""
-        limit = f_quantile(1 - DISTORTION_PROBABILITY, 2 * self.excited_dof, 2 * self.between_dof)
+        limit = f_quantile(1 - chance, 2 * self.excited_dof, 2 * self.between_dof)
         return np.asarray(self.excited > limit * self.between)
 
     def _residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -165,7 +164,7 @@ class Levels:
             return level, dof
         both = self.between_dof + dof
         pooled = (self.between * self.between_dof + level * dof) / both
-        apart = self.distorted
+        apart = self.distorted()
         return np.where(apart, self.between, pooled), np.where(apart, self.between_dof, both)
 
     def covariances(

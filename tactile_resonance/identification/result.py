@@ -143,6 +143,8 @@ class PolesBatch:
     band_hz : (float, float)
     variance_model : (...) str array
     method : str
+    remark : (...) object array of str, optional
+        What else is to be told to people of a point; empty: nothing.
     """
 
     poles_rad_s: ComplexArray
@@ -166,6 +168,7 @@ class PolesBatch:
     band_hz: tuple[float, float]
     variance_model: npt.NDArray[np.str_]
     method: str
+    remark: npt.NDArray[np.object_] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:

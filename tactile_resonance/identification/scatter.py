@@ -40,13 +40,10 @@ class Scatter:
         Turned by the phase of the input; of the variance of one residual. 0 on lines without input.
     differing : (batch, M, K) complex
         The rest, M - 1 degrees of freedom a line.
-    turned : (batch, M, K) complex
-        The rest turned by the phase of the input: smooth where a realisation saw another system.
     """
 
     common: ComplexArray
     differing: ComplexArray
-    turned: ComplexArray
 
     @classmethod
     def of(cls, residual: ComplexArray, u: ComplexArray) -> Scatter:
@@ -55,10 +52,7 @@ class Scatter:
         with np.errstate(divide="ignore", invalid="ignore"):
             direction = np.where(size > 0, u / size, 0.0)
         common = np.einsum("bmk,bmk->bk", direction.conj(), residual)
-        differing = residual - direction * common[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            phase = np.where(direction != 0, direction.conj() / np.abs(direction), 0.0)
-        return cls(common, differing, differing * phase)
+        return cls(common, residual - direction * common[:, None])
 
     @property
     def common_cost(self) -> FloatArray:

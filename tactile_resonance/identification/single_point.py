@@ -62,7 +62,8 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         values = array[index][there]
         return values if values.size and np.isfinite(values).all() else None
 
-    message = "; ".join(filter(None, [_sentence(batch, index, status), *notes]))
+    remark = "" if batch.remark is None else str(batch.remark[index])
+    message = "; ".join(filter(None, [_sentence(batch, index, status), remark, *notes]))
     return Poles(
         poles_rad_s=poles,
         f0_hz=batch.f0_hz[index][there],
@@ -138,4 +139,4 @@ def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
             f"residuals smooth over the lines (whiteness {batch.whiteness[index]:.1f} where "
             f"noise makes {SMOOTH_RESIDUAL} at most)"
         )
-    return ", ".join(found) or "realisations differ smoothly over the lines, as systems would"
+    return ", ".join(found) or "realisations contradict each other"
