@@ -84,7 +84,7 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
         candidate = _above_a_step(level_db, gap_db)
     if not np.any(candidate):
         raise ValueError(
-            "u: no line stands above the noise, expected a multisine; give excited_harmonics"
+            "u: no line stands above the noise, expected a multisine; give the excited harmonics"
         )
     odd = harmonics % 2 == 1
     # an odd grid is looked for first, so that hum on an even line cannot pass for excitation
