@@ -19,7 +19,7 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.identification.band import strongest_resonance_band
-from tactile_resonance.identification.estimator import POLES_METHODS
+from tactile_resonance.identification.estimator import POLES_METHODS, second_attempt
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -169,7 +169,7 @@ def _poles(
         raise ValueError("method: joint takes no channel delay, use frf")
     if method == "frf":
         return identify_poles(frf, band_hz, structure)
-    return identify_poles_from_records(
+    poles = identify_poles_from_records(
         recording.u,
         recording.y,
         sample_rate_hz=recording.sample_rate_hz,
@@ -177,6 +177,7 @@ def _poles(
         band_hz=band_hz,
         structure=structure,
     )
+    return second_attempt(poles, frf, band_hz, structure)
 
 
 def analysis_as_json(analysis: Analysis) -> str:

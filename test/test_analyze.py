@@ -311,3 +311,35 @@ def test_noise_is_not_taken_for_a_resonance(tmp_path, capsys, method, through):
         found = json.loads(out.read_text())
         assert found["status"] in ("no resonance", "not converged"), (seed, found["poles"])
         assert all(pole["covariance"] is None for pole in found["poles"])
+
+
+def test_excited_harmonics_may_be_given(tmp_path):
+    """A disturbance as strong as the lines hides some from the finder; the file's own lose."""
+    content = record(noise=1e-4)
+    path = tmp_path / "record.npz"
+    np.savez(path, **content, excited_harmonics=np.arange(40, 161, 3))
+    answer = run(path, "--band", 200, 300, "--harmonics", "40,41:160")
+    assert answer.returncode == 0, answer.stderr
+    assert "FRF: 121 lines, 100-400 Hz" in answer.stdout
+    answer = run(path, "--band", 200, 300, "--harmonics", "41:160:2")
+    assert "FRF: 60 lines, 102.5-397.5 Hz" in answer.stdout
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("5:3", "expected H or FIRST:LAST"),
+        ("0:3", "1 <= FIRST"),
+        ("1:9:0", "STEP >= 1"),
+        ("1:2:3:4", "FIRST:LAST:STEP"),
+        ("7,", "expected H"),
+        ("3.5", "expected H"),
+        ("1:999999999999", "LAST <= 10000000"),
+        ("1:1000", "expected whole numbers from 1 to 999"),
+    ],
+)
+def test_wrong_harmonics_are_refused(good, given, reason):
+    answer = run(good, "--harmonics", given)
+    assert answer.returncode != 0
+    assert reason in answer.stderr
+    assert "Traceback" not in answer.stderr

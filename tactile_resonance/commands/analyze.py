@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from tactile_resonance.analysis import (
     POLES_METHODS,
@@ -23,6 +24,8 @@ from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store_recording import read_store_recording, recording_of
+
+MOST_HARMONICS = 10**7
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -55,6 +58,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         type=parse_segments,
         metavar="START:STOP,...",
         help="cut realisations out of a longer recording (samples, stop excluded)",
+    )
+    parser.add_argument(
+        "--harmonics",
+        type=parse_harmonics,
+        metavar="H,FIRST:LAST:STEP,...",
+        help="excited multiples of the sample rate over the samples per period, LAST included; "
+        "default: the file's, else found from the spectrum of u",
     )
     parser.add_argument(
         "--band",
@@ -130,13 +140,31 @@ def parse_segments(text: str) -> list[tuple[int, int]]:
         ) from None
 
 
+def parse_harmonics(text: str) -> npt.NDArray[np.int64]:
+    """'3,10:20:5' as [3, 10, 15, 20]."""
+    found: set[int] = set()
+    try:
+        for part in text.split(","):
+            first, *rest = (int(number) for number in part.split(":"))
+            last, step = (rest + [first, 1][len(rest) :])[:2]
+            if len(rest) > 2 or not (1 <= first <= last <= MOST_HARMONICS and step >= 1):
+                raise ValueError
+            found.update(range(first, last + 1, step))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}, expected H or FIRST:LAST or FIRST:LAST:STEP, several with commas between, "
+            f"1 <= FIRST <= LAST <= {MOST_HARMONICS} and STEP >= 1"
+        ) from None
+    return np.array(sorted(found), np.int64)
+
+
 def run(options: argparse.Namespace) -> int:
     """Read, analyse, then write: nothing is written unless all went well."""
     _check_outputs(options)
     if options.periods is not None and options.periods < 1:
         raise ValueError(f"periods: {options.periods}, expected at least 1")
     if options.record.is_dir():
-        for name in ("sample_rate", "samples_per_period", "segments"):
+        for name in ("sample_rate", "samples_per_period", "segments", "harmonics"):
             if getattr(options, name) is not None:
                 raise ValueError(f"{name}: not for a folder of records, which say it themselves")
         recording = _read_folder(options)
@@ -151,6 +179,7 @@ def run(options: argparse.Namespace) -> int:
             samples_per_period=options.samples_per_period,
             periods=options.periods,
             segments=options.segments,
+            excited_harmonics=options.harmonics,
         )
     structure = ModelStructure.with_residual(options.order)
     if options.numerator_order is not None:

@@ -52,10 +52,15 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     Notes
     -----
     For P >= 2 the noise level is that of the bins between harmonics, taken locally (coloured
-    noise). For P = 1 there are none: the noise level is that of the weaker half of the lines. Where
+    noise); F-tests admit a false line in one of ten thousand records. Over 9336 records of 2 to 8
+    periods in thirteen noises, white to the fourth power of 1/f and narrow resonances, at -20 and 0 dB
+    of the multisine, 9 had one: the first harmonic of two periods, where the noise falls steeply, but
+    for one at a resonance. Lines less than some 14 dB above the noise on a bin are missed.
+
+    For P = 1 there are no such bins: the noise level is that of the weaker half of the lines. Where
     more than half are excited nothing stands above that; then a step of `gap_db` must part them from
     at least four lines of noise, which noise alone does in less than one record of a hundred
-    thousand.
+    thousand. Coloured noise above the level of the lines cannot be told from excitation then.
     """
     u = np.asarray(u)
     if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:
@@ -84,7 +89,7 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
         candidate = _above_a_step(level_db, gap_db)
     if not np.any(candidate):
         raise ValueError(
-            "u: no line stands above the noise, expected a multisine; give excited_harmonics"
+            "u: no line stands above the noise, expected a multisine; give the excited harmonics"
         )
     odd = harmonics % 2 == 1
     # an odd grid is looked for first, so that hum on an even line cannot pass for excitation

@@ -57,7 +57,32 @@ def poles_of_frf(
             poles = replace(poles, message=message)
         return poles
     notes = [frf.message] if frf.status is not FrfStatus.OK else []
-    return identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
+    poles = identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
+    return second_attempt(poles, frf, band_hz, structure)
+
+
+def second_attempt(
+    poles: Poles, frf: FRF, band_hz: tuple[float, float], structure: ModelStructure
+) -> Poles:
+    """Poles from the FRF where the joint fit of the same record did not converge, and says so.
+
+    Parameters
+    ----------
+    poles : Poles
+        From a joint fit; returned as they are unless it did not converge.
+    frf : FRF
+        With (F,) arrays.
+    band_hz : (low, high)
+    structure : ModelStructure
+    """
+    if poles.status is not PolesStatus.NOT_CONVERGED:
+        return poles
+    again = identify_poles(frf, band_hz, structure)
+    if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
+        also = f"from the FRF: {again.status.value}"
+        return replace(poles, message="; ".join(filter(None, [poles.message, also])))
+    note = "from the FRF: the joint fit did not converge"
+    return replace(again, message="; ".join(filter(None, [again.message, note])))
 
 
 def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:

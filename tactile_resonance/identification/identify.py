@@ -31,10 +31,9 @@ from tactile_resonance.identification.result import (
 )
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.transient_left import with_transient_judged
 from tactile_resonance.identification.whiteness import are_smooth
 
-# Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
-FEWEST_BINS = 16
 # Mean square of the residuals over that of the data, below which they are rounding.
 ROUNDED = 1e-22
 
@@ -56,7 +55,8 @@ def identify_poles(
     Returns
     -------
     Poles
-        Always; the status says what it is worth.
+        Always; the status says what it is worth, also where the FRF still holds a transient, see
+        `transient_left.with_transient_judged`.
 
     Notes
     -----
@@ -78,24 +78,7 @@ def identify_poles(
         notes.append(f"{left_out} lines without a finite response, or a variance above 0, left out")
     if frf.status is not FrfStatus.OK or frf.variance_noise is None:
         notes.append(frf.message)
-    poles = single(batch, notes=notes)
-    message = "; ".join(filter(None, [poles.message, _light_damping(frf, poles)]))
-    return replace(poles, message=message)
-
-
-def _light_damping(frf: FRF, poles: Poles) -> str:
-    """Where the transient of a mode is too narrow for the local polynomials that removed it."""
-    if "local polynomial" not in frf.method or frf.periods < 2 or frf.frequency_hz.size < 2:
-        return ""
-    bin_hz = float(np.diff(frf.frequency_hz).min()) / frf.periods
-    half_width = np.abs(poles.damping_ratio) * poles.f0_hz / bin_hz
-    if not np.any(half_width < FEWEST_BINS):
-        return ""
-    return (
-        f"half the width of the mode is {half_width.min():.1f} bins, less than {FEWEST_BINS}: "
-        "unless the record began settled, what the local polynomial method leaves of the transient "
-        "biases the poles"
-    )
+    return with_transient_judged(frf, single(batch, notes=notes))
 
 
 @np.errstate(all="ignore")  # what exceeds double precision shows in the status

@@ -280,7 +280,8 @@ def _level_from_others(
 
 def student_variance(dof):
     """Variance of Student's distribution for a level of `dof` complex degrees of freedom."""
-    return np.where(dof > 1, dof / (dof - 1), np.nan)
+    dof = np.asarray(dof, float)  # Python's own floats raise where the division is by 0
+    return np.divide(dof, dof - 1, out=np.full(dof.shape, np.nan), where=dof > 1)
 
 
 def mean_power(values: ComplexArray) -> FloatArray:

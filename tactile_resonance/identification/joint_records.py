@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.identification.disturbed_input import poles_of_bins
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_layout import whole_harmonics
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
 
 IntArray = npt.NDArray[np.int64]
@@ -43,7 +43,8 @@ def identify_poles_from_records(
     Returns
     -------
     Poles
-        Always with a status; raised is only what `JointPlan` raises.
+        Always with a status; raised is only what `JointPlan` raises. See
+        `disturbed_input.poles_of_bins` for inputs that a disturbance moves between harmonics.
     """
     if np.ndim(u) not in (2, 3):
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
@@ -58,7 +59,7 @@ def identify_poles_from_records(
         structure or ModelStructure(),
         input_noise_ratio=input_noise_ratio,
     )
-    return single(plan(u, y))
+    return poles_of_bins(plan, plan.transform(u, "u"), plan.transform(y, "y"))
 
 
 def identify_poles_from_bins(
@@ -107,7 +108,7 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return single(plan.from_bins(u, y), notes=notes)
+    return poles_of_bins(plan, u, y, notes)
 
 
 @lru_cache(maxsize=32)

@@ -121,8 +121,14 @@ def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
             "the variance of each line has too few degrees of freedom to tell the uncertainty: "
             "record more periods or realisations"
         )
-    return "the variance is not known independently of the fit: a model error would not show" + (
-        " unless it is smooth" if _has_total(batch, index) else ""
+    if not _has_total(batch, index):
+        return (
+            "the fit leaves too few degrees of freedom to tell the noise: take a wider band, more "
+            "periods or a smaller order"
+        )
+    return (
+        "the variance is not known independently of the fit: a model error would not show unless it "
+        "is smooth"
     )
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -72,6 +73,19 @@ class Health:
         self._node.get_logger().error(text)
         self._error = text
         self._error_s = time.monotonic()
+
+    def failed(self, what: str, error: Exception) -> str:
+        """Report what `what` ended with; the reason, for whoever waits for an answer.
+
+        Of a `ValueError` its message; of any other exception, a defect, also the type, and the
+        traceback goes to the log.
+        """
+        reason = str(error)
+        if not isinstance(error, ValueError):
+            reason = f"{type(error).__name__}: {error}"
+            self._node.get_logger().error("".join(traceback.format_exception(error)))
+        self.error(f"{what}: {reason}")
+        return reason
 
     def _publish(self) -> None:
         now_s = time.monotonic()

@@ -80,10 +80,10 @@ class FrfNode(ManagedNode):
         """Publish an FRF, or why there is none: a reader waits for an answer to every record."""
         try:
             self._estimate(record)
-        except ValueError as error:
-            self.health.error(f"record of excitation {record.origin.excitation_id}: {error}")
+        except Exception as error:
+            reason = self.health.failed(f"record of excitation {record.origin.excitation_id}", error)
             nothing = FRF(
-                np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=str(error)
+                np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=reason
             )
             self._publisher.publish(frf_to_message(nothing, record.origin, float("nan"), False))
 

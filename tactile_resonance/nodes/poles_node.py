@@ -55,13 +55,12 @@ class PolesNode(ManagedNode):
         try:
             frf, _ = frf_from_message(message)
             poles = self._identify(frf)
-        except ValueError as error:
-            self.health.error(f"FRF of measurement {origin.measurement_id}: {error}")
-            poles = Poles(status=PolesStatus.FAILED, message=str(error))
+        except Exception as error:  # a reader waits for an answer to every FRF
+            reason = self.health.failed(f"FRF of measurement {origin.measurement_id}", error)
+            poles = Poles(status=PolesStatus.FAILED, message=reason)
         self._publisher.publish(poles_to_message(poles, origin))
 
     def _identify(self, frf: FRF) -> Poles:
-        """Poles, or the reason why there are none: a reader waits for an answer to every FRF."""
         low_hz, high_hz, order, terms, method = values(
             self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import scipy.io
 
 from tactile_resonance.recording.recording import Recording, make_recording
@@ -24,6 +25,7 @@ def read_recording(
     samples_per_period: int | None = None,
     periods: int | None = None,
     segments: Sequence[tuple[int, int]] | None = None,
+    excited_harmonics: npt.ArrayLike | None = None,
 ) -> Recording:
     """Read both channels and what belongs to them.
 
@@ -35,7 +37,7 @@ def read_recording(
         its columns, among them `u`, `y` and optionally ``time_s``.
     u, y : str
         Names of the actuator and sensor field.
-    sample_rate_hz, samples_per_period
+    sample_rate_hz, samples_per_period, excited_harmonics
         Win over what the file says.
     periods, segments
         See `make_recording`.
@@ -60,6 +62,8 @@ def read_recording(
         if value % 1:
             raise ValueError(f"samples_per_period: {value:g}, expected a whole number")
         samples_per_period = int(value)
+    if excited_harmonics is None:
+        excited_harmonics = fields.get("excited_harmonics")
     return make_recording(
         fields[u],
         fields[y],
@@ -67,7 +71,7 @@ def read_recording(
         samples_per_period=samples_per_period,
         periods=periods,
         segments=segments,
-        excited_harmonics=fields.get("excited_harmonics"),
+        excited_harmonics=excited_harmonics,
         u_name=u,
         y_name=y,
     )

@@ -140,3 +140,18 @@ def test_a_record_that_does_not_fit_may_come_before_its_excitation(node):
     node._on_record(records[0])
     node._on_excitation(message)
     assert [m.status for m in node.published] == [3]
+
+
+def test_an_estimate_that_raises_gets_a_failure_with_its_reason(node, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("division by zero")
+
+    message, records = messages(10)
+    node._on_excitation(message)
+    with monkeypatch.context() as patched:
+        patched.setattr("tactile_resonance.frf.measurement.MeasurementFrf.add", broken)
+        node._on_record(records[0])
+    node._on_excitation(messages(11)[0])
+    node._on_record(messages(11)[1][0])
+    assert [m.status for m in node.published] == [3, 1]
+    assert node.published[0].message == "ZeroDivisionError: division by zero"

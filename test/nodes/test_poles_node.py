@@ -93,6 +93,22 @@ def test_a_broken_frf_gets_a_failure_with_a_reason(node, case):
     assert after.f0_hz[0] == pytest.approx(250, rel=1e-6)
 
 
+def test_a_fit_that_raises_gets_a_failure_with_its_reason(node, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("division by zero")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("tactile_resonance.nodes.poles_node.poles_of_frf", broken)
+        node._on_frf(good())
+    node._on_frf(good())
+    failed, after = node.published
+    assert failed.status == msg.Poles.STATUS_FAILED
+    assert failed.message == "ZeroDivisionError: division by zero"
+    assert failed.measurement_id == 7
+    assert "ZeroDivisionError" in node.health._error
+    assert after.status == msg.Poles.STATUS_OK
+
+
 def test_bins_give_after_every_block_what_the_whole_record_gives(node, monkeypatch):
     """Through the messages of both nodes: a mode of 2 % at 250 Hz from rest, measured with noise."""
     rng = np.random.default_rng(3)
