@@ -137,6 +137,9 @@ class PolesBatch:
         Index into `STATUSES`.
     noise_variance : (..., 2) float
         Estimated variance of a bin of Y and of U [V^2]; NaN where the data brought their own.
+    lacking : (..., 3) float
+        Chi-square of what the model lacks, how many parameters that has, and f0 [Hz] of the mode it is,
+        NaN for residual terms; all NaN where a test finds nothing, or was not made.
     fit : RationalModel
         Its coefficients have the same leading axes.
     structure : ModelStructure
@@ -161,6 +164,7 @@ class PolesBatch:
     significant: npt.NDArray[np.bool_]
     status_code: npt.NDArray[np.uint8]
     noise_variance: FloatArray
+    lacking: FloatArray
     fit: RationalModel
     structure: ModelStructure
     band_hz: tuple[float, float]
