@@ -76,6 +76,29 @@ def test_json_and_figure_of_a_record(good, tmp_path):
     assert figure.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_data_choose_the_orders(tmp_path, capsys):
+    """Of one mode alone one is chosen, of two 6 Hz apart both, where one alone is a model error."""
+    one, two = record(), record()
+    late = 2 * np.pi * 256.0
+    time_s = np.arange(N) / RATE_HZ
+    kernel = np.exp(-DAMPING * late * time_s) * np.cos(late * time_s) * 60 / RATE_HZ
+    settled = np.fft.irfft(np.fft.rfft(kernel) * np.fft.rfft(two["u"][:N]), N)
+    two["y"] = two["y"] + np.tile(settled, 6)
+    for content, order in ((one, 2), (two, 4)):
+        path, out = tmp_path / f"{order}.npz", tmp_path / f"{order}.json"
+        np.savez(path, **content)
+        common = ["analyze", str(path), "--band", "200", "300", "--json", str(out)]
+        assert cli.main([*common, "--order", "auto"]) == 0
+        chosen = json.loads(out.read_text())
+        assert (chosen["order"], chosen["status"]) == (order, "ok")
+        assert "chosen by description length from 9" in capsys.readouterr().out
+        f0_hz = [pole["f0_hz"] for pole in chosen["poles"]]
+        assert f0_hz == pytest.approx([250.0, 256.0][: order // 2], abs=0.2)
+        assert cli.main(common) == 0
+        assert json.loads(out.read_text())["status"] == ("ok" if order == 2 else "model error")
+        capsys.readouterr()
+
+
 def test_band_is_found_when_none_is_given(good):
     answer = run(good)
     assert answer.returncode == 0, answer.stderr
@@ -100,6 +123,7 @@ BAD = {
     "zero rate option": (damaged(), ("--sample-rate", 0), "sample_rate_hz: 0"),
     "broken period": (damaged(samples_per_period=1999), (), "expected a multiple of the period"),
     "order": (damaged(), ("--order", 0), "order: 0"),
+    "orders": (damaged(), ("--order", "auto", "--numerator-order", 7), "numerator_order: chosen"),
     "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "json: /nonexistent"),
     "figure kind": (damaged(), ("--plot", "out.docx"), "plot: out.docx"),
 }
