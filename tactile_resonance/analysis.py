@@ -214,9 +214,15 @@ def analysis_as_json(analysis: Analysis) -> str:
                 "total_covariance": _list(
                     None if poles.total_covariance is None else poles.total_covariance[k]
                 ),
+                "f0_drift_hz_per_s": _entry(poles.f0_drift_hz_per_s, k),
+                "damping_drift_per_s": _entry(poles.damping_drift_per_s, k),
+                "drift_covariance": _list(
+                    None if poles.drift_covariance is None else poles.drift_covariance[k]
+                ),
             }
             for k, pole in enumerate(poles.poles_rad_s)
         ],
+        "instant_s": poles.instant_s,
         "band_hz": list(poles.band_hz),
         "lines": poles.lines,
         "order": poles.structure.order,
@@ -276,6 +282,10 @@ def write_whole(path: Path, content: bytes) -> None:
 
 def _list(array: npt.NDArray[np.floating] | None) -> list | None:
     return None if array is None or not np.all(np.isfinite(array)) else array.tolist()
+
+
+def _entry(values: npt.NDArray[np.floating] | None, k: int) -> float | None:
+    return None if values is None else _number(values[k])
 
 
 def _numbers(values: npt.NDArray[np.floating]) -> list[float | None]:

@@ -73,6 +73,7 @@ def test_json_and_figure_of_a_record(good, tmp_path):
     assert len({len(frf[key]) for key in ("frequency_hz", "real", "imag", "variance")}) == 1
     assert frf["frequency_hz"][0] == 100.0
     assert content["status"] == "ok"
+    assert pole["f0_drift_hz_per_s"] is content["instant_s"] is None
     assert figure.read_bytes()[:4] == b"\x89PNG"
 
 
@@ -97,6 +98,29 @@ def test_the_data_choose_the_orders(tmp_path, capsys):
         assert cli.main(common) == 0
         assert json.loads(out.read_text())["status"] == ("ok" if order == 2 else "model error")
         capsys.readouterr()
+
+
+def test_a_mode_that_changes_is_reported_with_its_drift(tmp_path, capsys):
+    """f0 rises by .02 Hz from period to period, each of them settled."""
+    content = record()
+    spectrum = np.fft.rfft(content["u"][:N])
+    s = 2j * np.pi * np.arange(spectrum.size) * RATE_HZ / N
+    rng = np.random.default_rng(3)
+    periods = []
+    for k in range(6):
+        w0 = 2 * np.pi * (F0_HZ + 0.02 * (k - 2.5))
+        g = 0.02 + 100 * s / (s**2 + 2 * DAMPING * w0 * s + w0**2)
+        periods.append(np.fft.irfft(spectrum * g, N) + 1e-3 * rng.standard_normal(N))
+    path, out = tmp_path / "creeps.npz", tmp_path / "out.json"
+    np.savez(path, **{**content, "y": np.concatenate(periods)})
+    assert cli.main(["analyze", str(path), "--band", "200", "300", "--json", str(out)]) == 0
+    assert "the mode changes: f0 by 0.0" in capsys.readouterr().out
+    content = json.loads(out.read_text())
+    pole = content["poles"][0]
+    assert content["instant_s"] == pytest.approx(1.2, abs=1e-3)
+    assert pole["f0_drift_hz_per_s"] == pytest.approx(0.05, rel=0.1)
+    assert abs(pole["damping_drift_per_s"]) < 1e-5
+    assert 0 < np.sqrt(pole["drift_covariance"][0][0]) < 0.005
 
 
 def test_band_is_found_when_none_is_given(good):

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.drift import poles_with_drift
+from tactile_resonance.identification.joint import ComplexArray, JointPlan
 from tactile_resonance.identification.joint_layout import whole_harmonics
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
@@ -58,7 +60,7 @@ def identify_poles_from_records(
         structure or ModelStructure(),
         input_noise_ratio=input_noise_ratio,
     )
-    return single(plan(u, y))
+    return _of_plan(plan, plan.transform(u, "u"), plan.transform(y, "y"))
 
 
 def identify_poles_from_bins(
@@ -107,7 +109,17 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return single(plan.from_bins(u, y), notes=notes)
+    return _of_plan(plan, u, y, notes)
+
+
+def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
+    """Poles from bins, with their drift where one record of several periods shows any."""
+    batch = plan.from_bins(u, y)
+    if y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
+        poles = poles_with_drift(plan, u, y, batch)
+        if poles is not None:
+            return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))
+    return single(batch, notes=notes)
 
 
 @lru_cache(maxsize=32)
