@@ -65,9 +65,7 @@ PARAMETERS = (
     ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
-    Parameter(
-        "sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True
-    ),
+    Parameter("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True),
     Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
     BROADCAST_TF,
     *contact_parameters(),

@@ -153,10 +153,7 @@ class ScanNode(ManagedNode):
         progress = getattr(self, "_progress", None)
         if progress is None:
             return {}
-        return {
-            "phase": progress.phase.value,
-            "points": f"{progress.finished} of {progress.points}",
-        }
+        return {"phase": progress.phase.value, "points": f"{progress.finished} of {progress.points}"}
 
     def _act(self, kind: type, name: str, work: Any, check: Any, busy: Any) -> None:
         """Offer an action of which, with the others of this kind, one goal at a time is worked at."""

@@ -36,7 +36,9 @@ class StopInput:
         node.create_service(SetBool, STOP, self._on_request)
         node.create_subscription(Bool, STOP, lambda message: self._set(message.data), 10)
 
-    def _on_request(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_request(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
         self._set(request.data)
         response.success = True
         response.message = "stopped; contact_state reports when it is idle"

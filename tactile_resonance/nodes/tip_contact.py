@@ -125,9 +125,7 @@ class TipContact:
             if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
                 self.touching = False
                 return
-        raise ScanEnded(
-            f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
-        )
+        raise ScanEnded(f"the tip was not drawn back within {within_s:g} s: is contact_node active?")
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""

@@ -150,9 +150,7 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
     for file in run.files:
         if not file.name.endswith(f"-{name}.mcap"):
             continue
-        for _, topic, message in read_messages_of_type(
-            run.path / RECORDING / file.name, POLES_TYPE
-        ):
+        for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES_TYPE):
             if topic.rsplit("/", 1)[-1] == "poles":
                 poles, _ = poles_from_message(message)
                 found = reference_of(poles)

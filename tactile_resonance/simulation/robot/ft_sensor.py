@@ -120,9 +120,7 @@ class FtSensor:
             Measured by another sensor, to be used in place of this one's reading.
         """
         noise, keep = self._rows.take(), self._keep
-        self._drift = [
-            keep * drift + kick for drift, kick in zip(self._drift, noise[:6], strict=True)
-        ]
+        self._drift = [keep * drift + kick for drift, kick in zip(self._drift, noise[:6], strict=True)]
         parts = zip(true, self._offset, self._drift, noise[6:], strict=True)
         self.raw = tuple([t + offset + drift + n for t, offset, drift, n in parts])
         self._free = difference(self.raw if external is None else external, payload_weight)
