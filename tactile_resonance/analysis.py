@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.estimator import POLES_METHODS, second_attempt
 from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
@@ -56,6 +58,7 @@ def analyse(
     *,
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
+    candidates: Sequence[ModelStructure] = (),
     frf_method: str = "local polynomial",
     poles_method: str = "auto",
     with_distortion: bool = False,
@@ -69,6 +72,8 @@ def analyse(
     band_hz : (low, high), optional
         Around the strongest resonance when absent, with a warning that says which.
     structure : ModelStructure, optional
+    candidates : sequence of ModelStructure, optional
+        Of which the data choose one in place of `structure`, by minimum description length.
     frf_method : str
         See `frf.estimate.estimate_frf`.
     poles_method : {"auto", "joint", "frf"}
@@ -124,7 +129,17 @@ def analyse(
         )
     if poles_method == "auto":
         poles_method = "frf" if channel_delay_s else "joint"
-    poles = _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
+
+    def fit(structure: ModelStructure) -> Poles:
+        return _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
+
+    if candidates:
+        choice = choose_among(fit, candidates)
+        poles = choice.poles[choice.chosen]
+        orders = f"{choice.structure.order} and {choice.structure.numerator_order}"
+        warnings.append(f"orders: {orders} chosen by description length from {len(choice.mdl)}")
+    else:
+        poles = fit(structure)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:
@@ -200,9 +215,15 @@ def analysis_as_json(analysis: Analysis) -> str:
                 "total_covariance": _list(
                     None if poles.total_covariance is None else poles.total_covariance[k]
                 ),
+                "f0_drift_hz_per_s": _entry(poles.f0_drift_hz_per_s, k),
+                "damping_drift_per_s": _entry(poles.damping_drift_per_s, k),
+                "drift_covariance": _list(
+                    None if poles.drift_covariance is None else poles.drift_covariance[k]
+                ),
             }
             for k, pole in enumerate(poles.poles_rad_s)
         ],
+        "instant_s": poles.instant_s,
         "band_hz": list(poles.band_hz),
         "lines": poles.lines,
         "order": poles.structure.order,
@@ -262,6 +283,10 @@ def write_whole(path: Path, content: bytes) -> None:
 
 def _list(array: npt.NDArray[np.floating] | None) -> list | None:
     return None if array is None or not np.all(np.isfinite(array)) else array.tolist()
+
+
+def _entry(values: npt.NDArray[np.floating] | None, k: int) -> float | None:
+    return None if values is None else _number(values[k])
 
 
 def _numbers(values: npt.NDArray[np.floating]) -> list[float | None]:

@@ -73,7 +73,54 @@ def test_json_and_figure_of_a_record(good, tmp_path):
     assert len({len(frf[key]) for key in ("frequency_hz", "real", "imag", "variance")}) == 1
     assert frf["frequency_hz"][0] == 100.0
     assert content["status"] == "ok"
+    assert pole["f0_drift_hz_per_s"] is content["instant_s"] is None
     assert figure.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_data_choose_the_orders(tmp_path, capsys):
+    """Of one mode alone one is chosen, of two 6 Hz apart both, where one alone is a model error."""
+    one, two = record(), record()
+    late = 2 * np.pi * 256.0
+    time_s = np.arange(N) / RATE_HZ
+    kernel = np.exp(-DAMPING * late * time_s) * np.cos(late * time_s) * 60 / RATE_HZ
+    settled = np.fft.irfft(np.fft.rfft(kernel) * np.fft.rfft(two["u"][:N]), N)
+    two["y"] = two["y"] + np.tile(settled, 6)
+    for content, order in ((one, 2), (two, 4)):
+        path, out = tmp_path / f"{order}.npz", tmp_path / f"{order}.json"
+        np.savez(path, **content)
+        common = ["analyze", str(path), "--band", "200", "300", "--json", str(out)]
+        assert cli.main([*common, "--order", "auto"]) == 0
+        chosen = json.loads(out.read_text())
+        assert (chosen["order"], chosen["status"]) == (order, "ok")
+        assert "chosen by description length from 9" in capsys.readouterr().out
+        f0_hz = [pole["f0_hz"] for pole in chosen["poles"]]
+        assert f0_hz == pytest.approx([250.0, 256.0][: order // 2], abs=0.2)
+        assert cli.main(common) == 0
+        assert json.loads(out.read_text())["status"] == ("ok" if order == 2 else "model error")
+        capsys.readouterr()
+
+
+def test_a_mode_that_changes_is_reported_with_its_drift(tmp_path, capsys):
+    """f0 rises by .02 Hz from period to period, each of them settled."""
+    content = record()
+    spectrum = np.fft.rfft(content["u"][:N])
+    s = 2j * np.pi * np.arange(spectrum.size) * RATE_HZ / N
+    rng = np.random.default_rng(3)
+    periods = []
+    for k in range(6):
+        w0 = 2 * np.pi * (F0_HZ + 0.02 * (k - 2.5))
+        g = 0.02 + 100 * s / (s**2 + 2 * DAMPING * w0 * s + w0**2)
+        periods.append(np.fft.irfft(spectrum * g, N) + 1e-3 * rng.standard_normal(N))
+    path, out = tmp_path / "creeps.npz", tmp_path / "out.json"
+    np.savez(path, **{**content, "y": np.concatenate(periods)})
+    assert cli.main(["analyze", str(path), "--band", "200", "300", "--json", str(out)]) == 0
+    assert "the mode changes: f0 by 0.0" in capsys.readouterr().out
+    content = json.loads(out.read_text())
+    pole = content["poles"][0]
+    assert content["instant_s"] == pytest.approx(1.2, abs=1e-3)
+    assert pole["f0_drift_hz_per_s"] == pytest.approx(0.05, rel=0.1)
+    assert abs(pole["damping_drift_per_s"]) < 1e-5
+    assert 0 < np.sqrt(pole["drift_covariance"][0][0]) < 0.005
 
 
 def test_band_is_found_when_none_is_given(good):
@@ -100,6 +147,7 @@ BAD = {
     "zero rate option": (damaged(), ("--sample-rate", 0), "sample_rate_hz: 0"),
     "broken period": (damaged(samples_per_period=1999), (), "expected a multiple of the period"),
     "order": (damaged(), ("--order", 0), "order: 0"),
+    "orders": (damaged(), ("--order", "auto", "--numerator-order", 7), "numerator_order: chosen"),
     "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "json: /nonexistent"),
     "figure kind": (damaged(), ("--plot", "out.docx"), "plot: out.docx"),
 }

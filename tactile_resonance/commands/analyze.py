@@ -74,7 +74,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="[Hz] of the fit; default: around the strongest resonance",
     )
     parser.add_argument(
-        "--order", type=int, default=2, help="of the denominator, two per mode (default: 2)"
+        "--order",
+        type=parse_order,
+        default=2,
+        metavar="N",
+        help="of the denominator, two per mode (default: 2); auto: the data choose one to three modes "
+        "and six to ten residual terms, by description length",
     )
     parser.add_argument(
         "--numerator-order",
@@ -129,6 +134,16 @@ def _read_folder(options: argparse.Namespace) -> Recording:
     return recording_of(measurement, options.periods)
 
 
+def parse_order(text: str) -> int | None:
+    """'4' as 4, 'auto' as None."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number or auto") from None
+
+
 def parse_segments(text: str) -> list[tuple[int, int]]:
     """'0:10,20:30' as [(0, 10), (20, 30)]."""
     try:
@@ -181,11 +196,16 @@ def run(options: argparse.Namespace) -> int:
             segments=options.segments,
             excited_harmonics=options.harmonics,
         )
-    structure = ModelStructure.with_residual(options.order)
-    if options.numerator_order is not None:
-        structure = replace(structure, numerator_order=options.numerator_order)
+    structures = [ModelStructure.with_residual(2 if options.order is None else options.order)]
+    if options.order is None:
+        if options.numerator_order is not None:
+            raise ValueError("numerator_order: chosen with --order auto, expected none")
+        structures = [ModelStructure.with_residual(n, r) for n in (2, 4, 6) for r in (6, 8, 10)]
+    elif options.numerator_order is not None:
+        structures = [replace(structures[0], numerator_order=options.numerator_order)]
     if options.domain == "z":
-        structure = replace(structure, domain="z", sample_rate_hz=recording.sample_rate_hz)
+        rate_hz = recording.sample_rate_hz
+        structures = [replace(s, domain="z", sample_rate_hz=rate_hz) for s in structures]
     band_hz = None
     if options.band is not None:
         low_hz, high_hz = options.band
@@ -198,7 +218,8 @@ def run(options: argparse.Namespace) -> int:
     analysis = analyse(
         recording,
         band_hz=band_hz,
-        structure=structure,
+        structure=structures[0],
+        candidates=structures[1:] and structures,
         frf_method=options.frf,
         poles_method=options.method,
         with_distortion=options.distortion,

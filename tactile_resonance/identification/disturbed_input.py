@@ -8,7 +8,6 @@ it is coloured and strong the fit does not converge. So are lines that were exci
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,30 +34,28 @@ FITS = 3
 """To all bins; each after the first with the ratio of the noises that the one before shows."""
 
 
-def poles_of_bins(
-    plan: JointPlan, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()
-) -> Poles:
-    """Poles from the bins of the band of one point.
+def poles_with_all_bins(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
+) -> Poles | None:
+    """Poles from all bins of one point where the input between harmonics moves the output.
 
     Parameters
     ----------
     plan : JointPlan
     u, y : (K,) or (M, K) complex
         At its bins; of M realisations for a plan of these.
-    notes : sequence of str
-        Added to the message.
+    batch : PolesBatch
+        Its fit to the excited lines, shape (). A model error found on these stays: bins that noise alone
+        moves have found it.
 
     Returns
     -------
-    Poles
-        From the excited lines, or from all bins where the input between harmonics moves the output; see
-        `DISTURBED` and `EXPLAINED`. A model error found on the lines stays: bins that noise alone moves
-        have found it.
+    Poles or None
+        None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`.
     """
-    batch = plan.from_bins(u, y)
     final = (PolesStatus.MODEL_ERROR, PolesStatus.TOO_FEW_LINES)
     if batch.status() in final or not _disturbed(plan, u):
-        return single(batch, notes=notes)
+        return None
     ratio = 0.0
     of_all = _with_all_bins(plan, u, y, ratio)
     for _ in range(FITS - 1):
@@ -69,7 +66,7 @@ def poles_of_bins(
         of_all.status() is PolesStatus.MODEL_ERROR and batch.status() is not PolesStatus.OK
     )
     if not (better and explained >= EXPLAINED):
-        return single(batch, notes=notes)
+        return None
     above_db = 10 * np.log10(explained)
     note = (
         f"the input beside the excited lines moves the output {above_db:.0f} dB above its noise, as a "
@@ -77,7 +74,7 @@ def poles_of_bins(
     )
     if batch.status() is not PolesStatus.OK:
         note += f"; the fit to the excited lines alone: {batch.status().value}"
-    poles = single(of_all, notes=[note, *notes])
+    poles = single(of_all, notes=[note])
     return replace(poles, method=f"{poles.method}, all bins as excitation")
 
 

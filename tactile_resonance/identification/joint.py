@@ -20,7 +20,6 @@ from tactile_resonance.identification.joint_fit import JointFit, fit_bins
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.judgement import Evidence, assemble
 from tactile_resonance.identification.lines_fit import LinesFit
-from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.result import PolesBatch
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -123,18 +122,13 @@ def result_of(
     level_known : bool
         Whether the level of the noise is told by more than the residuals.
     """
-    a, b, _ = layout.problem.sizes
-    theta = fit.theta
-    model = RationalModel(
-        denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-        numerator=theta[:, a : a + b],
-        transient=theta[:, a + b :],
-        variable=layout.variable,
-        denominator_basis=layout.denominator_basis,
-        numerator_basis=layout.numerator_basis,
-    )
     lines_fit = LinesFit(
-        model, fit.cost, fit.covariance, fit.condition, fit.converged, fit.residual
+        layout.model_of(fit.theta),
+        fit.cost,
+        fit.covariance,
+        fit.condition,
+        fit.converged,
+        fit.residual,
     )
     evidence = Evidence(
         lines_fit,
@@ -148,6 +142,7 @@ def result_of(
         fit.kind,
         level_known,
         fit.noise,
+        fit.lacking,
     )
     if evidence.suspect.any():
         known = np.isfinite(fit.total)

@@ -18,12 +18,14 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.identification import one_mode
+from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.compiled import kernel
 from tactile_resonance.identification.covariance import BAND_MARGIN
 from tactile_resonance.identification.joint import METHOD, JointPlan
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, FEWEST_PIECES
 from tactile_resonance.identification.judgement import LARGEST_CONDITION_NUMBER
 from tactile_resonance.identification.kernel_tables import GroupTable, interleaved
+from tactile_resonance.identification.lacking import asks, lacking_terms
 from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import FALSE_ALARM, flat_limit
@@ -102,11 +104,34 @@ class CompiledJointPlan(JointPlan):
             part = tuple(values[rows] for values in out)
             code.fit_points(flat_u[rows], flat_y[rows], *self._constants, part)
             ordinary[rows] &= ~are_smooth(residual[rows], self.structure.parameters)
+            cost, expected = (part[-1][:, k] for k in (one_mode.COST, one_mode.EXPECTED))
+            ordinary[rows] &= ~self._lack(
+                np.flatnonzero(ordinary[rows] & asks(self, cost, expected, residual[rows])),
+                (flat_u[rows], flat_y[rows], *part),
+            )
         result = self._ordinary(theta, covariance, residual, figures)
         if not ordinary.all():
             rest = np.flatnonzero(~ordinary)
             result = _replaced(result, rest, super().from_bins(flat_u[rest], flat_y[rest]))
         return result if shape == (batch,) else _reshaped(result, shape)
+
+    def _lack(
+        self, asked: npt.NDArray[np.int64], points: tuple[npt.NDArray, ...]
+    ) -> npt.NDArray[np.bool_]:
+        """(batch,) which points, of those asked for, need more than the model has; see `lacking`."""
+        lack = np.zeros(points[0].shape[0], bool)
+        if not asked.size:
+            return lack
+        u, y, _, theta, _, _, figures = (values[asked] for values in points)
+        noise = figures[:, one_mode.NOISE_Y : one_mode.NOISE_Y + 2]
+        variance_y, variance_u = (np.ascontiguousarray(noise[:, k : k + 1]) for k in (0, 1))
+        u_e, y_e = (values.take(self.excited_at, axis=1) for values in (u, y))
+        data = [
+            BinData(y.take(self.others_at, axis=1), None, variance_y),
+            BinData(y_e, u_e, variance_y, variance_u),
+        ]
+        lack[asked] = np.isfinite(lacking_terms(self, data, theta)[:, 0])
+        return lack
 
     def _ordinary(
         self,
@@ -154,6 +179,7 @@ class CompiledJointPlan(JointPlan):
             significant=significant,
             status_code=code.astype(np.uint8),
             noise_variance=figures[:, one_mode.NOISE_Y : one_mode.NOISE_Y + 2],
+            lacking=np.full((batch, 3), np.nan),
             fit=model,
             structure=self.structure,
             band_hz=self.band_hz,

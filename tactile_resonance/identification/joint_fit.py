@@ -16,6 +16,7 @@ from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_model_error import systematic_of
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
 from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
+from tactile_resonance.identification.lacking import asks, lacking_terms
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import KINDS, f_quantile
 from tactile_resonance.identification.solver import Solution, minimise, refine
@@ -63,6 +64,8 @@ class JointFit:
         suspicion.
     remark : (batch,) object
         What else is to be told to people; empty: nothing.
+    lacking : (batch, 3) float
+        See `lacking.lacking_terms`; NaN where it was not asked, as for several realisations.
     """
 
     theta: FloatArray
@@ -79,6 +82,11 @@ class JointFit:
     residual: ComplexArray
     systematic: FloatArray
     remark: npt.NDArray[np.object_]
+    lacking: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.lacking is None:
+            object.__setattr__(self, "lacking", np.full((self.cost.size, 3), np.nan))
 
     def rows(self, which: npt.NDArray[np.int64]) -> JointFit:
         """Some of the points."""
@@ -190,8 +198,16 @@ def _fit(
         level = _level_from_others(layout, solution, inverse, noise)
     residual = data[-1].turned(solution.residual) / np.sqrt(level.scale)[:, None]
     suspect = are_smooth(residual, layout.structure.parameters) | level.suspect
+    lacking = np.full((batch, 3), np.nan)
+    asked = suspect | (batch == 1) | asks(layout, level.cost, level.expected, residual)
+    asked = np.flatnonzero(asked & _may_return(solution))
+    if asked.size:
+        part = [values.rows(asked) for values in data]
+        lacking[asked] = lacking_terms(layout, part, solution.theta[asked], inverse[asked])
+        suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
         suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * mean_power(y_e)
+        lacking[~suspect] = np.nan
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     wrong = suspect
     if start is None and layout.other_bins.size > 0:  # others are fitted once more
@@ -218,6 +234,7 @@ def _fit(
         residual=residual,
         systematic=systematic,
         remark=np.full(batch, "", object),
+        lacking=lacking,
     )
 
 

@@ -18,7 +18,8 @@ from tactile_resonance.identification.joint_transient import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.identification.model import Variable
+from tactile_resonance.identification.lacking import Directions
+from tactile_resonance.identification.model import RationalModel, Variable
 from tactile_resonance.identification.model_error import richer
 from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.structure import ModelStructure
@@ -163,6 +164,26 @@ class JointLayout:
             )
         except ValueError:
             return None
+
+    @cached_property
+    def directions(self) -> Directions:
+        """What a richer model has in addition, on the excited bins."""
+        resolution = self.sample_rate_hz / (self.samples_per_period * self.periods)
+        frequency_hz = np.asarray(self.excited_bins * resolution, float)
+        x = self.variable.of_frequency(frequency_hz)
+        return Directions.on_lines(frequency_hz, x, self.structure.numerator_order)
+
+    def model_of(self, theta: FloatArray) -> RationalModel:
+        """The model of coefficients (batch, n)."""
+        a, b, _ = self.problem.sizes
+        return RationalModel(
+            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
+            numerator=theta[:, a : a + b],
+            transient=theta[:, a + b :],
+            variable=self.variable,
+            denominator_basis=self.denominator_basis,
+            numerator_basis=self.numerator_basis,
+        )
 
     def poles_in_band(self, theta: FloatArray) -> ComplexArray:
         """(batch, places) poles [rad/s] of coefficients (batch, n)."""

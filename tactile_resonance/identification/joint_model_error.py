@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.covariance import invert_normal, pole_quantities
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.model_error import (
     COMPARISON_ITERATIONS,
@@ -19,6 +20,7 @@ from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.shared_points import minimise_shared
 from tactile_resonance.identification.solver import minimise
 
+ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -50,12 +52,28 @@ def systematic_of(layout: JointLayout, data: list[BinData], theta: FloatArray) -
     if theta.ndim == 3:
         systematic = systematic + _of_realisations(layout, data, theta)
     if layout.richer is not None:
-        found = _fit(layout.richer.problem, [*other, excited], theta.shape, None)
         first = theta if theta.ndim == 2 else theta[:, 0]
+        found, covariance = None, None
+        if theta.ndim == 2:
+            found, covariance = _richer_poles(layout.richer, data)
+        else:
+            found = layout.richer.poles_in_band(
+                _fit(layout.richer.problem, [*other, excited], theta.shape, None)
+            )
         systematic = systematic + difference_of_models(
-            layout.poles_in_band(first), layout.richer.poles_in_band(found)
+            layout.poles_in_band(first), found, covariance
         )
     return systematic
+
+
+def _richer_poles(layout: JointLayout, data: list[BinData]) -> tuple[ComplexArray, FloatArray]:
+    """(batch, places) poles of a fit, and (batch, places, 2, 2) the covariance of their quantities."""
+    solution = minimise(layout.problem, data, None, COMPARISON_ITERATIONS)
+    inverse, _ = invert_normal(solution.normal.sum(axis=1))
+    dof = max(sum(values.y.shape[1] for values in data) - inverse.shape[-1] / 2, 1)
+    covariance = inverse * (solution.cost / (2 * dof))[:, None, None]
+    quantities = pole_quantities(layout.model_of(solution.theta), layout.band_hz, covariance)
+    return quantities["poles_rad_s"], quantities["covariance"]
 
 
 def _of_realisations(layout: JointLayout, data: list[BinData], theta: FloatArray) -> FloatArray:

@@ -4,17 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.identification.disturbed_input import poles_of_bins
-from tactile_resonance.identification.joint import JointPlan
+from tactile_resonance.identification.disturbed_input import poles_with_all_bins
+from tactile_resonance.identification.drift import poles_with_drift
+from tactile_resonance.identification.joint import ComplexArray, JointPlan
 from tactile_resonance.identification.joint_layout import whole_harmonics
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
+from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
 
 IntArray = npt.NDArray[np.int64]
@@ -44,7 +47,7 @@ def identify_poles_from_records(
     -------
     Poles
         Always with a status; raised is only what `JointPlan` raises. See
-        `disturbed_input.poles_of_bins` for inputs that a disturbance moves between harmonics.
+        `disturbed_input` for inputs that a disturbance moves between harmonics, `drift` for modes that change.
     """
     if np.ndim(u) not in (2, 3):
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
@@ -59,7 +62,7 @@ def identify_poles_from_records(
         structure or ModelStructure(),
         input_noise_ratio=input_noise_ratio,
     )
-    return poles_of_bins(plan, plan.transform(u, "u"), plan.transform(y, "y"))
+    return _of_plan(plan, plan.transform(u, "u"), plan.transform(y, "y"))
 
 
 def identify_poles_from_bins(
@@ -108,7 +111,18 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return poles_of_bins(plan, u, y, notes)
+    return _of_plan(plan, u, y, notes)
+
+
+def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
+    """Poles from bins, by all of them as excitation, or with their drift, where the record asks for it."""
+    batch = plan.from_bins(u, y)
+    poles = poles_with_all_bins(plan, u, y, batch)
+    if poles is None and y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
+        poles = poles_with_drift(plan, u, y, batch)
+    if poles is None:
+        return single(batch, notes=notes)
+    return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))
 
 
 @lru_cache(maxsize=32)

@@ -47,6 +47,8 @@ class Evidence:
         Whether the variance is known otherwise than from the residuals.
     noise_variance : (batch, 2) float or None
         See `PolesBatch`.
+    lacking : (batch, 3) float or None
+        See `PolesBatch`.
     """
 
     fit: LinesFit
@@ -60,6 +62,7 @@ class Evidence:
     variance_model: npt.NDArray[np.str_]
     level_known: bool | BoolArray
     noise_variance: FloatArray | None = None
+    lacking: FloatArray | None = None
 
     @classmethod
     def empty(cls, plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Evidence:
@@ -145,6 +148,9 @@ def assemble(
     noise = evidence.noise_variance
     if noise is None:
         noise = np.full((code.size, 2), np.nan)
+    lacking = evidence.lacking
+    if lacking is None:
+        lacking = np.full((code.size, 3), np.nan)
 
     def batch(array: npt.NDArray) -> npt.NDArray:
         return array.reshape((*shape, *array.shape[1:]))
@@ -163,6 +169,7 @@ def assemble(
         significant=batch(significant),
         status_code=batch(code),
         noise_variance=batch(noise),
+        lacking=batch(lacking),
         fit=replace(
             model,
             denominator=batch(model.denominator),

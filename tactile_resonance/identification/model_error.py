@@ -78,7 +78,9 @@ def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> F
     return np.asarray(difference[..., :, None] * difference[..., None, :])
 
 
-def difference_of_models(poles_rad_s: ComplexArray, richer_rad_s: ComplexArray) -> FloatArray:
+def difference_of_models(
+    poles_rad_s: ComplexArray, richer_rad_s: ComplexArray, covariance: FloatArray | None = None
+) -> FloatArray:
     """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
 
     Two modes nearer to each other than their widths are fitted by one between them so well that
@@ -89,16 +91,21 @@ def difference_of_models(poles_rad_s: ComplexArray, richer_rad_s: ComplexArray) 
     poles_rad_s : (..., places) complex
     richer_rad_s : (..., more places) complex
         NaN where there is no mode; the nearest one counts.
+    covariance : (..., more places, 2, 2) float, optional
+        Of (f0_hz, damping_ratio) of the latter.
 
     Returns
     -------
     (..., places, 2, 2) float
-        0 where the richer model has no mode.
+        With the covariance of the nearest one, where given; 0 where the richer model has no mode.
     """
     distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
     nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
     other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
-    return np.nan_to_num(difference_of_halves(poles_rad_s, other))
+    moved = difference_of_halves(poles_rad_s, other)
+    if covariance is not None:
+        moved = moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3)
+    return np.nan_to_num(moved)
 
 
 def richer(structure: ModelStructure) -> ModelStructure:

@@ -198,8 +198,7 @@ class OnePoint:
     def normals(self, value: OneValue) -> tuple[FloatArray, FloatArray]:
         """Half the gradient (n,) of the cost, normals (groups, n, n), of a weighted value."""
         basis = self._basis
-        scaled = value.inverse * value.root
-        real = self._weighted_jacobian(value.model, scaled)
+        real = self.jacobian(value)
         flat = value.weighted.view(float)
         gradient = real @ flat
         if self._variance_u is not None:
@@ -221,6 +220,10 @@ class OnePoint:
             rows = real[:, 2 * part.start : 2 * part.stop]
             np.matmul(rows, rows.T, out=out)
         return gradient, normal
+
+    def jacobian(self, value: OneValue) -> FloatArray:
+        """(n, 2 K) derivative of the weighted errors, real and imaginary parts; valid until the next call."""
+        return self._weighted_jacobian(value.model, value.inverse * value.root)
 
     def step(
         self, normal: FloatArray, gradient: FloatArray, damping: float = 0.0

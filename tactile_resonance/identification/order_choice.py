@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,19 +75,45 @@ def choose_order(
             for order in (2, 4, 6)
             for terms in (1, 2, 4, 6, 8)
         ]
+    return choose_among(lambda structure: identify_poles(frf, band_hz, structure), candidates)
+
+
+def choose_among(
+    fit: Callable[[ModelStructure], Poles], candidates: Sequence[ModelStructure]
+) -> OrderChoice:
+    """As `choose_order`, for any fit of a structure to the same data.
+
+    Parameters
+    ----------
+    fit : callable
+        May raise a `ValueError` where the data are too few for a structure, which is then left out.
+    candidates : sequence of ModelStructure
+    """
     if not candidates:
         raise ValueError("candidates: none given, expected one structure at least")
-    poles = tuple(identify_poles(frf, band_hz, structure) for structure in candidates)
+    fits, refused = [], None
+    for structure in candidates:
+        try:
+            fits.append(fit(structure))
+        except ValueError as error:
+            refused = error
+    if not fits:
+        assert refused is not None
+        raise refused
+    poles = tuple(fits)
     mdl = tuple(_description_length(p) for p in poles)
     chosen = int(np.argmin(mdl))
     if not np.isfinite(mdl[chosen]):
-        raise ValueError("candidates: none has a result, more lines or smaller orders are needed")
+        raise ValueError(
+            "candidates: none has a result with a known level of noise, more lines or smaller orders "
+            "are needed"
+        )
     return OrderChoice(poles, mdl, chosen, poles[chosen].status is not PolesStatus.MODEL_ERROR)
 
 
 def _description_length(poles: Poles) -> float:
     usable = (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_RESONANCE)
     data, n = 2 * poles.lines, poles.structure.parameters
-    if poles.status not in usable or data <= n + 2:
+    if poles.status not in usable or data <= n + 2 or not np.isfinite(poles.cost):
         return float("inf")
     return poles.cost / poles.lines * float(np.exp(n * np.log(data) / (data - n - 2)))

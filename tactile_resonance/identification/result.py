@@ -58,6 +58,12 @@ class Poles:
         All zeros of the model [rad/s]; those far outside the band mean nothing.
     zero_covariance : (k, 2, 2) float or None
         Of (Re, Im) of each zero, from noise.
+    f0_drift_hz_per_s, damping_drift_per_s : (n,) float or None
+        What f0 and damping ratio change by; None where not estimated: nothing shows that they do.
+    drift_covariance : (n, 2, 2) float or None
+        Of these two.
+    instant_s : float or None
+        When, from the start of the record, poles that change are those given; None of others.
     structure : ModelStructure
     band_hz : (float, float)
     lines : int
@@ -91,6 +97,10 @@ class Poles:
     residue_covariance: FloatArray | None = None
     zeros_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
     zero_covariance: FloatArray | None = None
+    f0_drift_hz_per_s: FloatArray | None = None
+    damping_drift_per_s: FloatArray | None = None
+    drift_covariance: FloatArray | None = None
+    instant_s: float | None = None
     structure: ModelStructure = field(default_factory=ModelStructure)
     band_hz: tuple[float, float] = (float("nan"), float("nan"))
     lines: int = 0
@@ -137,6 +147,9 @@ class PolesBatch:
         Index into `STATUSES`.
     noise_variance : (..., 2) float
         Estimated variance of a bin of Y and of U [V^2]; NaN where the data brought their own.
+    lacking : (..., 3) float
+        Chi-square of what the model lacks, how many parameters that has, and f0 [Hz] of the mode it is,
+        NaN for residual terms; all NaN where a test finds nothing, or was not made.
     fit : RationalModel
         Its coefficients have the same leading axes.
     structure : ModelStructure
@@ -163,6 +176,7 @@ class PolesBatch:
     significant: npt.NDArray[np.bool_]
     status_code: npt.NDArray[np.uint8]
     noise_variance: FloatArray
+    lacking: FloatArray
     fit: RationalModel
     structure: ModelStructure
     band_hz: tuple[float, float]

@@ -135,6 +135,14 @@ def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
 def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
     """What noise alone would not make."""
     found = []
+    chi_square, parameters, f0_hz = batch.lacking[index]
+    if np.isfinite(chi_square):
+        what = (
+            f"one mode more near {f0_hz:.4g} Hz fits"
+            if np.isfinite(f0_hz)
+            else ("two residual terms more fit")
+        )
+        found.append(f"{what} better: chi-square {chi_square:.0f} for {parameters:.0f} parameters")
     if batch.cost[index] > batch.expected_cost[index]:
         found.append(
             f"cost {batch.cost[index]:.4g} where the variance explains "

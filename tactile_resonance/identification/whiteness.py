@@ -74,16 +74,18 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     return np.asarray(-special.ndtri(np.maximum(among, np.finfo(float).tiny)))
 
 
-def are_smooth(residual: ComplexArray, parameters: int) -> npt.NDArray[np.bool_]:
-    """(...) whether the `whiteness` of residuals (..., F) is beyond `SMOOTH_RESIDUAL`."""
+def are_smooth(
+    residual: ComplexArray, parameters: int, limit: float = SMOOTH_RESIDUAL
+) -> npt.NDArray[np.bool_]:
+    """(...) whether the `whiteness` of residuals (..., F) is beyond `limit`."""
     score, levels = _best_level(residual, parameters)
-    return np.asarray(score > _limit(levels))
+    return np.asarray(score > _limit(levels, limit))
 
 
 @lru_cache(maxsize=64)
-def _limit(levels: int) -> float:
-    """Score of the most significant of so many levels that `SMOOTH_RESIDUAL` stands for."""
-    each = -np.expm1(np.log1p(-special.ndtr(-SMOOTH_RESIDUAL)) / levels)
+def _limit(levels: int, limit: float) -> float:
+    """Score of the most significant of so many levels that `limit` stands for."""
+    each = -np.expm1(np.log1p(-special.ndtr(-limit)) / levels)
     return float(-special.ndtri(each))
 
 

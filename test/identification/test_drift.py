@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A mode that changes while it is measured: told, and its poles given for a stated instant."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy import stats
+
+from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.result import PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+
+RATE_HZ, SAMPLES, HARMONICS = 5000.0, 2000, np.arange(4, 401)
+F0_HZ, DAMPING, BARE = 250.0, 0.03, ModelStructure(2, 2)
+RUNS = 40
+
+
+def record(periods, f0_drift_hz_per_s, damping_drift_per_s):
+    """From rest; f0 and damping ratio are the nominal ones in the middle.
+
+    One interval after the other with the input straight between samples and the pole of the interval's
+    middle: exact but for a smooth factor of the response, which the feed-through does not have.
+    """
+    rng = np.random.default_rng(1)
+    spectrum = np.zeros(SAMPLES // 2 + 1, complex)
+    spectrum[HARMONICS] = np.exp(2j * np.pi * rng.random(HARMONICS.size))
+    u = np.tile(np.fft.irfft(spectrum, SAMPLES), periods) * SAMPLES / np.sqrt(2 * HARMONICS.size)
+    interval = 1 / RATE_HZ
+    time_s = (np.arange(u.size - 1) + 0.5) * interval - (u.size - 1) * interval / 2
+    zeta = DAMPING + damping_drift_per_s * time_s
+    w = 2 * np.pi * (F0_HZ + f0_drift_hz_per_s * time_s)
+    q = w * (-zeta + 1j * np.sqrt(1 - zeta**2)) * interval
+    residue = 2 * DAMPING * (2 * np.pi * F0_HZ) / (2j * np.sqrt(1 - DAMPING**2)) * interval
+    late = (np.exp(q) - 1 - q) / q**2
+    drive = residue * ((np.expm1(q) / q - late) * u[:-1] + late * u[1:])
+    x = np.zeros(u.size, complex)
+    # x[k + 1] = exp(q[k]) x[k] + drive[k], all at once
+    bands = np.ones((2, u.size), complex)
+    bands[1, :-1] = -np.exp(q)
+    x = scipy.linalg.solve_banded((1, 0), bands, np.append(0, drive))
+    return tuple(values.reshape(periods, SAMPLES) for values in (u, 0.1 * u + 2 * x.real))
+
+
+def fits(periods, f0_drift_hz_per_s=0.0, damping_drift_per_s=0.0, structure=BARE, noise=5e-3):
+    u, y = record(periods, f0_drift_hz_per_s, damping_drift_per_s)
+    rng = np.random.default_rng(2)
+    for _ in range(RUNS):
+        yield identify_poles_from_records(
+            u + noise / 10 * rng.standard_normal(u.shape),
+            y + noise * rng.standard_normal(y.shape),
+            sample_rate_hz=RATE_HZ,
+            harmonics=HARMONICS,
+            band_hz=(200.0, 300.0),
+            structure=structure,
+        )
+
+
+def inside(errors, covariances):
+    """How many are in their 95 % ellipses."""
+    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    return np.sum(np.sum(errors * solved, axis=-1) < -2 * np.log(0.05))
+
+
+@pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
+@pytest.mark.parametrize("periods", [2, 3, 8])
+@pytest.mark.parametrize("drift", [(0.3, 0.0), (-0.5, 1e-3)], ids=["slow", "fast"])
+def test_drift_is_estimated_with_honest_ellipses(drift, periods, structure):
+    if periods == 8:
+        drift = (drift[0] / 4, drift[1] / 4)
+    found = list(fits(periods, *drift, structure))
+    constant = list(fits(periods, structure=structure))
+    assert all(p.status is PolesStatus.OK for p in found)
+    assert all("the mode changes: f0 by" in p.message for p in found)
+    assert {p.instant_s for p in found} == {(periods * SAMPLES - 1) / RATE_HZ / 2}
+    rates = np.array([[p.f0_drift_hz_per_s[0], p.damping_drift_per_s[0]] for p in found])
+    of_rates = np.stack([p.drift_covariance[0] for p in found])
+    poles = np.array([[p.f0_hz[0], p.damping_ratio[0]] for p in found])
+    unchanged = np.array([[p.f0_hz[0], p.damping_ratio[0]] for p in constant])
+    # beside the constant mode's bias, from how the record is computed
+    bias = unchanged.mean(axis=0) - [F0_HZ, DAMPING]
+    assert np.all(np.abs(bias) < [0.01, 1e-4])
+    for count in (
+        inside(rates - drift, of_rates),
+        inside(poles - bias - [F0_HZ, DAMPING], np.stack([p.covariance[0] for p in found])),
+    ):
+        assert stats.binom.cdf(count, RUNS, 0.94) > 0.0005
+    # as precise as where nothing changes
+    std, of_constant = (
+        np.sqrt(np.median([p.covariance[0, 0, 0] for p in some])) for some in (found, constant)
+    )
+    assert std < 1.2 * of_constant
+
+
+@pytest.mark.parametrize("periods", [2, 8])
+def test_a_constant_mode_does_not_change(periods):
+    for poles in fits(periods):
+        assert poles.f0_drift_hz_per_s is None
+        assert poles.drift_covariance is None
+        assert poles.instant_s is None
+        assert poles.message == ""
+
+
+def test_without_noise_rounding_is_no_change():
+    u, y = record(3, 0.0, 0.0)
+    poles = identify_poles_from_records(
+        u, y, sample_rate_hz=RATE_HZ, harmonics=HARMONICS, band_hz=(200.0, 300.0)
+    )
+    assert poles.f0_hz == pytest.approx([F0_HZ], abs=0.01)
+    rate = poles.f0_drift_hz_per_s
+    assert rate is None or abs(rate[0]) < 1e-4
