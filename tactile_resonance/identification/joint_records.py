@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.tones import ComplexArray, PlanOf, poles_without_tones
 
 IntArray = npt.NDArray[np.int64]
 
@@ -49,16 +50,22 @@ def identify_poles_from_records(
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
     if np.ndim(u) == 3 and len(u) == 1:
         u, y = u[0], y[0]
-    plan = (JointPlan if np.ndim(u) == 2 else RealisationsPlan)(
-        sample_rate_hz,
-        np.shape(u)[-1],
-        np.shape(u)[-2],
-        harmonics,
-        band_hz,
-        structure or ModelStructure(),
-        input_noise_ratio=input_noise_ratio,
-    )
-    return single(plan(u, y))
+
+    @lru_cache(maxsize=2)
+    def plan_of(left_out: tuple[int, ...]) -> JointPlan:
+        return (JointPlan if np.ndim(u) == 2 else RealisationsPlan)(
+            sample_rate_hz,
+            np.shape(u)[-1],
+            np.shape(u)[-2],
+            harmonics,
+            band_hz,
+            structure or ModelStructure(),
+            input_noise_ratio=input_noise_ratio,
+            left_out=left_out,
+        )
+
+    transform = plan_of(()).transform
+    return _without_tones(plan_of, transform(u, "u"), transform(y, "y"))
 
 
 def identify_poles_from_bins(
@@ -88,7 +95,8 @@ def identify_poles_from_bins(
     """
     if band_hz is None:
         band_hz = bins.band_hz
-    plan = _plan(
+    plan_of = partial(
+        _plan,
         bins.sample_rate_hz,
         bins.samples_per_period,
         bins.periods,
@@ -98,6 +106,7 @@ def identify_poles_from_bins(
         input_noise_ratio,
         bins.u.shape[0] > 1,
     )
+    plan = plan_of(())
     first = plan.bins[0] - bins.first_bin
     if first < 0 or first + plan.bins.size > bins.count:
         raise ValueError(
@@ -107,7 +116,14 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return single(plan.from_bins(u, y), notes=notes)
+    return _without_tones(plan_of, u, y, notes)
+
+
+def _without_tones(
+    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()
+) -> Poles:
+    batch, tones = poles_without_tones(plan_of, u, y)
+    return single(batch, notes=[*(tone.text("left out") for tone in tones), *notes])
 
 
 @lru_cache(maxsize=32)
@@ -120,6 +136,7 @@ def _plan(
     structure: ModelStructure,
     input_noise_ratio: float | None,
     several: bool,
+    left_out: tuple[int, ...],
 ) -> JointPlan:
     return (RealisationsPlan if several else JointPlan)(
         sample_rate_hz,
@@ -129,4 +146,5 @@ def _plan(
         band_hz,
         structure,
         input_noise_ratio=input_noise_ratio,
+        left_out=left_out,
     )
