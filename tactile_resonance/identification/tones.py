@@ -2,11 +2,8 @@
 """Hum and other tones in the bins of the joint estimator: found, named, taken out.
 
 A tone is a sinusoid that the excitation did not make. On an excited line it looks like response and
-bends the poles, between lines it looks like noise. One bin at a time, the one that departs most from
-the fit is tested as an outlier of a regression: by how much the cost falls without it (Cook & Weisberg,
-*Residuals and Influence in Regression* (1982), section 2.2). What it is compared with are medians of
-bins around of the same kind, so that coloured noise, distortion and an error of the model, which all
-spread over many bins, are no tones.
+bends the poles, between lines it looks like noise. One at a time, the bin that departs most from the
+fit is tested (`outliers`).
 """
 
 from __future__ import annotations
@@ -22,8 +19,14 @@ from scipy.optimize import minimize_scalar
 
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_transient import transient_basis
-from tactile_resonance.identification.result import PolesBatch
-from tactile_resonance.tones import Tone
+from tactile_resonance.identification.outliers import (
+    FALSE_ALARM,
+    MOST_TONES,
+    chances_of,
+    falls_without_each,
+)
+from tactile_resonance.identification.result import PolesBatch, PolesStatus
+from tactile_resonance.tones import ROUNDING, Tone
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -31,17 +34,6 @@ ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 PlanOf = Callable[[tuple[int, ...]], JointPlan]
 
-FALSE_ALARM = 1e-4
-"""Probability that noise of a record has a bin taken for a tone."""
-MOST_TONES = 8
-"""In a band; where there are more bins that stand out, something else is wrong."""
-WINDOW = 33
-"""Bins, or lines, around one that tell the level there."""
-MEDIAN_LOSS = 2.1
-"""Times the variance of a mean: that of a median of exponential powers."""
-FEWEST_AROUND = 8
-ROUNDING = 1e-14
-"""Of the power of the excited lines: what is smaller is no tone."""
 NEAR_BINS = 0.75
 """So near a tone bins are left out; further away what leaks is taken off."""
 BINS_OF_A_TONE = 3
@@ -50,8 +42,6 @@ PEAK_PASSES = 1e-4
 """Probability that a narrow peak of the noise passes for a tone, where it is the largest."""
 MOST_RETURNS = 8
 """How often a tone is estimated anew from a fit without it."""
-CERTAIN_LEVERAGE = 0.99
-"""A bin that the fit follows to this part cannot be tested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +117,7 @@ def poles_without_tones(
         Of shape ().
     tuple of Tone
         By frequency; none where so many bins, or neighbouring excited lines, stand out that something
-        other than tones is wrong.
+        other than tones is wrong, or where the fit without them finds no minimum.
     """
     taken: list[_Taken] = []
     whole = fitted = _Fitted.without(plan_of, u, y, taken)
@@ -146,7 +136,10 @@ def poles_without_tones(
                 taken, fitted = fewer, again
     except ValueError:  # too few lines are left
         return whole.batch, ()
-    if _lines_in_a_row(fitted.plan):
+    lost = fitted.batch.has_status(PolesStatus.NOT_CONVERGED) and not whole.batch.has_status(
+        PolesStatus.NOT_CONVERGED
+    )
+    if lost or _lines_in_a_row(fitted.plan):
         return whole.batch, ()
     named = (tone.named(fitted.plan) for tone in sorted(taken, key=lambda tone: tone.at))
     return fitted.batch, tuple(named)
@@ -242,7 +235,7 @@ class _Model:
     def without_each(self) -> FloatArray:
         """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
 
-        0 where a bin is not used, or where the fit goes through it whatever is there.
+        0 where a bin is not used.
         """
         records = self._y.shape[0]
         used = self.excited | self.others
@@ -259,20 +252,9 @@ class _Model:
         jacobian[..., :shared] = of_ab
         for m in range(records):
             jacobian[m, :, shared + m * c : shared + (m + 1) * c] = self._t
-        jacobian *= (used / (self._a * np.sqrt(self.variance)))[:, None]
-        parts = np.stack([jacobian.real, jacobian.imag], axis=2)  # (M, K, 2, n)
-        q = np.linalg.qr(parts.reshape(-1, parts.shape[-1]))[0].reshape(parts.shape)
-        error = self.errors() / np.sqrt(self.variance)
-        # (I - H) of each bin, 2 x 2: what of an error there the fit has left
-        p, r = (1 - np.sum(q[..., k, :] ** 2, axis=-1) for k in (0, 1))
-        b = -np.sum(q[..., 0, :] * q[..., 1, :], axis=-1)
-        determinant = p * r - b**2
-        least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
-        falls = (
-            r * error.real**2 - 2 * b * error.real * error.imag + p * error.imag**2
-        ) / determinant
-        tested = used & (least > 1 - CERTAIN_LEVERAGE)
-        return np.asarray(np.where(tested, falls, 0.0).mean(axis=0))
+        weight = used / np.sqrt(self.variance)
+        falls = falls_without_each(jacobian * (weight / self._a)[:, None], self.errors() * weight)
+        return np.asarray(falls.mean(axis=0))
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -292,62 +274,14 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
         least = np.maximum(least, median_filter(falls, 5))
     other = [np.zeros_like(on_line), *kinds[1:]]
     chances = {
-        "sensor": _chances(falls, kinds, len(fitted.y), least),
-        "actuator": _chances(input_power, other, len(fitted.u), rounding_u),
+        "sensor": chances_of(falls, kinds, len(fitted.y), least),
+        "actuator": chances_of(input_power, other, len(fitted.u), rounding_u),
     }
     tests = np.count_nonzero(model.excited) + 2 * np.count_nonzero(model.others)
     channel = min(chances, key=lambda name: chances[name].min())
     k = int(np.argmin(chances[channel]))
     striking = chances[channel][k] * tests < FALSE_ALARM
     return (int(plan.bins[k]), channel) if striking else None
-
-
-def _chances(
-    power: FloatArray, kinds: list[BoolArray], records: int, least: FloatArray | float
-) -> FloatArray:
-    """(K,) probability that noise makes a power as large as that of each bin, from those around.
-
-    Parameters
-    ----------
-    power : (K,) float
-        Means over records.
-    kinds : list of (K,) bool
-        Excited lines, other harmonics, and bins between, with noise alone. Harmonics may hold
-        distortion: they are compared with the larger level of their own kind and of the noise, the
-        other harmonics, where they are few, also with that of the excited ones.
-    records : int
-    least : (K,) float or float
-        Level of rounding.
-    """
-    chance = np.ones(power.size)
-    levels = [_level(power, kind, records) for kind in kinds]
-    for kind, (own, around), spare in zip(kinds, levels, (None, levels[0], None), strict=True):
-        between, between_around = levels[-1]
-        level = np.maximum(own, between)
-        if not around and spare is not None:
-            level, around = np.maximum(level, spare[0]), spare[1]
-        # the larger of two levels makes fewer false alarms than either
-        around = between_around or around
-        if around:
-            dof = records * around / MEDIAN_LOSS
-            ratio = power[kind] / np.maximum(level, least)[kind]
-            chance[kind] = special.fdtrc(2 * records, 2 * dof, ratio)
-    return chance
-
-
-def _level(power: FloatArray, kind: BoolArray, records: int) -> tuple[FloatArray, int]:
-    """(K,) level at each bin by the median of those of a kind around, and how many these are.
-
-    Zero where there are too few.
-    """
-    at = np.flatnonzero(kind)
-    around = min(WINDOW, at.size)
-    if around < FEWEST_AROUND:
-        return np.zeros(power.size), 0
-    medians = np.median(np.lib.stride_tricks.sliding_window_view(power[at], around), axis=-1)
-    nearest = np.searchsorted(at, np.arange(power.size))
-    first = np.clip(nearest - around // 2, 0, medians.size - 1)
-    return medians[first] * (records / special.gammaincinv(records, 0.5)), around
 
 
 def _spectrum_of(at: float, plan: JointPlan) -> ComplexArray:

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
+from identification import mode_at_250_hz as mode
 
 from benchmarks.poles_plant import (
     BAND_HZ,
@@ -16,6 +17,7 @@ from benchmarks.poles_plant import (
     response,
 )
 from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.joint_records import identify_poles_from_bins
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.multisine import mains_lines
@@ -195,3 +197,28 @@ def test_errors_of_the_model_distortion_and_noise_of_the_generator_are_no_tones(
     for disturb in (another_mode, distortion, generator):
         for poles in runs([plant], 15, disturb):
             assert "tone" not in poles.message
+
+
+@pytest.mark.parametrize(("line", "hum"), [(20, ": fits hum of 50 Hz"), (12, ""), (3, "")])
+def test_a_tone_on_a_line_of_an_frf_is_named_and_moves_nothing(line, hum):
+    """20 deviations of a line: before, model error without a name."""
+    g = mode.NOISY.copy()
+    g[line] += 0.02j
+    poles = identify_poles(mode.frf(g=g), BAND_HZ)
+    assert poles.status is PolesStatus.OK
+    assert poles.message == f"tone at {mode.LINES_HZ[line]:.1f} Hz left out{hum}"
+    error = [poles.f0_hz[0] - F0_HZ, poles.damping_ratio[0] - 0.02]
+    assert error @ np.linalg.solve(poles.covariance[0], error) < 13.8  # once in a thousand
+
+
+@pytest.mark.parametrize("spread", [0.0, 3.0])
+def test_noise_of_an_frf_is_no_tone(spread):
+    """With sample variances of 7 degrees of freedom, and where lines differ by up to e^3 in it."""
+    rng = np.random.default_rng(3)
+    for _ in range(500):
+        variance = 1e-6 * np.exp(rng.uniform(-spread, spread, 41))
+        frf = mode.frf(
+            g=mode.G + mode.circular(rng, (41,), variance),
+            variance_noise=variance * rng.gamma(7, 1 / 7, 41),
+        )
+        assert "tone" not in identify_poles(frf, BAND_HZ).message
