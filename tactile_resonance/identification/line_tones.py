@@ -16,7 +16,7 @@ from tactile_resonance.identification.outliers import (
     chances_of,
     falls_without_each,
 )
-from tactile_resonance.identification.result import PolesBatch
+from tactile_resonance.identification.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone
 
 # Lines over which the variance counts as constant: that of one alone is too uncertain to divide by.
@@ -45,6 +45,8 @@ def poles_without_tones(
         batch = fit(rest)
         if len(found) > MOST_TONES or 1 in np.diff(np.sort(found)):
             return whole, ()  # neighbours stand out, or too many: that is no tone
+    if batch.has_status(PolesStatus.MODEL_ERROR) or batch.has_status(PolesStatus.NOT_CONVERGED):
+        return whole, ()  # distortion, or what the model leaves out, may be that large on a line
     spacing_hz = float(np.diff(frf.frequency_hz).min()) if found else 0.0
     tones = []
     for line in sorted(found):

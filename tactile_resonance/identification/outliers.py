@@ -25,8 +25,8 @@ MOST_TONES = 8
 """In a band; where there are more bins that stand out, something else is wrong."""
 WINDOW = 33
 """Bins, or lines, around one that tell the level there."""
-MEDIAN_LOSS = 2.1
-"""Times the variance of a mean: that of a median of exponential powers."""
+MEDIAN_LOSS = 3.0
+"""Times the variance of a mean that a median of exponential powers counts as having: 2.1, and its tails."""
 CERTAIN_LEVERAGE = 0.99
 """A bin that the fit follows to this part cannot be tested."""
 
@@ -56,7 +56,10 @@ def falls_without_each(jacobian: ComplexArray, error: ComplexArray) -> FloatArra
 
 
 def chances_of(
-    power: FloatArray, kinds: list[BoolArray], records: int, least: FloatArray | float,
+    power: FloatArray,
+    kinds: list[BoolArray],
+    records: int,
+    least: FloatArray | float,
     most_dof: float = np.inf,
 ) -> FloatArray:
     """(K,) probability that noise makes a power as large as that of each bin, from those around.
@@ -66,9 +69,10 @@ def chances_of(
     power : (K,) float
         Means over records.
     kinds : list of (K,) bool
-        Excited lines, other harmonics, and bins between, with noise alone. Harmonics may hold
-        distortion: they are compared with the larger level of their own kind and of the noise, the
-        other harmonics, where they are few, also with that of the excited ones.
+        First excited lines, then kinds of other harmonics, last the bins between, with noise alone.
+        Harmonics may hold distortion: they are compared with the larger level of their own kind and of
+        the noise. Other harmonics that are few of their kind are compared with the excited ones, and not
+        tested where there are none.
     records : int
     least : (K,) float or float
         Level of rounding.
@@ -77,11 +81,13 @@ def chances_of(
     """
     chance = np.ones(power.size)
     levels = [level_around(power, kind, records, WINDOW) for kind in kinds]
-    for kind, (own, around), spare in zip(kinds, levels, (None, levels[0], None), strict=True):
-        between, between_around = levels[-1]
+    between, between_around = levels[-1]
+    for k, (kind, (own, around)) in enumerate(zip(kinds, levels, strict=True)):
+        if not around and 0 < k < len(kinds) - 1:
+            own, around = levels[0]
+            if not around:
+                continue
         level = np.maximum(own, between)
-        if not around and spare is not None:
-            level, around = np.maximum(level, spare[0]), spare[1]
         # the larger of two levels makes fewer false alarms than either
         around = between_around or around
         if around:

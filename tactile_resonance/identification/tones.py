@@ -39,7 +39,8 @@ NEAR_BINS = 0.75
 BINS_OF_A_TONE = 3
 """On either side of its peak, from which it is estimated."""
 PEAK_PASSES = 1e-4
-"""Probability that a narrow peak of the noise passes for a tone, where it is the largest."""
+"""Probability that a narrow peak of noise or distortion passes for a tone, where it is the largest."""
+LINES_AROUND = 3
 MOST_RETURNS = 8
 """How often a tone is estimated anew from a fit without it."""
 
@@ -67,6 +68,10 @@ class _Taken:
     def leak(self, plan: JointPlan) -> ComplexArray:
         """(M, K) what it adds to the bins of a band."""
         return self.phasor[:, None] * _spectrum_of(self.at, plan)
+
+    def on_line_of(self, plan: JointPlan) -> bool:
+        """Whether a harmonic of the period is left out for it, excited or not."""
+        return any(n % plan.periods == 0 for n in self.bins)
 
     def named(self, plan: JointPlan) -> Tone:
         """For people."""
@@ -123,10 +128,7 @@ def poles_without_tones(
     whole = fitted = _Fitted.without(plan_of, u, y, taken)
     try:
         while (found := _most_striking(fitted)) is not None:
-            more, without = _taken_too(plan_of, u, y, taken, *found)
-            if not _is_steady(without, more[-1]):
-                break
-            taken, fitted = more, without
+            taken, fitted = _taken_too(plan_of, u, y, taken, *found)
             if len(taken) > MOST_TONES:
                 return whole.batch, ()
         # a large tone bends the fit, and then others that are none stand out too
@@ -134,6 +136,12 @@ def poles_without_tones(
             fewer = [other for other in taken if other is not tone]
             if fewer and _most_striking(again := _Fitted.without(plan_of, u, y, fewer)) is None:
                 taken, fitted = fewer, again
+        sure = [tone for tone in taken if _stands_alone(fitted, tone)]
+        if fitted.batch.has_status(PolesStatus.MODEL_ERROR):
+            # what the model leaves out, or distortion, may be that large on a single line
+            sure = [tone for tone in sure if not tone.on_line_of(fitted.plan)]
+        if len(sure) < len(taken):
+            taken, fitted = sure, _Fitted.without(plan_of, u, y, sure)
     except ValueError:  # too few lines are left
         return whole.batch, ()
     lost = fitted.batch.has_status(PolesStatus.NOT_CONVERGED) and not whole.batch.has_status(
@@ -267,11 +275,12 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
         ROUNDING * np.mean(np.abs(x[:, model.driven]) ** 2) for x in (fitted.y, fitted.u)
     )
     on_line = plan.bins % plan.periods == 0
-    kinds = [model.excited, model.others & on_line, model.others & ~on_line]
+    silent, odd = model.others & on_line, plan.bins // plan.periods % 2 == 1
+    kinds = [model.excited, silent & ~odd, silent & odd, model.others & ~on_line]
     input_power = np.mean(np.abs(fitted.u) ** 2, axis=0)
     falls, least = model.without_each(), rounding_y / model.variance
     if not plan.level_known:  # noise of the input may make more at a resonance
-        least = np.maximum(least, median_filter(falls, 5))
+        least = np.maximum(least, 1.4 * median_filter(falls, 5))
     other = [np.zeros_like(on_line), *kinds[1:]]
     chances = {
         "sensor": chances_of(falls, kinds, len(fitted.y), least),
@@ -316,13 +325,27 @@ def _tone_near(
     return float(found.x), fit(float(found.x))[1]
 
 
-def _is_steady(fitted: _Fitted, tone: _Taken) -> bool:
-    """Whether little is left around a tone once it is taken off: of a peak of the noise much is."""
-    plan = fitted.plan
-    near = np.isin(plan.bins, plan.other_bins) & (np.abs(plan.bins - tone.at) <= 2 * BINS_OF_A_TONE)
-    rest = fitted.u if tone.channel == "actuator" else _Model(fitted).errors()
-    left = rest[:, near]
-    if left.shape[1] < 2:
-        return True
-    ratio = np.sum(np.abs(tone.phasor) ** 2) / np.sum(np.mean(np.abs(left) ** 2, axis=1))
-    return bool(special.fdtrc(2 * len(left), 2 * left.size, ratio) < PEAK_PASSES)
+def _stands_alone(fitted: _Fitted, tone: _Taken) -> bool:
+    """Whether little is left around a tone once it is taken off: of a peak of noise or distortion much is.
+
+    Around are bins between lines, and lines where the tone is on one.
+    """
+    plan, model = fitted.plan, _Model(fitted)
+    power = np.sum(np.abs(tone.phasor) ** 2)
+    rest = fitted.u if tone.channel == "actuator" else model.errors()
+    away = np.abs(plan.bins - tone.at)
+    kinds = [(model.others, 4 * BINS_OF_A_TONE)]
+    if tone.channel == "sensor" and tone.on_line_of(plan):
+        kinds.append((model.excited, 2 * LINES_AROUND))
+    for kind, count in kinds:
+        at = np.flatnonzero(kind)
+        near = at[np.argsort(away[at])[:count]]
+        if near.size < 2:
+            continue
+        left = np.abs(rest[:, near]) ** 2
+        # as large as at the tone, were they noise of the model's variance
+        left = left / model.variance[near] * np.interp(tone.at, plan.bins, model.variance)
+        ratio = power / np.sum(np.mean(left, axis=1))
+        if special.fdtrc(2 * len(left), 2 * left.size, ratio) > PEAK_PASSES:
+            return False
+    return True

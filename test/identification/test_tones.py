@@ -165,6 +165,26 @@ def test_a_tone_in_the_actuator_channel_is_named_as_such():
     assert poles.status is PolesStatus.OK
 
 
+def test_distortion_on_lines_of_an_odd_random_grid_is_no_tone():
+    """Few odd lines without excitation: before their level was compared with that of the even ones."""
+    plant = Plant(0.02, 40.0, 4)
+    bins = plant.bins()
+    line = bins // 4 - HARMONICS[0]
+    detection = (bins % 4 == 0) & (bins // 4 % 8 == 3)
+    odd = (bins % 4 == 0) & (bins // 4 % 2 == 1)
+    harmonics = HARMONICS[(HARMONICS % 2 == 1) & (HARMONICS % 8 != 3)]
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        u, y = plant.noisy(rng, 1, bins)
+        s = 2j * np.pi * bins * (SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD / 4)
+        silent = (bins % 4 == 0) & (~odd | detection)
+        clean = np.where(silent, plant.phasor[line], 0)
+        level = 20 * np.sqrt(plant.noise[0]) * detection
+        u = u - clean + level * np.exp(1j * rng.uniform(0, 7, bins.size))
+        y = y - clean * response(plant.theta, s)
+        assert "tone" not in identify([plant], u, y, harmonics).message
+
+
 def test_noise_is_no_tone():
     """One of 4800: at most one of a thousand by the 95 % bound of Clopper and Pearson, 4.74 / 4800."""
     plant = Plant(0.02, 40.0, 2)
@@ -190,11 +210,17 @@ def test_errors_of_the_model_distortion_and_noise_of_the_generator_are_no_tones(
     def distortion(rng, u, y):
         return u, y + circular(rng, y.shape) * excited
 
+    def at_the_resonance(rng, u, y):
+        return u, y + circular(rng, y.shape) * response(plant.theta, s) * excited
+
+    def peak_of_noise(rng, u, y):
+        return u, y + circular(rng, y.shape) * response(plant.theta, s)
+
     def generator(rng, u, y):
         noise = circular(rng, u.shape)
         return u + noise, y + response(plant.theta, s) * noise
 
-    for disturb in (another_mode, distortion, generator):
+    for disturb in (another_mode, distortion, at_the_resonance, peak_of_noise, generator):
         for poles in runs([plant], 15, disturb):
             assert "tone" not in poles.message
 
