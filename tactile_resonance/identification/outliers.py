@@ -25,7 +25,7 @@ MOST_TONES = 8
 """In a band; where there are more bins that stand out, something else is wrong."""
 WINDOW = 33
 """Bins, or lines, around one that tell the level there."""
-MEDIAN_LOSS = 3.0
+MEDIAN_LOSS = 2.5
 """Times the variance of a mean that a median of exponential powers counts as having: 2.1, and its tails."""
 CERTAIN_LEVERAGE = 0.99
 """A bin that the fit follows to this part cannot be tested."""
