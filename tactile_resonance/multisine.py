@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -163,6 +164,40 @@ def harmonics_on_grid(
     return lines
 
 
+def mains_lines(
+    frequency_hz: FloatArray, spacing_hz: float, mains_hz: Sequence[float], lines_beside: int = 1
+) -> npt.NDArray[np.bool_]:
+    """(F,) which lines are the nearest to a harmonic of the mains, or one of those beside it.
+
+    Parameters
+    ----------
+    frequency_hz : (F,) float
+        Multiples of `spacing_hz`.
+    spacing_hz : float
+    mains_hz : sequence of float
+    lines_beside : int
+        On either side of the nearest one.
+
+    Raises
+    ------
+    ValueError
+        If a frequency has harmonics so near each other that no line would be left between them.
+    """
+    if not (isinstance(lines_beside, int) and lines_beside >= 0):
+        raise ValueError(f"lines_beside: {lines_beside!r}, expected a whole number, at least 0")
+    width_hz = (2 * lines_beside + 1) * spacing_hz
+    found = np.zeros(np.shape(frequency_hz), bool)
+    for mains in mains_hz:
+        if not width_hz < mains < np.inf:
+            raise ValueError(
+                f"mains_hz: {mains:g}, expected above {width_hz:g} Hz, what {2 * lines_beside + 1} "
+                f"lines of {spacing_hz:g} Hz take up"
+            )
+        harmonic = np.maximum(np.round(frequency_hz / mains), 1)
+        found |= np.abs(frequency_hz - harmonic * mains) < width_hz / 2
+    return found
+
+
 def design_multisine(
     *,
     sample_rate_hz: float = 50e3,
@@ -172,6 +207,8 @@ def design_multisine(
     scale_by: str = "rms",
     grid: Grid = Grid.FULL,
     block_lines: int = 4,
+    mains_hz: Sequence[float] = (),
+    lines_beside: int = 1,
     relative_amplitude: npt.ArrayLike | None = None,
     seed: int = 0,
     realisation: int = 0,
@@ -197,6 +234,11 @@ def design_multisine(
     scale_by : {"rms", "peak"}
     grid, block_lines
         See `harmonics_on_grid`.
+    mains_hz : sequence of float
+        The lines of the grid at harmonics of these, and `lines_beside` on either side, are not excited
+        (`mains_lines`): hum is then seen between the lines, and bends no response. None by default,
+        for near a pole such lines are those that tell most (docs/poles.md).
+    lines_beside : int
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.
     seed, realisation, realisations, periods, measurement_id, excitation_id, label
@@ -227,6 +269,11 @@ def design_multisine(
     low = int(np.ceil(low_hz / resolution_hz - 1e-9))
     high = int(np.floor(high_hz / resolution_hz + 1e-9))
     harmonics = harmonics_on_grid(low, high, grid, seed=seed, block_lines=block_lines)
+    frequency_hz = np.asarray(harmonics * resolution_hz, float)
+    hum = mains_lines(frequency_hz, resolution_hz, mains_hz, lines_beside)
+    if hum.all():
+        raise ValueError(f"mains_hz: {list(mains_hz)} leave no line of {low_hz:g}..{high_hz:g} Hz")
+    harmonics = harmonics[~hum]
     shape = np.ones(harmonics.size)
     if relative_amplitude is not None:
         shape = np.asarray(relative_amplitude, float)

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.multisine import Grid, design_multisine, harmonics_on_grid
+from tactile_resonance.multisine import Grid, design_multisine, harmonics_on_grid, mains_lines
 
 
 def test_default_is_the_papers_signal():
@@ -55,6 +55,30 @@ def test_odd_random_grid_leaves_out_one_of_each_block():
     assert np.all(np.abs(places - 25) < 20)
 
 
+@pytest.mark.parametrize("grid", [Grid.FULL, Grid.ODD, Grid.ODD_RANDOM])
+def test_lines_at_harmonics_of_the_mains_are_not_excited(grid):
+    whole = design_multisine(grid=grid, seed=5)
+    left = design_multisine(grid=grid, seed=5, mains_hz=(50.0, 60.0))
+    # on the grid of 2.5 Hz these are multiples of 20 and 24; one line beside each is left out too
+    far = [min(n % 20, -n % 20) > 1 and min(n % 24, -n % 24) > 1 for n in whole.harmonics]
+    np.testing.assert_array_equal(left.harmonics, whole.harmonics[far])
+    assert 0.5 * whole.harmonics.size < left.harmonics.size < 0.8 * whole.harmonics.size
+    assert left.level_v == pytest.approx(1.0, rel=1e-12)
+    assert np.ptp(left.amplitude_v) < 1e-15
+
+
+def test_mains_between_lines_takes_the_nearest_ones():
+    spacing_hz = 5000 / 2048
+    frequency_hz = np.arange(1, 200) * spacing_hz
+    for beside in (0, 1, 2):
+        found = frequency_hz[mains_lines(frequency_hz, spacing_hz, (50.0,), beside)]
+        near = found[np.abs(found - 250) < 25]
+        nearest = np.argsort(np.abs(frequency_hz - 250))[: 2 * beside + 1]
+        np.testing.assert_array_equal(near, np.sort(frequency_hz[nearest]))
+    # neither zero frequency nor what lies below the mains has anything to do with it
+    assert found.min() > 40
+
+
 def test_realisations_share_lines_but_not_phases_and_seeds_repeat():
     make = {"grid": Grid.ODD_RANDOM, "seed": 11, "realisations": 2}
     first = design_multisine(realisation=0, **make)
@@ -91,6 +115,10 @@ def test_crest_factor_of_random_phases_is_near_four():
         ({"relative_amplitude": np.ones(3)}, "relative_amplitude"),
         ({"grid": Grid.CUSTOM}, "grid: custom"),
         ({"periods": 0}, "periods: 0"),
+        ({"mains_hz": (50.0, 5.0)}, "mains_hz: 5, expected above 7.5 Hz"),
+        ({"mains_hz": (float("nan"),)}, "mains_hz: nan"),
+        ({"mains_hz": (50.0,), "band_hz": (248, 252)}, "mains_hz: .* leave no line"),
+        ({"lines_beside": -1}, "lines_beside: -1"),
     ],
 )
 def test_bad_input_names_the_field(change, message):

@@ -24,6 +24,7 @@ from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store_recording import read_store_recording, recording_of
+from tactile_resonance.silent import silent_record
 
 MOST_HARMONICS = 10**7
 
@@ -117,6 +118,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         action="store_true",
         help="even and odd distortion at the lines left out; --plot then draws FILE_distortion too",
     )
+    parser.add_argument(
+        "--silent",
+        action="store_true",
+        help="the record was taken without drive: name its tones (hum) and its noise level",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
     parser.set_defaults(run=run)
@@ -196,6 +202,15 @@ def run(options: argparse.Namespace) -> int:
             segments=options.segments,
             excited_harmonics=options.harmonics,
         )
+    band_hz = _band(options.band, recording.sample_rate_hz)
+    if options.silent:
+        for name in ("json", "plot"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"{name}: not with --silent, which prints")
+        rate_hz = recording.sample_rate_hz
+        found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
+        print(found.text())
+        return 0
     structures = [ModelStructure.with_residual(2 if options.order is None else options.order)]
     if options.order is None:
         if options.numerator_order is not None:
@@ -206,15 +221,6 @@ def run(options: argparse.Namespace) -> int:
     if options.domain == "z":
         rate_hz = recording.sample_rate_hz
         structures = [replace(s, domain="z", sample_rate_hz=rate_hz) for s in structures]
-    band_hz = None
-    if options.band is not None:
-        low_hz, high_hz = options.band
-        nyquist_hz = recording.sample_rate_hz / 2
-        if not 0 <= low_hz < high_hz <= nyquist_hz:
-            raise ValueError(
-                f"band: {low_hz:g} {high_hz:g}, expected 0 <= LO < HI <= {nyquist_hz:g} Hz"
-            )
-        band_hz = (low_hz, high_hz)
     analysis = analyse(
         recording,
         band_hz=band_hz,
@@ -246,6 +252,17 @@ def run(options: argparse.Namespace) -> int:
         write_whole(path, content)
     print(as_text(analysis))
     return 0
+
+
+def _band(band_hz: list[float] | None, sample_rate_hz: float) -> tuple[float, float] | None:
+    if band_hz is None:
+        return None
+    low_hz, high_hz = band_hz
+    if not 0 <= low_hz < high_hz <= sample_rate_hz / 2:
+        raise ValueError(
+            f"band: {low_hz:g} {high_hz:g}, expected 0 <= LO < HI <= {sample_rate_hz / 2:g} Hz"
+        )
+    return low_hz, high_hz
 
 
 def as_text(analysis: Analysis) -> str:

@@ -12,6 +12,7 @@ from scipy import special
 
 from tactile_resonance.frf.fault_types import Fault, FaultKind
 from tactile_resonance.frf.spectra import period_spectra
+from tactile_resonance.tones import MAINS_HZ, ROUNDING
 
 Samples = npt.NDArray[np.floating]
 Lines = npt.NDArray[np.integer]
@@ -24,7 +25,6 @@ LARGE_OFFSET = 0.1
 """Mean against the rms of the rest."""
 LARGE_DRIFT = 0.05
 """Spread of the means of the periods against the rms of the rest."""
-MAINS_HZ = (50.0, 60.0)
 MAINS_HARMONICS = 5
 _HUM_FLOOR_BINS = (10, 40)  # distance from the mains frequency at which the floor is taken
 _FALSE_ALARM = 1e-4
@@ -102,6 +102,7 @@ def hum(x: Samples, channel: str, sample_rate_hz: float, harmonics: Lines) -> li
     highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
     spectrum = scipy.fft.rfft(x.ravel() - x.mean())[: math.ceil(highest) + 1]
     power = 2 * np.abs(spectrum) ** 2 / length**2  # mean square per bin
+    rounding = ROUNDING * float(np.var(x))
     excited = np.zeros(power.size, bool)
     lines = np.asarray(harmonics) * periods
     excited[lines[lines < power.size]] = True
@@ -126,7 +127,7 @@ def hum(x: Samples, channel: str, sample_rate_hz: float, harmonics: Lines) -> li
             floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
             # the floor of a few bins is itself uncertain
             limit = special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size)
-            if power[peak].max() > 2 * limit * floor:
+            if power[peak].max() > max(2 * limit * floor, rounding):
                 near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
                 peaks.append((k * mains, float(power[peak].sum()), near))
         # the fundamental may be hidden, a single high harmonic may be anything

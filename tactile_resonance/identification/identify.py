@@ -13,6 +13,7 @@ from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import modes_in_band
 from tactile_resonance.identification.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.identification.judgement import Evidence, assemble
+from tactile_resonance.identification.line_tones import poles_without_tones
 from tactile_resonance.identification.line_weights import lines_of_frf, lines_of_spectra
 from tactile_resonance.identification.lines_compiled import fit_compiled
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
@@ -46,7 +47,8 @@ def identify_poles(
     Parameters
     ----------
     frf : FRF
-        With (F,) arrays. Lines whose response or variance is not finite are left out, and said so.
+        With (F,) arrays. Lines whose response or variance is not finite, or that hold a tone, are left
+        out, and said so.
     band_hz : (low, high), optional
         All lines when absent.
     structure : ModelStructure, optional
@@ -71,9 +73,12 @@ def identify_poles(
             f"frf.g: shape {np.shape(frf.g)}, expected (F,); identify_batch takes batches"
         )
     frf = checked_frf(frf)
-    batch = identify_batch(frf, band_hz, structure)
-    notes = []
-    left_out = frf.band(*batch.band_hz).g.size - int(batch.lines)
+    selected = frf.band(*checked_band(frf.frequency_hz, band_hz))
+    batch, tones = poles_without_tones(
+        lambda lines: identify_batch(lines, band_hz, structure), selected
+    )
+    notes = [tone.text("left out") for tone in tones]
+    left_out = selected.g.size - int(batch.lines) - len(tones)
     if left_out:
         notes.append(f"{left_out} lines without a finite response, or a variance above 0, left out")
     if frf.status is not FrfStatus.OK or frf.variance_noise is None:

@@ -54,6 +54,8 @@ class JointLayout:
     input_noise_ratio : float, optional
         Variance of the noise on a bin of U over that on a bin of Y. Needed for one period only:
         with several it is estimated.
+    left_out : tuple of int
+        Bins that are neither: those of tones (`tones`).
 
     Attributes
     ----------
@@ -76,6 +78,7 @@ class JointLayout:
     structure: ModelStructure = field(default_factory=ModelStructure)
     transient_terms: int | None = None
     input_noise_ratio: float | None = None
+    left_out: tuple[int, ...] = ()
     bins: IntArray = field(init=False)
     excited_bins: IntArray = field(init=False)
     other_bins: IntArray = field(init=False)
@@ -96,6 +99,9 @@ class JointLayout:
         excited = np.ones(bins.size, bool)
         if self.harmonics is not None:
             excited = np.isin(bins, whole_harmonics(self.harmonics) * self.periods)
+        kept = ~np.isin(bins, self.left_out)
+        others = self._between(bins, excited) & kept
+        excited &= kept
         parameters = self.structure.parameters
         if excited.sum() <= self.structure.fewest_lines:
             raise ValueError(
@@ -116,7 +122,6 @@ class JointLayout:
             frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
         )
         groups = [BinGroup(denominator.values[excited], numerator.values, transient[excited])]
-        others = self._between(bins, excited)
         if others.any():
             groups.insert(0, BinGroup(denominator.values[others], None, transient[others]))
         fields = {
@@ -161,6 +166,7 @@ class JointLayout:
                 self.band_hz,
                 richer(self.structure),
                 input_noise_ratio=self.input_noise_ratio,
+                left_out=self.left_out,
             )
         except ValueError:
             return None

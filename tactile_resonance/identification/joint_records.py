@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.identification.single_point import single
 from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.identification.tones import PlanOf, poles_without_tones
 
 IntArray = npt.NDArray[np.int64]
 
@@ -53,16 +54,22 @@ def identify_poles_from_records(
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
     if np.ndim(u) == 3 and len(u) == 1:
         u, y = u[0], y[0]
-    plan = (JointPlan if np.ndim(u) == 2 else RealisationsPlan)(
-        sample_rate_hz,
-        np.shape(u)[-1],
-        np.shape(u)[-2],
-        harmonics,
-        band_hz,
-        structure or ModelStructure(),
-        input_noise_ratio=input_noise_ratio,
-    )
-    return _of_plan(plan, plan.transform(u, "u"), plan.transform(y, "y"))
+
+    @lru_cache(maxsize=2)
+    def plan_of(left_out: tuple[int, ...]) -> JointPlan:
+        return (JointPlan if np.ndim(u) == 2 else RealisationsPlan)(
+            sample_rate_hz,
+            np.shape(u)[-1],
+            np.shape(u)[-2],
+            harmonics,
+            band_hz,
+            structure or ModelStructure(),
+            input_noise_ratio=input_noise_ratio,
+            left_out=left_out,
+        )
+
+    transform = plan_of(()).transform
+    return _of_plan(plan_of, transform(u, "u"), transform(y, "y"))
 
 
 def identify_poles_from_bins(
@@ -92,7 +99,8 @@ def identify_poles_from_bins(
     """
     if band_hz is None:
         band_hz = bins.band_hz
-    plan = _plan(
+    plan_of = partial(
+        _plan,
         bins.sample_rate_hz,
         bins.samples_per_period,
         bins.periods,
@@ -102,6 +110,7 @@ def identify_poles_from_bins(
         input_noise_ratio,
         bins.u.shape[0] > 1,
     )
+    plan = plan_of(())
     first = plan.bins[0] - bins.first_bin
     if first < 0 or first + plan.bins.size > bins.count:
         raise ValueError(
@@ -111,12 +120,15 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return _of_plan(plan, u, y, notes)
+    return _of_plan(plan_of, u, y, notes)
 
 
-def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
-    """Poles from bins, by all of them as excitation, or with their drift, where the record asks for it."""
-    batch = plan.from_bins(u, y)
+def _of_plan(plan_of: PlanOf, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
+    """Poles from bins: without tones, by all bins as excitation, with drift, as the record asks for."""
+    batch, tones = poles_without_tones(plan_of, u, y)
+    if tones:
+        return single(batch, notes=[*(tone.text("left out") for tone in tones), *notes])
+    plan = plan_of(())
     poles = poles_with_all_bins(plan, u, y, batch)
     if poles is None and y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
         poles = poles_with_drift(plan, u, y, batch)
@@ -135,6 +147,7 @@ def _plan(
     structure: ModelStructure,
     input_noise_ratio: float | None,
     several: bool,
+    left_out: tuple[int, ...],
 ) -> JointPlan:
     return (RealisationsPlan if several else JointPlan)(
         sample_rate_hz,
@@ -144,4 +157,5 @@ def _plan(
         band_hz,
         structure,
         input_noise_ratio=input_noise_ratio,
+        left_out=left_out,
     )

@@ -95,6 +95,7 @@ class RealisationsPlan(JointPlan):
             self.structure,
             self.transient_terms,
             self.input_noise_ratio,
+            self.left_out,
         )
 
     def _between(self, bins: IntArray, excited: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -41,6 +41,16 @@ PARAMETERS = (
         "Which harmonics are excited.",
         choices=tuple(grid.value for grid in GRIDS.values()),
     ),
+    Parameter(
+        "mains_hz",
+        0.0,
+        "Lines at the harmonics of this mains frequency are not excited; 0 excites all [Hz].",
+        0.0,
+        1e3,
+    ),
+    Parameter(
+        "mains_lines_beside", 1, "So many lines on either side of them are not excited too.", 0, 100
+    ),
     Parameter("periods", 8, "Periods of each realisation.", 1, 10**6),
     Parameter(
         "realisations", 1, "Realisations of the phases in each measurement.", 1, MOST_REALISATIONS
@@ -80,9 +90,10 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     ValueError
         Names the field, its value, and what is accepted.
     """
-    rate, samples, low, high, level, max_level, grid, periods, realisations, seed, passes = values(
+    rate, samples, low, high, level, max_level, grid, mains, beside, *rest = values(
         node, *(parameter.name for parameter in PARAMETERS)
     )
+    periods, realisations, seed, passes = rest
     level = goal.level_v or level
     if not level <= max_level:
         raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
@@ -98,6 +109,8 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
             band_hz=(goal.f_min_hz or low, goal.f_max_hz or high),
             level_v=level,
             grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
+            mains_hz=(mains,) if mains else (),
+            lines_beside=beside,
             seed=goal.seed or seed + measurements,
             realisation=realisation,
             realisations=realisations,

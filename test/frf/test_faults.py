@@ -11,6 +11,7 @@ from tactile_resonance.frf.fault_types import FaultKind, FaultReport
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.multisine import design_multisine
 
 RATE, SAMPLES, PERIODS = 2000.0, 1000, 6
 LINES = np.arange(5, 200, 2)  # 10 to 398 Hz
@@ -109,6 +110,18 @@ def test_hum(record, mains, near):
     fault = only(check(u, y + 0.01 * np.sin(2 * np.pi * mains * t)), FaultKind.HUM, "sensor")
     assert f"{round(mains)} Hz" in fault.message
     assert fault.spoils is near
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_rounding_leaves_is_no_hum(seed):
+    """Records without noise: before, hum of 1e-17 V."""
+    excitation = design_multisine(band_hz=(180.0, 320.0), seed=seed)
+    x = np.tile(excitation.period(), (8, 1))
+    assert record_checks.hum(x, "sensor", 50e3, excitation.harmonics) == []
+    t = np.arange(x.size).reshape(x.shape) / 50e3
+    hum = 1e-6 * np.sin(2 * np.pi * 50.1 * t)
+    (fault,) = record_checks.hum(x + hum, "sensor", 50e3, excitation.harmonics)
+    assert "at 50 Hz, at least" in fault.message
 
 
 def test_hum_of_the_silverbox(shared_data):

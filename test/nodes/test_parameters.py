@@ -114,3 +114,25 @@ def test_compressed_phases_for_one_realisation_only(ros):
             excitation_design.design(node, Measure.Goal(realisations=2), 0)
     finally:
         node.destroy_node()
+
+
+def test_lines_of_the_mains_are_left_out_where_the_laboratory_says_so(ros):
+    from tactile_resonance.action import Measure
+
+    from tactile_resonance.nodes import excitation_design
+
+    node = excitation_node.ExcitationNode()
+    goal = Measure.Goal(f_min_hz=190.0, f_max_hz=310.0)
+    try:
+        (whole,) = excitation_design.design(node, goal, 0)
+        node.set_parameters([RosParameter("mains_hz", value=50.0)])
+        (left,) = excitation_design.design(node, goal, 0)
+        assert sorted({*whole.frequency_hz} - {*left.frequency_hz}) == [
+            *(197.5, 200.0, 202.5, 247.5, 250.0, 252.5, 297.5, 300.0, 302.5)
+        ]
+        assert left.level_v == pytest.approx(whole.level_v)
+        node.set_parameters([RosParameter("mains_hz", value=5.0)])
+        with pytest.raises(ValueError, match="mains_hz: 5, expected above 7.5 Hz"):
+            excitation_design.design(node, goal, 0)
+    finally:
+        node.destroy_node()

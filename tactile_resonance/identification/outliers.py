@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the bin, or line, that departs most from a fit does so as noise would make it.
+
+The test of an outlier of a regression: by how much the cost falls without it (Cook & Weisberg,
+*Residuals and Influence in Regression* (1982), section 2.2). What it is compared with are medians of
+bins around of the same kind, so that coloured noise, distortion and an error of the model, which all
+spread over many bins, are no outliers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from tactile_resonance.tones import level_around
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+FALSE_ALARM = 1e-4
+"""Probability that noise of a record has a bin taken for a tone."""
+MOST_TONES = 8
+"""In a band; where there are more bins that stand out, something else is wrong."""
+WINDOW = 33
+"""Bins, or lines, around one that tell the level there."""
+MEDIAN_LOSS = 2.5
+"""Times the variance of a mean that a median of exponential powers counts as having: 2.1, and its tails."""
+CERTAIN_LEVERAGE = 0.99
+"""A bin that the fit follows to this part cannot be tested."""
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def falls_without_each(jacobian: ComplexArray, error: ComplexArray) -> FloatArray:
+    """(M, K) what the cost falls by without a bin, in units of its variance.
+
+    0 where the fit goes through a bin whatever is there.
+
+    Parameters
+    ----------
+    jacobian : (M, K, n) complex
+        Derivative of the model by the n real parameters of the fit, weighted; 0 on bins not used.
+    error : (M, K) complex
+        Weighted; E|error|^2 = 1 of noise.
+    """
+    parts = np.stack([jacobian.real, jacobian.imag], axis=2)  # (M, K, 2, n)
+    q = np.linalg.qr(parts.reshape(-1, parts.shape[-1]))[0].reshape(parts.shape)
+    # (I - H) of each bin, 2 x 2: what of an error there the fit has left
+    p, r = (1 - np.sum(q[..., k, :] ** 2, axis=-1) for k in (0, 1))
+    b = -np.sum(q[..., 0, :] * q[..., 1, :], axis=-1)
+    re, im = error.real, error.imag
+    falls = (r * re**2 - 2 * b * re * im + p * im**2) / (p * r - b**2)
+    least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
+    return np.asarray(np.where(least > 1 - CERTAIN_LEVERAGE, falls, 0.0))
+
+
+def chances_of(
+    power: FloatArray,
+    kinds: list[BoolArray],
+    records: int,
+    least: FloatArray | float,
+    most_dof: float = np.inf,
+) -> FloatArray:
+    """(K,) probability that noise makes a power as large as that of each bin, from those around.
+
+    Parameters
+    ----------
+    power : (K,) float
+        Means over records.
+    kinds : list of (K,) bool
+        First excited lines, then kinds of other harmonics, last the bins between, with noise alone.
+        Harmonics may hold distortion: they are compared with the larger level of their own kind and of
+        the noise. Other harmonics that are few of their kind are compared with the excited ones, and not
+        tested where there are none.
+    records : int
+    least : (K,) float or float
+        Level of rounding.
+    most_dof : float
+        Complex degrees of freedom of what the powers were divided by.
+    """
+    chance = np.ones(power.size)
+    levels = [level_around(power, kind, records, WINDOW) for kind in kinds]
+    between, between_around = levels[-1]
+    for k, (kind, (own, around)) in enumerate(zip(kinds, levels, strict=True)):
+        if not around and 0 < k < len(kinds) - 1:
+            own, around = levels[0]
+            if not around:
+                continue
+        level = np.maximum(own, between)
+        # the larger of two levels makes fewer false alarms than either
+        around = between_around or around
+        if around:
+            dof = min(records * around / MEDIAN_LOSS, most_dof)
+            ratio = power[kind] / np.maximum(level, least)[kind]
+            chance[kind] = special.fdtrc(2 * records, 2 * dof, ratio)
+    return chance

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A record without drive: tones by frequency and size, noise by its density."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.cli import main
+from tactile_resonance.silent import silent_record
+
+RATE_HZ, PERIODS, SAMPLES = 5000.0, 8, 2000
+
+
+def white(rng, density):
+    """(P, N) noise of this one-sided density [V/sqrt(Hz)]."""
+    return density * np.sqrt(RATE_HZ / 2) * rng.standard_normal((PERIODS, SAMPLES))
+
+
+def tones(*frequency_and_rms):
+    t = np.arange(PERIODS * SAMPLES).reshape(PERIODS, SAMPLES) / RATE_HZ
+    return sum(np.sqrt(2) * rms * np.sin(2 * np.pi * f * t + f) for f, rms in frequency_and_rms)
+
+
+def test_tones_and_noise_are_those_put_in():
+    rng = np.random.default_rng(1)
+    hidden = (49.98, 1e-3), (149.94, 3e-4), (333.3, 1e-4)
+    u, y = white(rng, 1e-6), white(rng, 2e-6) + tones(*hidden)
+    found = silent_record(u, y, sample_rate_hz=RATE_HZ)
+    assert found.actuator_noise == pytest.approx(1e-6, rel=0.05)
+    assert found.sensor_noise == pytest.approx(2e-6, rel=0.05)
+    assert len(found.tones) == 3
+    for tone, (frequency_hz, rms_v) in zip(found.tones, hidden, strict=True):
+        assert tone.channel == "sensor"
+        assert tone.frequency_hz == pytest.approx(frequency_hz, abs=0.02)
+        assert tone.rms_v == pytest.approx(rms_v, rel=0.05)
+    assert [tone.mains_hz for tone in found.tones] == [(50.0,), (50.0,), ()]
+
+
+def test_noise_is_no_tone():
+    """White, and that of a random walk, whose density falls by 20 dB a decade."""
+    rng = np.random.default_rng(2)
+    for _ in range(150):
+        walk = np.cumsum(white(rng, 1e-6)).reshape(PERIODS, SAMPLES)
+        assert silent_record(white(rng, 1e-6), walk, sample_rate_hz=RATE_HZ).tones == ()
+
+
+def test_zeros_hold_nothing():
+    nothing = np.zeros((PERIODS, SAMPLES))
+    found = silent_record(nothing, nothing, sample_rate_hz=RATE_HZ)
+    assert found.tones == ()
+    assert found.sensor_noise == 0
+
+
+def test_a_band_may_be_asked_for_and_must_hold_bins():
+    rng = np.random.default_rng(3)
+    u, y = white(rng, 1e-6), white(rng, 1e-6) + tones((50.0, 1e-3), (250.0, 1e-3))
+    (tone,) = silent_record(u, y, sample_rate_hz=RATE_HZ, band_hz=(200.0, 300.0)).tones
+    assert tone.frequency_hz == pytest.approx(250, abs=0.02)
+    with pytest.raises(ValueError, match=r"band_hz: 200..201 Hz hold 4 bins"):
+        silent_record(u, y, sample_rate_hz=RATE_HZ, band_hz=(200.0, 201.0))
+
+
+def test_analyze_prints_what_a_silent_record_holds(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    u, y = white(rng, 1e-6), white(rng, 2e-6) + tones((249.9, 1e-4))
+    path = tmp_path / "silent.npz"
+    np.savez(path, u=u, y=y, sample_rate_hz=RATE_HZ, samples_per_period=SAMPLES)
+    assert main(["analyze", str(path), "--silent"]) == 0
+    out = capsys.readouterr().out
+    assert "sensor: noise 2e-06 V/sqrt(Hz), median from 0 to 2500 Hz" in out
+    assert "tone at 249.9 Hz: fits hum of 50 Hz, 0.0001 V rms in the sensor" in out
+    assert main(["analyze", str(path), "--silent", "--json", str(tmp_path / "a.json")]) != 0
+    assert "json: not with --silent" in capsys.readouterr().err
