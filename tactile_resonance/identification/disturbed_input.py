@@ -45,16 +45,16 @@ def poles_with_all_bins(
     u, y : (K,) or (M, K) complex
         At its bins; of M realisations for a plan of these.
     batch : PolesBatch
-        Its fit to the excited lines, shape (). A model error found on these stays: bins that noise alone
-        moves have found it.
+        Its fit to the excited lines, shape (). A model error found on these by cost or whiteness stays:
+        bins that noise alone moves have found it. A disturbance looks like terms that the model lacks.
 
     Returns
     -------
     Poles or None
         None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`.
     """
-    final = (PolesStatus.MODEL_ERROR, PolesStatus.TOO_FEW_LINES)
-    if batch.status() in final or not _disturbed(plan, u):
+    wrong = batch.status() is PolesStatus.MODEL_ERROR and not np.isfinite(batch.lacking[0])
+    if wrong or batch.status() is PolesStatus.TOO_FEW_LINES or not _disturbed(plan, u):
         return None
     ratio = 0.0
     of_all = _with_all_bins(plan, u, y, ratio)

@@ -124,14 +124,15 @@ def identify_poles_from_bins(
 
 
 def _of_plan(plan_of: PlanOf, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
-    """Poles from bins: without tones, by all bins as excitation, with drift, as the record asks for."""
-    batch, tones = poles_without_tones(plan_of, u, y)
-    if tones:
-        return single(batch, notes=[*(tone.text("left out") for tone in tones), *notes])
+    """Poles from bins: by all as excitation, without tones, with drift, as the record asks for."""
     plan = plan_of(())
+    batch = plan.from_bins(u, y)
     poles = poles_with_all_bins(plan, u, y, batch)
-    if poles is None and y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
-        poles = poles_with_drift(plan, u, y, batch)
+    if poles is None:
+        batch, tones = poles_without_tones(plan_of, u, y, batch)
+        notes = [*(tone.text("left out") for tone in tones), *notes]
+        if not tones and y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
+            poles = poles_with_drift(plan, u, y, batch)
     if poles is None:
         return single(batch, notes=notes)
     return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))

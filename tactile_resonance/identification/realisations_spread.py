@@ -121,7 +121,7 @@ class Spread:
     def chance(self) -> FloatArray:
         """(batch,) how often one system scatters as much, in f0 or damping of any mode; NaN: not known."""
         p = stats.f.sf(self.ratio, self.records - 1, self.dof[:, None, None])
-        p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2))
+        p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2), initial=np.inf)
         known = self.known & np.isfinite(p)
         return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** self.ratio[0].size, np.nan)
 
@@ -158,7 +158,7 @@ class Spread:
         """(batch,) where one realisation contradicts the others, and what is to be told to people."""
         surely = self.chance < MODEL_ERROR_PROBABILITY
         odd, away = self._odd_one()
-        size = np.sqrt(np.nan_to_num(self.ratio).max(axis=(1, 2)))
+        size = np.sqrt(np.nan_to_num(self.ratio).max(axis=(1, 2), initial=0.0))
         remarks = np.full(size.size, "", object)
         for k in np.flatnonzero(surely):
             remarks[k] = (
@@ -192,7 +192,7 @@ class Spread:
             mean = np.sum(others.information * others.departure, axis=1)
             spread = self.expected[:, m] + 1 / np.sum(1 / others.expected, axis=1)
             away = np.abs(self.departure[:, m] - mean) / np.sqrt(spread)
-            away = np.nan_to_num(away).max(axis=(1, 2))
+            away = np.nan_to_num(away).max(axis=(1, 2), initial=0.0)
             here = (away > limit) & (away > size) & (others.weight == 0)
             odd[here], size[here] = m, away[here]
         return odd, size

@@ -103,7 +103,7 @@ class _Fitted:
 
 
 def poles_without_tones(
-    plan_of: PlanOf, u: ComplexArray, y: ComplexArray
+    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:
     """Poles of one point, bins with a tone left out and what leaks out of them taken off.
 
@@ -115,6 +115,8 @@ def poles_without_tones(
         The plan that leaves out some bins.
     u, y : (K,) or (M, K) complex
         At the bins of its band.
+    batch : PolesBatch
+        Of the plan that leaves out none, shape ().
 
     Returns
     -------
@@ -125,7 +127,7 @@ def poles_without_tones(
         other than tones is wrong, or where the fit without them finds no minimum.
     """
     taken: list[_Taken] = []
-    whole = fitted = _Fitted.without(plan_of, u, y, taken)
+    whole = fitted = _Fitted(plan_of(()), batch, np.atleast_2d(u), np.atleast_2d(y))
     try:
         while (found := _most_striking(fitted)) is not None:
             taken, fitted = _taken_too(plan_of, u, y, taken, *found)
