@@ -17,6 +17,18 @@ HARMONICS = np.arange(4, 401)  # 10 to 1000 Hz
 BAND_HZ = (200.0, 300.0)
 F0_HZ, DAMPING_RATIO = 250.0, 0.02
 STEPS = 4  # of the method in a sample: without k the response is exact to 4e-5
+_STEP_S = 1 / SAMPLE_RATE_HZ / STEPS
+
+
+def linear_mode() -> tuple[float, float]:
+    """f0 [Hz] and damping ratio without k, as the method makes them: a pole p becomes ``ln R(p h) / h``.
+
+    R is the stability function of the method, the first five terms of the exponential series.
+    """
+    w0 = 2 * np.pi * F0_HZ
+    z = w0 * (-DAMPING_RATIO + 1j * np.sqrt(1 - DAMPING_RATIO**2)) * _STEP_S
+    pole = np.log(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) / _STEP_S
+    return float(abs(pole) / (2 * np.pi)), float(-pole.real / abs(pole))
 
 
 def records(
@@ -47,7 +59,7 @@ def records(
 
 def _respond(u: FloatArray, periods: int, cubic: float) -> FloatArray:
     """(samples, count) of one period at half steps (2 STEPS samples, count), repeated."""
-    w0, h = 2 * np.pi * F0_HZ, 1 / SAMPLE_RATE_HZ / STEPS
+    w0, h = 2 * np.pi * F0_HZ, _STEP_S
     x, v = np.zeros(u.shape[1]), np.zeros(u.shape[1])
 
     def force(x: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from benchmarks.cubic_resonator import (
     HARMONICS,
     SAMPLE_RATE_HZ,
     SAMPLES_PER_PERIOD,
+    linear_mode,
     records,
 )
 from tactile_resonance.identification.joint import JointPlan
@@ -84,8 +85,7 @@ def measure(
     u, y = (np.concatenate(c).reshape(groups, realisations, -1) for c in zip(*bins, strict=True))
     one = alone.from_bins(u, y)
     each = np.stack([one.f0_hz[..., 0], one.damping_ratio[..., 0]], axis=-1)  # (groups, M, 2)
-    linear = np.array([F0_HZ, DAMPING_RATIO])
-    truth = linear if distortion_db is None else each.mean(axis=(0, 1))
+    truth = np.array(linear_mode()) if distortion_db is None else each.mean(axis=(0, 1))
     return _judged(together.from_bins(u, y), each, truth)
 
 
