@@ -114,7 +114,7 @@ def test_a_mode_that_changes_is_reported_with_its_drift(tmp_path, capsys):
     path, out = tmp_path / "creeps.npz", tmp_path / "out.json"
     np.savez(path, **{**content, "y": np.concatenate(periods)})
     assert cli.main(["analyze", str(path), "--band", "200", "300", "--json", str(out)]) == 0
-    assert "the mode changes: f0 by 0.0" in capsys.readouterr().out
+    assert "changes: f0 by 0.0" in capsys.readouterr().out
     content = json.loads(out.read_text())
     pole = content["poles"][0]
     assert content["instant_s"] == pytest.approx(1.2, abs=1e-3)

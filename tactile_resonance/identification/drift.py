@@ -42,6 +42,12 @@ FALSE_ALARM = 2e-5
 # Refits of the other coefficients, and the change of the drift, in deviations, that is the last one.
 MOST_RETURNS = 12
 SAME_DRIFT = 0.02
+# Share of the drift itself that is as good as none, for records next to without noise.
+SAME_SHARE = 1e-4
+GAIN_TOO = (
+    "the gain changes over the record as well, as where contact is lost: the drift is no property of "
+    "the mode"
+)
 USABLE = (PolesStatus.OK, PolesStatus.MODEL_ERROR)
 
 
@@ -74,9 +80,16 @@ class _Step:
 
     def chance(self, drift: FloatArray) -> float:
         """Of a drift as large where there is none: an F test."""
-        fall = drift @ np.linalg.solve(self.inverse, drift)
+        return self._chance(float(drift @ np.linalg.solve(self.inverse, drift)), drift.size)
+
+    @property
+    def chance_of_last(self) -> float:
+        """As `chance`, of the last one beside all others."""
+        return self._chance(float(self.step[-1] ** 2 / self.inverse[-1, -1]), 1)
+
+    def _chance(self, fall: float, count: int) -> float:
         rest = self.level * self.dof
-        return float(special.betainc(self.dof, drift.size / 2, rest / (rest + fall)))
+        return float(special.betainc(self.dof, count / 2, rest / (rest + fall)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +126,12 @@ class DriftingModes:
                 first = _pair(self._s, pole, d, 1) * self._decay
                 columns.append(self._spread(constant, about_t) + first)
         return np.array(columns)
+
+    @cached_property
+    def of_gain(self) -> ComplexArray:
+        """(1, K) of a gain of the output that grows by 1/s."""
+        g = self.fit.fit.response(self._s.imag / (2 * np.pi))
+        return np.asarray(self._spread(np.zeros_like(g), g) + self._decay)[None]
 
     def added(self, drift: FloatArray) -> ComplexArray:
         """(K,) by a drift (2 m,) [rad/s^2], real and imaginary parts in turn."""
@@ -182,13 +201,22 @@ def _pair(s: ComplexArray, pole: complex, factor: complex, power: int) -> Comple
 
 
 def _linearised(
-    plan: JointPlan, fit: PolesBatch, u: ComplexArray, y: ComplexArray, flat: bool
+    plan: JointPlan,
+    fit: PolesBatch,
+    u: ComplexArray,
+    y: ComplexArray,
+    flat: bool,
+    with_gain: bool = False,
 ) -> _Step:
     """The drift that bins u, y (K,) show beside a fit to them, or to y without some drift.
 
-    With weights of flat noise, or of what noise a test finds: this takes a drift for noise.
+    With weights of flat noise, or of what noise a test finds: this takes a drift for noise. The drift of
+    the gain, if asked for, is the last.
     """
     modes = DriftingModes(plan, fit, u)
+    directions = modes.directions
+    if with_gain:
+        directions = np.concatenate([directions, modes.of_gain])
     theta = modes.theta
     u_o, u_e = u[None, plan.others_at], u[None, plan.excited_at]
     one = np.ones((1, 1))
@@ -211,7 +239,7 @@ def _linearised(
     gradient, normals = point.normals(value)
     own = point.jacobian(value)
     where = np.concatenate([plan.others_at, plan.excited_at])
-    more = np.ascontiguousarray(-modes.directions[:, where] * value.root).view(float)
+    more = np.ascontiguousarray(-directions[:, where] * value.root).view(float)
     inverse = np.linalg.inv(normals.sum(axis=0))
     crossed = own @ more.T  # (n, 2 m)
     coefficients = inverse @ crossed
@@ -227,7 +255,7 @@ def _linearised(
 
 def poles_with_drift(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, fit: PolesBatch
-) -> Poles | None:
+) -> tuple[Poles, float] | None:
     """Poles in the middle of a record and their drift, where it shows that they change.
 
     Parameters
@@ -241,37 +269,59 @@ def poles_with_drift(
 
     Returns
     -------
-    Poles or None
-        None where nothing changes beyond chance, or no fit with drift is found.
+    tuple of Poles and float, or None
+        With the variance of the noise that is left on a bin of Y. None where nothing changes beyond chance.
+        Status MODEL_ERROR where something changes that is no
+        steady drift of the poles: the gain too, as where contact is lost, or no fit with drift is found.
 
     Notes
     -----
     Gauss-Newton steps of the drift, each followed by a fit of all else to the record without it.
     """
-    drift: FloatArray | None = None
+    first: _Step | None = None
+    constant, drift = fit, np.zeros(0)
     with np.errstate(all="ignore"):
         if not fit.noise_variance[0] > ROUNDED * np.mean(np.abs(y) ** 2):
             return None  # what rounding leaves of exact data says nothing
         for _ in range(MOST_RETURNS):
             if fit.status() not in USABLE or not np.isfinite(fit.poles_rad_s).any():
-                return None
-            added = 0 if drift is None else DriftingModes(plan, fit, u).added(drift)
+                break
+            rest = y if first is None else y - DriftingModes(plan, fit, u).added(drift)
             try:
-                at = _linearised(plan, fit, u, y - added, flat=drift is None)
+                at = _linearised(plan, fit, u, rest, flat=first is None)
             except np.linalg.LinAlgError:
-                return None
-            if drift is None:
+                break
+            if first is None:
                 if not at.chance(at.step) < FALSE_ALARM:
                     return None
-                drift = np.zeros(at.step.size)
+                first, drift = at, np.zeros(at.step.size)
             if drift.size != at.step.size or not np.isfinite(at.step).all():
-                return None
+                break
             drift = drift + at.step
-            deviation = np.sqrt(np.diagonal(at.covariance))
-            if np.all(np.abs(at.step) < SAME_DRIFT * deviation):
-                return _result(plan, fit, at, drift) if at.chance(drift) < FALSE_ALARM else None
+            least = np.maximum(
+                SAME_DRIFT * np.sqrt(np.diagonal(at.covariance)), SAME_SHARE * np.abs(drift)
+            )
+            if np.all(np.abs(at.step) < least):
+                if not at.chance(drift) < FALSE_ALARM:
+                    break
+                rest = y - DriftingModes(plan, fit, u).added(drift)
+                gain = _linearised(plan, fit, u, rest, flat=False, with_gain=True)
+                poles = _result(plan, fit, at, drift)
+                if not gain.chance_of_last > FALSE_ALARM:
+                    poles = _changed(poles, GAIN_TOO)
+                return poles, float(fit.noise_variance[0])
             fit = plan.from_bins(u, y - DriftingModes(plan, fit, u).added(drift))
-    return None
+    if first is None:
+        return None
+    reason = "the mode changes over the record, and no fit with its drift is found"
+    return _changed(single(constant), reason), float(constant.noise_variance[0])
+
+
+def _changed(poles: Poles, reason: str) -> Poles:
+    """Poles of a record that changes as no model here does."""
+    total = poles.covariance if poles.total_covariance is None else poles.total_covariance
+    message = "; ".join(filter(None, [poles.message, reason]))
+    return replace(poles, status=PolesStatus.MODEL_ERROR, total_covariance=total, message=message)
 
 
 def _result(plan: JointPlan, fit: PolesBatch, at: _Step, drift: FloatArray) -> Poles:
@@ -299,9 +349,10 @@ def _result(plan: JointPlan, fit: PolesBatch, at: _Step, drift: FloatArray) -> P
     poles = single(fit)
     deviations = np.sqrt(np.diagonal(of_rates, axis1=-2, axis2=-1))
     told = [
-        f"the mode changes: f0 by {rate[0]:.3g} +- {std[0]:.2g} Hz/s, damping ratio by "
+        f"the mode at {f0:.4g} Hz changes: f0 by {rate[0]:.3g} +- {std[0]:.2g} Hz/s, damping ratio by "
         f"{rate[1]:.2g} +- {std[1]:.2g} 1/s; poles are those {middle_s:.3g} s after the start"
-        for rate, std in zip(rates[real], deviations[real], strict=True)
+        for f0, rate, std in zip(poles.f0_hz, rates[real], deviations[real], strict=True)
+        if np.any(np.abs(rate) > 3 * std)
     ]
     return replace(
         poles,

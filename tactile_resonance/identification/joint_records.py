@@ -128,14 +128,15 @@ def _of_plan(plan_of: PlanOf, u: ComplexArray, y: ComplexArray, notes: Sequence[
     plan = plan_of(())
     batch = plan.from_bins(u, y)
     poles = poles_with_all_bins(plan, u, y, batch)
-    if poles is None:
-        batch, tones = poles_without_tones(plan_of, u, y, batch)
-        notes = [*(tone.text("left out") for tone in tones), *notes]
-        if not tones and y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
-            poles = poles_with_drift(plan, u, y, batch)
-    if poles is None:
-        return single(batch, notes=notes)
-    return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))
+    if poles is not None:
+        return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))
+    rest, tones = poles_without_tones(plan_of, u, y, batch)
+    if y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
+        found = poles_with_drift(plan, u, y, batch)
+        # a drift fills the bins beside a line as tones would: what leaves less noise is right
+        if found is not None and (not tones or found[1] < rest.noise_variance[0]):
+            return replace(found[0], message="; ".join(filter(None, [found[0].message, *notes])))
+    return single(rest, notes=[*(tone.text("left out") for tone in tones), *notes])
 
 
 @lru_cache(maxsize=32)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from tactile_resonance.identification.arrow import ArrowInverse, solve_arrow
 from tactile_resonance.identification.joint_layout import JointLayout
@@ -120,7 +120,7 @@ class Spread:
     @property
     def chance(self) -> FloatArray:
         """(batch,) how often one system scatters as much, in f0 or damping of any mode; NaN: not known."""
-        p = stats.f.sf(self.ratio, self.records - 1, self.dof[:, None, None])
+        p = special.fdtrc(self.records - 1, self.dof[:, None, None], self.ratio)
         p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2), initial=np.inf)
         known = self.known & np.isfinite(p)
         return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** self.ratio[0].size, np.nan)
@@ -143,8 +143,8 @@ class Spread:
         """
         share = np.where(alike[:, None, None, None], 1 / self.records, self.information)
         of_mean = np.sum((share * self._rest(share)) ** 2, axis=1)
-        quantile = stats.t.ppf((1 + INSIDE) / 2, self.records - 1)
-        wider = 2 * quantile**2 / stats.chi2.ppf(INSIDE, 2)
+        quantile = special.stdtrit(self.records - 1, (1 + INSIDE) / 2)
+        wider = 2 * quantile**2 / special.chdtri(2, 1 - INSIDE)
         return np.asarray(wider * self.records / (self.records - 1) * of_mean)
 
     def of_poles(self, covariance: FloatArray) -> FloatArray:
@@ -183,7 +183,7 @@ class Spread:
         odd, size = np.full(batch, -1), np.zeros(batch)
         if records < FEWEST_RECORDS:
             return odd, size
-        limit = stats.norm.isf(MODEL_ERROR_PROBABILITY / (4 * records))
+        limit = -special.ndtri(MODEL_ERROR_PROBABILITY / (4 * records))
         for m in range(records):
             rest = np.arange(records) != m
             others = replace(
