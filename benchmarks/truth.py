@@ -141,7 +141,7 @@ def cubic_table(groups: int) -> list[str]:
 
 
 def bench_table(count: int) -> list[str]:
-    """Realisations of the simulated bench at a high level, in groups that share none, as lines of a page."""
+    """Realisations of the simulated bench at a high level, in disjoint groups, as lines of a page."""
     bench, tissue = SimulatedBench.from_configuration(), read_tissues()[TISSUE]
     effects = replace(DEFAULT_EFFECTS, nonlinearity=True)
     design = design_multisine(level_v=LEVEL_V)
@@ -158,7 +158,7 @@ def bench_table(count: int) -> list[str]:
         f"## Realisations of the simulated bench at {LEVEL_V:g} V rms",
         "",
         f"Ten modes on {TISSUE}, 10 Hz to 10 kHz, two periods from rest, with its static nonlinearity; {count} "
-        "records in groups that share none. f0 of one realisation scatters by "
+        "records in disjoint groups. f0 of one realisation scatters by "
         f"{1e3 * each[:, 0].std():.0f} mHz; fits to one state {1e3 * _median_std(alone):.0f} mHz.",
         "",
         "| realisations | groups | ok | coverage, ok | worst | MSE f0, damping | scatter of f0 | stated |",

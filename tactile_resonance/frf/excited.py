@@ -60,7 +60,7 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     For P = 1 there are no such bins: the noise level is that of the weaker half of the lines. Where
     more than half are excited nothing stands above that; then a step of `gap_db` must part them from
     at least four lines of noise, which noise alone does in less than one record of a hundred
-    thousand. Coloured noise above the level of the lines cannot be told from excitation then.
+    thousand. Coloured noise above the level of the lines cannot then be distinguished from excitation.
     """
     u = np.asarray(u)
     if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:

@@ -97,7 +97,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
 
     Of a fit weighted with another ratio.
     """
-    gain = np.abs(of_all.fit.response(_frequency_hz(plan, plan.bins))) ** 2
+    gain = np.abs(of_all.fit.response(plan.frequency_hz(plan.bins))) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + ratio * gain)
     curve = two_channels(variance[None], gain[None], np.ones((1, gain.size), bool))[0]
     low, high = np.argmin(gain), np.argmax(gain)
@@ -107,17 +107,10 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
     return float(found) if np.isfinite(found) else 0.0  # of a fit that failed
 
 
-def _frequency_hz(plan: JointPlan, bins: IntArray) -> FloatArray:
-    """(K,) of bins (K,)."""
-    return np.asarray(
-        bins * (plan.sample_rate_hz / (plan.samples_per_period * plan.periods)), float
-    )
-
-
 @np.errstate(all="ignore")  # a fit that failed explains nothing
 def _explained(plan: JointPlan, of_all: PolesBatch, u: ComplexArray) -> float:
     """Mean square of ``G U`` between harmonics over the variance of ``Y - G U``."""
-    g = of_all.fit.response(_frequency_hz(plan, plan.other_bins))
+    g = of_all.fit.response(plan.frequency_hz(plan.other_bins))
     made = np.mean(np.abs(g * u[..., plan.others_at]) ** 2)
     noise_y, noise_u = of_all.noise_variance
     return float(made / (noise_y + noise_u * np.mean(np.abs(g) ** 2)))

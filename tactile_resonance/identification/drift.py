@@ -152,9 +152,7 @@ class DriftingModes:
 
     @cached_property
     def _s(self) -> ComplexArray:
-        plan = self.plan
-        resolution = plan.sample_rate_hz / (plan.samples_per_period * plan.periods)
-        return np.asarray(2j * np.pi * plan.bins * resolution)
+        return np.asarray(2j * np.pi * self.plan.frequency_hz(self.plan.bins))
 
     @cached_property
     def _decay(self) -> ComplexArray:

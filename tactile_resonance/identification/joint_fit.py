@@ -82,11 +82,7 @@ class JointFit:
     residual: ComplexArray
     systematic: FloatArray
     remark: npt.NDArray[np.object_]
-    lacking: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        if self.lacking is None:
-            object.__setattr__(self, "lacking", np.full((self.cost.size, 3), np.nan))
+    lacking: FloatArray
 
     def rows(self, which: npt.NDArray[np.int64]) -> JointFit:
         """Some of the points."""

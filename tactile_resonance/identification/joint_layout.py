@@ -171,11 +171,19 @@ class JointLayout:
         except ValueError:
             return None
 
+    @property
+    def resolution_hz(self) -> float:
+        """Spacing of the bins: one over the duration of the record."""
+        return self.sample_rate_hz / (self.samples_per_period * self.periods)
+
+    def frequency_hz(self, bins: IntArray) -> FloatArray:
+        """Of bins."""
+        return np.asarray(bins * self.resolution_hz, float)
+
     @cached_property
     def directions(self) -> Directions:
         """What a richer model has in addition, on the excited bins."""
-        resolution = self.sample_rate_hz / (self.samples_per_period * self.periods)
-        frequency_hz = np.asarray(self.excited_bins * resolution, float)
+        frequency_hz = self.frequency_hz(self.excited_bins)
         x = self.variable.of_frequency(frequency_hz)
         return Directions.on_lines(frequency_hz, x, self.structure.numerator_order)
 

@@ -281,6 +281,7 @@ def _judged(
         residual=common,
         systematic=systematic,
         remark=np.full(batch, "", object),
+        lacking=np.full((batch, 3), np.nan),
     )
     return _each_by_itself(layout, fit, first, pieces)
 

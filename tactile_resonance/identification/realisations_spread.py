@@ -16,7 +16,6 @@ from scipy import special
 
 from tactile_resonance.identification.arrow import ArrowInverse, solve_arrow
 from tactile_resonance.identification.joint_layout import JointLayout
-from tactile_resonance.identification.model import RationalModel
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.result import natural_frequency_and_damping_jacobian
 from tactile_resonance.identification.shared_points import SharedPoints
@@ -200,16 +199,7 @@ class Spread:
 
 def _turn(layout: JointLayout, theta: FloatArray) -> FloatArray:
     """(batch, places, 2, a) derivative of (f0_hz, damping_ratio) by the denominator's coefficients."""
-    a, b, _ = layout.problem.sizes
-    model = RationalModel(
-        denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-        numerator=theta[:, a : a + b],
-        transient=theta[:, a + b :],
-        variable=layout.variable,
-        denominator_basis=layout.denominator_basis,
-        numerator_basis=layout.numerator_basis,
-    )
     poles = layout.poles_in_band(theta)
-    _, sensitivity = model.residues_and_sensitivity(poles)  # (batch, places, a)
+    _, sensitivity = layout.model_of(theta).residues_and_sensitivity(poles)  # (batch, places, a)
     stacked = np.stack([sensitivity.real, sensitivity.imag], axis=-2)
     return np.asarray(natural_frequency_and_damping_jacobian(poles) @ stacked)

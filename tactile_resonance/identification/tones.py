@@ -76,8 +76,7 @@ class _Taken:
     def named(self, plan: JointPlan) -> Tone:
         """For people."""
         rms_v = float(np.sqrt(2 * np.mean(np.abs(self.phasor) ** 2)))
-        resolution_hz = _resolution_hz(plan)
-        return Tone(self.at * resolution_hz, rms_v, self.channel, resolution_hz)
+        return Tone(self.at * plan.resolution_hz, rms_v, self.channel, plan.resolution_hz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +179,6 @@ def _taken_too(
     return [*taken, tone], fitted
 
 
-def _resolution_hz(plan: JointPlan) -> float:
-    return plan.sample_rate_hz / (plan.samples_per_period * plan.periods)
-
-
 def _lines_in_a_row(plan: JointPlan) -> bool:
     """Whether neighbouring excited lines are left out, and not what lies between them: no tone does that."""
     gone = np.flatnonzero(np.isin(_excited(plan), plan.left_out))
@@ -211,7 +206,7 @@ class _Model:
     def __init__(self, fitted: _Fitted) -> None:
         plan, fit = fitted.plan, fitted.batch.fit
         self._u, self._y, self.bins = fitted.u, fitted.y, plan.bins
-        frequency_hz = np.asarray(plan.bins * _resolution_hz(plan), float)
+        frequency_hz = plan.frequency_hz(plan.bins)
         x = plan.variable.of_frequency(frequency_hz)
         self._p = fit.denominator_basis.values_at(x)  # (K, a + 1)
         self._q = fit.numerator_basis.values_at(x)  # (K, b)
