@@ -269,23 +269,16 @@ class NodeHands:
         return seen
 
     def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
-        """Until every block's record, FRF and poles are in the recording."""
+        """Until every block's record, FRF and poles are in the recording, and all excitations."""
         within_s = self._time.silent_s if self._time.simulated else RESULTS_WITHIN_S
         deadline = time.monotonic() + within_s
-        while True:
-            counts = self._recorder.counts()
-            if all(count >= result.blocks for count in counts):
-                return
-            came = (
-                f"of {result.blocks} blocks {counts[0]} records, {counts[1]} FRFs and {counts[2]} poles "
-                "came"
-            )
+        while missing := self._recorder.missing(result.blocks):
             if time.monotonic() > deadline:
-                raise PointDisturbed(came, "messages lost")
+                raise PointDisturbed(missing, "messages lost")
             try:
                 poll()
             except NodeAway as error:
-                raise NodeAway(f"{error}; {came}", error.kind) from error
+                raise NodeAway(f"{error}; {missing}", error.kind) from error
             check()
             time.sleep(POLL_S)
 

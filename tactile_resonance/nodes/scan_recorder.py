@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every message of a point into its file, as it travelled; what the scan waits for is counted."""
+"""Every message of a point into its file, as it travelled; and what of a measurement has not come."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ class Recorded:
     """A topic that is recorded.
 
     `qos` is asked for; `offered`, by its publisher, is recorded where it is more than that. `measured` where
-    its messages belong to a measurement: only those of the scan's own are kept. `counted` where the scan needs
-    to know how many came.
+    its messages belong to a measurement: only those of the scan's own are kept. `each_block` names, in the
+    plural, what comes once with each block: the scan waits for all of them.
     """
 
     kind: type
     qos: QoSProfile
     measured: bool = False
-    counted: bool = False
+    each_block: str = ""
     offered: QoSProfile | None = None
 
 
 TOPICS = {
     "excitation": Recorded(msg.Excitation, EXCITATIONS, measured=True),
-    "record": Recorded(msg.Record, RESULTS, measured=True, counted=True),
-    "frf": Recorded(msg.FRF, RESULTS, measured=True, counted=True),
-    "poles": Recorded(msg.Poles, RESULTS, measured=True, counted=True, offered=POLES),
+    "record": Recorded(msg.Record, RESULTS, measured=True, each_block="records"),
+    "frf": Recorded(msg.FRF, RESULTS, measured=True, each_block="FRFs"),
+    "poles": Recorded(msg.Poles, RESULTS, measured=True, each_block="poles", offered=POLES),
     "bench/truth": Recorded(msg.Poles, TRUTHS, measured=True),
     "wrench": Recorded(WrenchStamped, SERIES),
     "tcp_pose": Recorded(PoseStamped, SERIES),
@@ -68,6 +68,8 @@ class ScanRecorder:
         self._recording: Recording | None = None
         self._measurement_id = 0
         self._counts: Counter[str] = Counter()
+        self._played: set[int] = set()  # excitation ids of the records that came
+        self._described: set[int] = set()  # and of the excitations
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
@@ -75,7 +77,8 @@ class ScanRecorder:
         """Write what comes from now on there; of measurements only this one."""
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id
-            self._counts.clear()
+            for kept in (self._counts, self._played, self._described):
+                kept.clear()
             self.force_reason = ""
             while not self.poles.empty():
                 self.poles.get()
@@ -85,10 +88,18 @@ class ScanRecorder:
         with self._lock:
             self._recording = None
 
-    def counts(self) -> tuple[int, ...]:
-        """Records, FRFs and poles of the measurement that came."""
+    def missing(self, blocks: int) -> str:
+        """What has not come yet of a measurement of so many blocks; empty where all has.
+
+        A record without its excitation could not be evaluated again.
+        """
         with self._lock:
-            return tuple(self._counts[topic] for topic, r in TOPICS.items() if r.counted)
+            counts = {r.each_block: self._counts[t] for t, r in TOPICS.items() if r.each_block}
+            undescribed = len(self._played - self._described)
+        if undescribed == 0 and all(count >= blocks for count in counts.values()):
+            return ""
+        came = ", ".join(f"{count} {name}" for name, count in counts.items())
+        return f"of {blocks} blocks came {came}; excitations without a message: {undescribed}"
 
     def _listen(self, node: ManagedNode, topic: str, recorded: Recorded) -> None:
         full = node.resolve_topic_name(topic)
@@ -112,7 +123,10 @@ class ScanRecorder:
                 self._counts[topic] += 1
                 if topic == "poles":
                     self.poles.put(message)
+                elif topic == "excitation":
+                    self._described.add(message.excitation_id)
                 elif topic == "record":
+                    self._played.add(message.excitation_id)
                     self.force_reason = message.contact_reason or self.force_reason
 
         node.listen(recorded.kind, topic, heard, recorded.qos, raw=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the bench tells of a measurement is in its file, however close together it is told."""
+"""What is told of a measurement is in its file, however close together it is told, in any order."""
 
 import os
 import time
@@ -9,13 +9,15 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 
+from tactile_resonance import msg
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import initialised
+from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initialised
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.from_messages import poles_from_message
@@ -91,3 +93,48 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
         messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message)[1] for _, _, message in messages]
     assert [origin.time_ns for origin in told] == [1000 + k for k in range(TRUTHS)]
+
+
+def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
+    """Excitations have a topic of their own, so that records may come before them."""
+    start, executor = nodes
+    recorder = start(Listener).recorder
+    outside = rclpy.create_node("outside")
+    executor.add_node(outside)
+    publishers = {
+        topic: outside.create_publisher(kind, topic, qos)
+        for topic, kind, qos in (
+            ("excitation", msg.Excitation, EXCITATIONS),
+            ("record", msg.Record, RESULTS),
+            ("frf", msg.FRF, RESULTS),
+            ("poles", msg.Poles, POLES),
+        )
+    }
+
+    def spin_until(done):
+        deadline_s = time.monotonic() + 20.0
+        while not done() and time.monotonic() < deadline_s:
+            executor.spin_once(0.05)
+        assert done()
+
+    def tell(topic, **fields):
+        publishers[topic].publish(publishers[topic].msg_type(measurement_id=KEY, **fields))
+
+    spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()))
+    plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
+    with (
+        RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run,
+        run.begin_point(0) as recording,
+    ):
+        recorder.record_into(recording, KEY)
+        tell("excitation", excitation_id=4)
+        for excitation_id in (4, 5):  # two realisations of a block each
+            for topic in ("record", "frf", "poles"):
+                tell(topic, excitation_id=excitation_id)
+        without = "of 2 blocks came 2 records, 2 FRFs, 2 poles; excitations without a message: 1"
+        spin_until(lambda: recorder.missing(2) == without)
+        tell("excitation", excitation_id=5)
+        spin_until(lambda: recorder.missing(2) == "")
+        assert recorder.missing(3).startswith("of 3 blocks came 2 records")
+        recorder.stop()
+        recording.finish(PointResult(0, measurement_id=KEY))
