@@ -14,21 +14,22 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "report",
         help="page and picture of a scan's run",
-        description="Write report.html, which needs nothing else, and pole_map.png into the folder of a run; "
-        "of a run that is going on, too.",
+        description="Write report.html, which needs nothing else, pole_map.png, and map.mcap, the map as it "
+        "grew for Foxglove and rviz, into the folder of a run; of a run that is going on, too.",
     )
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read the run, draw, write both files whole."""
+    """Read the run, draw, write each file whole."""
     # only here: the command answers --help without the library for recordings
     try:
         from tactile_resonance.scan.run_content import read_run
     except ImportError as error:
         raise ValueError(f"report: {error.name} not found; pip install rosbags") from error
     from tactile_resonance.report.drawing import figure_bytes
+    from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_table import point_table, table_notes
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import as_page, pole_map_of, skipped_lines, summary
@@ -43,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
         picture = figure_bytes(draw_pole_map(pole_map, title), ".png")
         write_whole(options.run_folder / "pole_map.png", picture)
     write_whole(options.run_folder / "report.html", as_page(content, picture, truths).encode())
+    write_map_recording(content)
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
@@ -50,5 +52,5 @@ def run(options: argparse.Namespace) -> int:
         print(line)
     for problem in content.problems:
         print(f"damaged: {problem}")
-    print(f"page and picture in {options.run_folder}")
+    print(f"page, picture and map.mcap in {options.run_folder}")
     return 0

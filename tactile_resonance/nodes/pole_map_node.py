@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -15,7 +16,8 @@ from tactile_resonance.nodes.conversions import poles_from_message
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
-from tactile_resonance.nodes.pole_map_messages import (
+from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.scan.map_messages import (
     cloud_message,
     header_message,
     legend_message,
@@ -23,7 +25,7 @@ from tactile_resonance.nodes.pole_map_messages import (
     restamp,
     surface_message,
 )
-from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.point_result import Kind, Outcome, from_message
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
@@ -133,7 +135,7 @@ class PoleMapNode(ManagedNode):
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
-        self._shown: dict[str, PointCloud2 | MarkerArray] = {}
+        self._shown: dict[str, Any] = {}  # messages of rosbags
         self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
         self._pause.cancel()
         self.resources.callback(self.destroy_timer, self._pause)
@@ -234,10 +236,10 @@ class PoleMapNode(ManagedNode):
 
     def _publish(self, wanted: set[str]) -> None:
         (probability, cells) = values(self, "ellipse_probability", "surface_cells")
-        header = header_message(self._frame_id, self.get_clock().now().to_msg())
+        header = header_message(self._frame_id, self.get_clock().now().nanoseconds)
         scale = self._scale(probability)
         names = tuple(tissue.name for tissue in self._classes)
-        makers: dict[str, Callable[[], PointCloud2 | MarkerArray]] = {
+        makers: dict[str, Callable[[], Any]] = {
             "": lambda: cloud_message(self._map, names, header),
             "/markers": lambda: marker_message(self._map, scale, probability, header),
             "/legend": lambda: legend_message(self._map, scale, probability, names, header),
@@ -245,16 +247,16 @@ class PoleMapNode(ManagedNode):
         }
         for name in wanted:
             self._shown[name] = makers[name]()
-            self._publishers_of[name].publish(self._shown[name])
+            self._publishers_of[name].publish(to_cdr(self._shown[name]))
             self._old.discard(name)
 
     def _repeat(self) -> None:
         """Publish what is shown once more, dated now: the frame may be known from now on only."""
-        now = self.get_clock().now().to_msg()
+        now_ns = self.get_clock().now().nanoseconds
         for name, message in self._shown.items():
             if name not in self._old and self._publishers_of[name].get_subscription_count() > 0:
-                restamp(message, now)
-                self._publishers_of[name].publish(message)
+                restamp(message, now_ns)
+                self._publishers_of[name].publish(to_cdr(message))
 
     def _scale(self, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")

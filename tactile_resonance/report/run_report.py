@@ -7,6 +7,7 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from tactile_resonance.report.drawing import SIMULATED
 from tactile_resonance.report.point_table import table_notes
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.point_result import Outcome, PointResult
-from tactile_resonance.scan.pole_map import PoleMap, point_of_result
+from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.references import SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits, read_scan_scene
@@ -57,12 +58,8 @@ _TEXT = {"tissue", "repeats", "outcome"}
 
 
 def pole_map_of(run: RunContent) -> PoleMap:
-    """Map of the latest attempt at every finished point; those skipped are not on it."""
-    pole_map = PoleMap()
-    for result in run.latest:
-        if result.outcome is not Outcome.SKIPPED:
-            pole_map = pole_map.with_point(point_of_result(result))
-    return pole_map
+    """Map of every point's latest attempt that counts; those skipped are not on it."""
+    return reduce(PoleMap.with_result, run.results, PoleMap())
 
 
 def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:

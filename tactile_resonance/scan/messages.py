@@ -37,6 +37,34 @@ def message_types() -> Typestore:
     return store
 
 
+def make_message(type_name: str, **content: Any) -> Any:
+    """Message as rosbags knows it, ready for `to_cdr`; fields that are not given are zero or empty.
+
+    Types with arrays of a fixed length are not supported.
+    """
+    store = message_types()
+    fields: Any = store.fielddefs[type_name][1]
+    for field, (node, detail) in fields:
+        if field in content:
+            continue
+        if node is Nodetype.NAME:
+            content[field] = make_message(detail)
+        elif node is Nodetype.BASE:
+            content[field] = _ZEROS.get(detail[0], 0)
+        else:
+            node, element = detail[0]
+            content[field] = [] if node is Nodetype.NAME else np.zeros(0, element[0])
+    return store.types[type_name](**content)
+
+
+_ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+
+
+def to_cdr(message: Any) -> bytes:
+    """A message of rosbags as it travels, which a publisher of rclpy takes too."""
+    return bytes(message_types().serialize_cdr(message, message.__msgtype__))
+
+
 @cache
 def reader_of(type_name: str, definition: MessageDefinition) -> Callable[[bytes], Any]:
     """Function that reads a message from CDR bytes by the definition in their file.

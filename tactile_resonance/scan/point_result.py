@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import message_types, to_cdr
 
 TOPIC = "point_result"
 TYPE = "tactile_resonance/msg/PointResult"
@@ -113,7 +113,7 @@ _HEADER = ("time_ns", "frame_id")
 
 
 def to_message(result: PointResult, poles: Any = None) -> Any:
-    """Message as rosbags knows it, ready for ``message_types().serialize_cdr``.
+    """Message as rosbags knows it, ready for `to_cdr`.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def to_message(result: PointResult, poles: Any = None) -> Any:
 
 def serialised(result: PointResult, poles: Any = None) -> bytes:
     """The message of `to_message` as it travels (CDR)."""
-    return bytes(message_types().serialize_cdr(to_message(result, poles), TYPE))
+    return to_cdr(to_message(result, poles))
 
 
 def from_message(message: Any) -> PointResult:

@@ -17,7 +17,7 @@ from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.main_mode import main_mode
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 
 FloatArray = npt.NDArray[np.float64]
@@ -190,8 +190,16 @@ class PoleMap:
     def with_point(self, point: MapPoint) -> PoleMap:
         """The same with one point more; it replaces what its own measurement or place had before."""
         rest = self.without(point.place, point.place_frame).points
-        kept = (p for p in rest if p.measurement_id != point.measurement_id)
+        own = point.measurement_id  # 0: it came to no measurement
+        kept = (p for p in rest if not own or p.measurement_id != own)
         return replace(self, points=(*kept, point))
+
+    def with_result(self, result: PointResult) -> PoleMap:
+        """The same after one attempt at a point of a scan; one in free air or discarded changes nothing."""
+        if result.kind is not Kind.TISSUE or result.outcome is Outcome.DISCARDED:
+            return self
+        now = self.without(result.position_m)
+        return now if result.outcome is Outcome.SKIPPED else now.with_point(point_of_result(result))
 
     def without(self, place_m: FloatArray, frame: str = "") -> PoleMap:
         """The same with nothing at a place (3,) [m]."""

@@ -82,7 +82,7 @@ class RunSource:
         content = read_run(run)
         points = {file_of(run, result) for result in content.results}
         self.entries: list[RecordedEntry] = []
-        for path in _in_order(content):
+        for path in files_in_order(content):
             reference = path not in points
             self.entries += [RecordedEntry(key, path, reference) for key in _ids_of(path)]
 
@@ -107,7 +107,7 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
 
     In runs of earlier versions references have none, and poles are the last ones in the file of the point.
     """
-    for path in _in_order(run):
+    for path in files_in_order(run):
         for _, _, message in read_messages_of_type(path, TYPE):
             poles = None
             for _, topic, poles_message in read_messages_of_type(path, POLES_TYPE):
@@ -151,7 +151,7 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
         )
 
 
-def _in_order(run: RunContent) -> list[Path]:
+def files_in_order(run: RunContent) -> list[Path]:
     """Files of a run, in the order in which they were recorded."""
     files = sorted(run.files, key=lambda file: (file.start_ns, file.name))
     return [run.path / RECORDING / file.name for file in files]

@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pole map as rviz shows it: a cloud with a named field per figure, few markers, a legend."""
+"""The pole map as rviz and Foxglove show it: a cloud with a named field per figure, few markers, a legend.
+
+Messages are those of rosbags, see `scan.messages.make_message`.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point
-from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import ColorRGBA, Header
-from visualization_msgs.msg import Marker, MarkerArray
 
-from tactile_resonance.nodes.conversions import POLES_STATUS
+from tactile_resonance.recording.from_messages import POLES_STATUS
 from tactile_resonance.scan.colour_scale import colours, shares
 from tactile_resonance.scan.mesh import grid_faces
+from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap
 
 FloatArray = npt.NDArray[np.float64]
 NO_CLASS = 255  # of the field tissue_class: none called, or unknown
-_TYPES = {"<f4": PointField.FLOAT32, "|u1": PointField.UINT8}
+CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
+_FIELD, _MARKER = "sensor_msgs/msg/PointField", "visualization_msgs/msg/Marker"
+Message = Any  # of rosbags
 POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "f0_hz", "damping_ratio", "f0_std_hz")]
     + [(name, "<f4") for name in ("damping_std", "force_n", "tissue_probability")]
@@ -35,7 +38,7 @@ _WHITE = (1.0, 1.0, 1.0)
 _FAILED = (1.0, 0.15, 0.1)
 
 
-def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Header) -> PointCloud2:
+def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Message) -> Message:
     """Cloud of all points with a pole; those that failed are markers.
 
     A point without a value would spoil the range over which rviz spreads its colours.
@@ -58,23 +61,23 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Header) -> 
     return _cloud(table, header)
 
 
-def surface_message(pole_map: PoleMap, cells: int, header: Header) -> MarkerArray:
+def surface_message(pole_map: PoleMap, cells: int, header: Message) -> Message:
     """The kriged surface as triangles in the colours of the legend."""
     surface = pole_map.surface(cells)
-    sheet = _marker(header, "surface", 0, Marker.TRIANGLE_LIST)
+    sheet = _marker(header, "surface", 0, "TRIANGLE_LIST")
     if surface is None:
-        return MarkerArray(markers=[_deleted(sheet)])
+        return make_message(MARKERS, markers=[_deleted(sheet)])
     below = surface.position_m - [0.0, 0.0, _LINE * pole_map.size_m]  # where it hides no ellipse
     _lay(sheet, below, shares(surface.f0_hz, pole_map.f0_hz), _SURFACE_ALPHA)
-    return MarkerArray(markers=[sheet])
+    return make_message(MARKERS, markers=[sheet])
 
 
 def marker_message(
-    pole_map: PoleMap, scale: EllipseScale, probability: float, header: Header
-) -> MarkerArray:
+    pole_map: PoleMap, scale: EllipseScale, probability: float, header: Message
+) -> Message:
     """Two markers: the ellipses of all points, crosses where a point failed."""
-    ellipses = _marker(header, "ellipses", 0, Marker.LINE_LIST)
-    crosses = _marker(header, "failures", 0, Marker.LINE_LIST)
+    ellipses = _marker(header, "ellipses", 0, "LINE_LIST")
+    crosses = _marker(header, "failures", 0, "LINE_LIST")
     if pole_map.estimated:
         ellipses.scale.x = _LINE * pole_map.size_m
         lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
@@ -88,7 +91,7 @@ def marker_message(
         ends = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
         crosses.points = _points(np.array(ends).reshape(-1, 3))
         crosses.color = _colour(_FAILED)
-    return MarkerArray(markers=[m if m.points else _deleted(m) for m in (ellipses, crosses)])
+    return make_message(MARKERS, markers=[m if m.points else _deleted(m) for m in (ellipses, crosses)])
 
 
 def legend_message(
@@ -96,17 +99,17 @@ def legend_message(
     scale: EllipseScale,
     probability: float,
     names: tuple[str, ...],
-    header: Header,
-) -> MarkerArray:
+    header: Message,
+) -> Message:
     """Right of the map and as high as it is long: colour bar, its figures, and beside them the lines.
 
     With the map it is little more than twice as wide as high. Each line is a marker: the distance at which
     rviz sets the lines of one text does not follow their height.
     """
-    everything = _marker(header, "", 0, Marker.CUBE)
-    everything.action = Marker.DELETEALL  # there may be fewer lines than before
+    everything = _marker(header, "", 0, "CUBE")
+    everything.action = everything.DELETEALL  # there may be fewer lines than before
     if not pole_map.estimated:
-        return MarkerArray(markers=[everything])
+        return make_message(MARKERS, markers=[everything])
     f0, size_m = pole_map.f0_hz, pole_map.size_m
     ticks = [f"{f0.min() + share * np.ptp(f0):.2f} Hz" for share in (0.0, 0.5, 1.0)]
     lines = legend_lines(pole_map, scale, probability, names)
@@ -118,17 +121,17 @@ def legend_message(
     y = float(low[1] + high[1] - size_m) / 2
     z = float(np.median(pole_map.positions_m[:, 2]))
 
-    bar = _marker(header, "legend", 0, Marker.TRIANGLE_LIST)
+    bar = _marker(header, "legend", 0, "TRIANGLE_LIST")
     across, up = np.meshgrid([0.0, _GAP], np.linspace(0, 1, _BAR_STEPS + 1))
     corners = np.stack([x + size_m * across, y + size_m * up, np.full_like(up, z)], axis=-1)
     _lay(bar, corners, up)  # (steps + 1, 2)
     markers = [everything, bar]
 
     def write(text: str, middle_m: float, height_m: float) -> None:
-        marker = _marker(header, "legend", len(markers), Marker.TEXT_VIEW_FACING)
+        marker = _marker(header, "legend", len(markers), "TEXT_VIEW_FACING")
         marker.text, marker.scale.z = text, text_m
         marker.scale.x = 0.6 * text_m  # of spaces; rviz's own is for texts 1 m high
-        marker.pose.position = Point(x=middle_m, y=height_m, z=z)
+        marker.pose.position = _point(middle_m, height_m, z)
         markers.append(marker)
 
     # rviz hangs a text about its middle
@@ -138,7 +141,7 @@ def legend_message(
     left_m += tick_width * text_m + 0.5 * _GAP * size_m
     for k, text in enumerate(lines):
         write(text, left_m + line_width * text_m / 2, y + size_m - 1.6 * k * text_m)
-    return MarkerArray(markers=markers)
+    return make_message(MARKERS, markers=markers)
 
 
 def legend_lines(
@@ -161,53 +164,59 @@ def legend_lines(
     return lines
 
 
-def restamp(message: PointCloud2 | MarkerArray, stamp: Time) -> None:
-    """Set all stamps of a message."""
-    for part in [message] if isinstance(message, PointCloud2) else message.markers:
-        part.header.stamp = stamp
-
-
-def header_message(frame_id: str, stamp: Time) -> Header:
+def header_message(frame_id: str, time_ns: int) -> Message:
     """Header of everything that shows one state of the map."""
-    return Header(frame_id=frame_id, stamp=stamp)
+    return make_message("std_msgs/msg/Header", frame_id=frame_id, stamp=_stamp(time_ns))
 
 
-def _cloud(table: np.ndarray, header: Header) -> PointCloud2:
+def restamp(message: Message, time_ns: int) -> None:
+    """Set all stamps of a message."""
+    for part in getattr(message, "markers", [message]):
+        part.header.stamp = _stamp(time_ns)
+
+
+def _stamp(time_ns: int) -> Message:
+    sec, nanosec = divmod(time_ns, 10**9)
+    return make_message("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+
+def _cloud(table: np.ndarray, header: Message) -> Message:
+    field: Any = message_types().types[_FIELD]
+    types = {"<f4": field.FLOAT32, "|u1": field.UINT8}
     fields = [
-        PointField(name=name, offset=offset, datatype=_TYPES[kind.str], count=1)
+        field(name=name, offset=offset, datatype=types[kind.str], count=1)
         for name, (kind, offset, *_) in (table.dtype.fields or {}).items()
-        if kind.str in _TYPES
+        if kind.str in types
     ]
-    return PointCloud2(
+    return make_message(
+        CLOUD,
         header=header,
         height=1,
         width=len(table),
         fields=fields,
-        is_bigendian=False,
         point_step=table.dtype.itemsize,
         row_step=table.nbytes,
-        data=table.tobytes(),
+        data=table.view(np.uint8).ravel(),
         is_dense=True,
     )
 
 
-def _marker(header: Header, namespace: str, number: int, kind: int) -> Marker:
+def _marker(header: Message, namespace: str, number: int, kind: str) -> Message:
     # locked: rviz tries again as soon as it knows the frame
-    marker = Marker(
-        header=header, ns=namespace, id=number, type=kind, action=Marker.ADD, frame_locked=True
-    )
+    marker = make_message(_MARKER, header=header, ns=namespace, id=number, frame_locked=True)
+    marker.type, marker.action = getattr(marker, kind), marker.ADD
     marker.pose.orientation.w = 1.0
     marker.color = _colour(_WHITE)
     return marker
 
 
-def _deleted(marker: Marker) -> Marker:
+def _deleted(marker: Message) -> Message:
     """Remove instead: rviz complains of lists without points."""
-    marker.action = Marker.DELETE
+    marker.action = marker.DELETE
     return marker
 
 
-def _lay(marker: Marker, positions_m: FloatArray, share: FloatArray, alpha: float = 1.0) -> None:
+def _lay(marker: Message, positions_m: FloatArray, share: FloatArray, alpha: float = 1.0) -> None:
     """Triangles between positions (r, c, 3), in the colours of shares (r, c)."""
     faces = grid_faces(*share.shape).ravel()
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
@@ -217,10 +226,14 @@ def _lay(marker: Marker, positions_m: FloatArray, share: FloatArray, alpha: floa
     marker.colors = [rgba[k] for k in faces]
 
 
-def _points(positions: FloatArray) -> list[Point]:
-    return [Point(x=x, y=y, z=z) for x, y, z in positions.tolist()]
+def _points(positions: FloatArray) -> list[Message]:
+    return [_point(*place) for place in positions.tolist()]
 
 
-def _colour(rgb: npt.ArrayLike, alpha: float = 1.0) -> ColorRGBA:
+def _point(x: float, y: float, z: float) -> Message:
+    return message_types().types["geometry_msgs/msg/Point"](x, y, z)
+
+
+def _colour(rgb: npt.ArrayLike, alpha: float = 1.0) -> Message:
     r, g, b = (float(v) for v in np.asarray(rgb))
-    return ColorRGBA(r=r, g=g, b=b, a=alpha)
+    return message_types().types["std_msgs/msg/ColorRGBA"](r, g, b, alpha)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map of a run as a recording of its own: what it shows, when, and where its frames stand."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.report import map_recording
+from tactile_resonance.report.map_recording import write_map_recording
+from tactile_resonance.scan.map_messages import POINT
+from tactile_resonance.scan.messages import make_message, to_cdr
+from tactile_resonance.scan.point_file import read_content, read_messages
+from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.scan_point import ScanPoint
+
+TABLE_IN_BASE = [0.3, -0.1, 0.05, 0.0, 0.0, np.pi / 2]
+TIP = Rotation.from_rotvec([0.1, 0.2, -0.3])
+START_NS = 1_700_000_000_000_000_000
+
+
+def result_of(index, attempt=0, outcome=Outcome.DONE, f0_hz=250.0, **more):
+    return PointResult(
+        index=index,
+        attempt=attempt,
+        outcome=outcome,
+        f0_hz=f0_hz,
+        f0_std_hz=0.01,
+        damping_ratio=0.03,
+        damping_ratio_std=1e-4,
+        f0_damping_covariance_hz=0.0,
+        x_m=0.002 * index,
+        y_m=0.001,
+        z_m=0.0,
+        normal_z=1.0,
+        frame_id="table",
+        simulated=True,
+        time_ns=START_NS + index * 10**9,
+        **more,
+    )
+
+
+ATTEMPTS = (
+    result_of(0),
+    result_of(1, outcome=Outcome.DISCARDED, f0_hz=999.0),
+    result_of(1, attempt=1, f0_hz=251.0),
+    result_of(2, outcome=Outcome.FAILED, f0_hz=np.nan),
+    result_of(3, outcome=Outcome.SKIPPED, f0_hz=np.nan),
+)
+
+
+def pose(x_m):
+    header = make_message("std_msgs/msg/Header", frame_id="base")
+    message = make_message("geometry_msgs/msg/PoseStamped", header=header)
+    message.pose.position.x = x_m
+    turn = message.pose.orientation
+    turn.x, turn.y, turn.z, turn.w = TIP.as_quat().tolist()
+    return to_cdr(message)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Four points, one repeated, one failed and one skipped, and a reference in free air."""
+    plan = [ScanPoint(i, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)) for i in range(4)]
+    facts = {"scan_node": {"table_in_base": TABLE_IN_BASE, "base_frame": "base"}}
+    with RunDirectory.create(tmp_path / "run", "name: x\n", plan, facts) as run:
+        for k, result in enumerate(ATTEMPTS):
+            with run.begin_point(result.index) as recording:
+                recording.write(
+                    "/left/tcp_pose", "geometry_msgs/msg/PoseStamped", START_NS + k, pose(0.01 * k)
+                )
+                recording.finish(result)
+        with run.begin_reference("air-after") as recording:
+            recording.finish(result_of(4, kind=Kind.AIR, f0_hz=246.6))
+    return tmp_path / "run"
+
+
+def told(path, topic):
+    return [(time_ns, message) for time_ns, _, message in read_messages(path, topic)]
+
+
+def test_the_map_grows_with_the_tissue_that_counts(folder):
+    path = write_map_recording(read_run(folder))
+    clouds = told(path, "/pole_map")
+    shown = [np.frombuffer(cloud.data.tobytes(), POINT)["f0_hz"].tolist() for _, cloud in clouds]
+    # neither the discarded attempt nor free air; the failure is a cross
+    assert [sorted(f0) for f0 in shown] == [[250.0], *3 * [[250.0, 251.0]]]
+    for time_ns, cloud in clouds:
+        assert cloud.header.frame_id == "table"
+        assert cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec == time_ns
+    crosses = [
+        {m.ns: m for m in array.markers}["failures"] for _, array in told(path, "/pole_map/markers")
+    ]
+    assert [len(marker.points) for marker in crosses] == [0, 0, 4, 4]
+    texts = [marker.text for marker in told(path, "/pole_map/legend")[-1][1].markers]
+    assert "2 points, 1 failed" in texts
+    assert "simulated, not measured" in texts
+
+
+def test_its_frames_are_those_of_the_scan(folder):
+    path = write_map_recording(read_run(folder))
+    ((_, static),) = told(path, "/tf_static")
+    (table,) = static.transforms
+    assert (table.header.frame_id, table.child_frame_id) == ("base", "table")
+    to, turn = table.transform.translation, table.transform.rotation
+    np.testing.assert_allclose([to.x, to.y, to.z], TABLE_IN_BASE[:3])
+    found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+    np.testing.assert_allclose(found.apply([1.0, 0.0, 0.0]), [0.0, 1.0, 0.0], atol=1e-12)
+    tips = [(time_ns, message.transforms[0]) for time_ns, message in told(path, "/tf")]
+    assert [tip.child_frame_id for _, tip in tips] == ["tip"] * len(ATTEMPTS)
+    np.testing.assert_allclose([t.transform.translation.x for _, t in tips], 0.01 * np.arange(5))
+    turn = tips[0][1].transform.rotation
+    assert (Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]) * TIP.inv()).magnitude() < 1e-12
+
+
+def test_late_readers_get_the_map_of_a_file_that_is_played(folder):
+    content = read_content(write_map_recording(read_run(folder)))
+    latched = {topic.name for topic in content.topics if topic.qos.durability.value == 1}
+    assert latched == {"/tf_static", "/pole_map"} | {
+        f"/pole_map/{name}" for name in ("markers", "legend", "surface")
+    }
+
+
+def test_a_long_run_is_drawn_at_some_points_and_at_the_last(folder, monkeypatch):
+    monkeypatch.setattr(map_recording, "MOST_STATES", 2)
+    path = write_map_recording(read_run(folder))  # in place of the one before
+    assert [cloud.width for _, cloud in told(path, "/pole_map")] == [2, 2]  # of four
+    crosses = told(path, "/pole_map/markers")[-1][1].markers[1]
+    assert len(crosses.points) == 4
+    assert {file.name for file in folder.iterdir()} >= {"map.mcap", "recording"}
+    assert not list(folder.glob(".map-*"))
+
+
+def test_without_a_point_there_is_no_map(tmp_path):
+    plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
+    RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}).close()
+    assert write_map_recording(read_run(tmp_path / "run")) is None
+    assert not (tmp_path / "run" / "map.mcap").exists()
