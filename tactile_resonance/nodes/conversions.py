@@ -185,6 +185,7 @@ def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
         cost=float(poles.cost),
         expected_cost=float(poles.expected_cost),
         condition_number=float(poles.condition_number),
+        instant_s=float("nan") if poles.instant_s is None else poles.instant_s,
         method=poles.method,
         status=POLES_STATUS[poles.status],
         message=poles.message,
@@ -196,10 +197,11 @@ def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
     _fill(message.damping_ratio, poles.damping_ratio, float)
     _fill(message.residue_real, poles.residues.real, float)
     _fill(message.residue_imag, poles.residues.imag, float)
-    for name in ("covariance", "total_covariance"):
-        covariance = getattr(poles, name)
-        if covariance is not None:
-            _fill(getattr(message, name), covariance, float)
+    drifts = ("f0_drift_hz_per_s", "damping_drift_per_s", "drift_covariance")
+    for name in ("covariance", "total_covariance", *drifts):
+        known = getattr(poles, name)
+        if known is not None:
+            _fill(getattr(message, name), known, float)
     return message
 
 

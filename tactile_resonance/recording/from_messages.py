@@ -8,6 +8,7 @@ A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays
 from __future__ import annotations
 
 import array
+import math
 from dataclasses import replace
 from enum import Enum
 from typing import Any, TypeVar
@@ -111,6 +112,9 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
     def blocks(values: Any) -> npt.NDArray[np.float64] | None:
         return array_of(values).reshape(n, 2, 2) if len(values) else None
 
+    def known(values: Any) -> npt.NDArray[np.float64] | None:
+        return array_of(values) if len(values) else None
+
     structure = ModelStructure()
     if message.order:
         structure = ModelStructure(message.order, message.numerator_order)
@@ -121,6 +125,10 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
         residues=array_of(message.residue_real) + 1j * array_of(message.residue_imag),
         covariance=blocks(message.covariance),
         total_covariance=blocks(message.total_covariance),
+        f0_drift_hz_per_s=known(message.f0_drift_hz_per_s),
+        damping_drift_per_s=known(message.damping_drift_per_s),
+        drift_covariance=blocks(message.drift_covariance),
+        instant_s=None if math.isnan(message.instant_s) else message.instant_s,
         structure=structure,
         band_hz=(message.band_low_hz, message.band_high_hz),
         lines=message.lines,

@@ -25,11 +25,15 @@ class MainMode:
         Of the estimate, total where known, else from noise; NaN where neither is.
     pole_rad_s : complex
         With positive imaginary part.
+    drift, drift_std : (2,) float
+        What f0 [Hz/s] and damping ratio [1/s] change by, and its deviation; NaN where no change shows.
     """
 
     estimate: FloatArray
     covariance: FloatArray
     pole_rad_s: complex
+    drift: FloatArray
+    drift_std: FloatArray
 
     @property
     def found(self) -> bool:
@@ -39,12 +43,16 @@ class MainMode:
 
 def main_mode(poles: Poles) -> MainMode:
     """Mode with the highest peak, |residue| / |Re pole|."""
-    covariance = np.full((2, 2), np.nan)
+    covariance, drift, drift_std = np.full((2, 2), np.nan), np.full(2, np.nan), np.full(2, np.nan)
     if not poles.f0_hz.size:
-        return MainMode(np.full(2, np.nan), covariance, complex("nan+nanj"))
+        return MainMode(np.full(2, np.nan), covariance, complex("nan+nanj"), drift, drift_std)
     k = int(np.argmax(np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)))
     for known in (poles.covariance, poles.total_covariance):
         if known is not None and np.all(np.isfinite(known[k])):
             covariance = known[k]
     estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
-    return MainMode(estimate, covariance, complex(poles.poles_rad_s[k]))
+    drifts = (poles.f0_drift_hz_per_s, poles.damping_drift_per_s)
+    if drifts[0] is not None and drifts[1] is not None and poles.drift_covariance is not None:
+        drift = np.array([drifts[0][k], drifts[1][k]])
+        drift_std = np.sqrt(np.diag(poles.drift_covariance[k]))
+    return MainMode(estimate, covariance, complex(poles.poles_rad_s[k]), drift, drift_std)

@@ -50,7 +50,7 @@ def measured_result(
     duration_s : float
         From the move to the point until the tip was free again [s].
     """
-    found, pole = map_point(poles, origin, scene.tissue_classes), main_mode(poles).pole_rad_s
+    found, mode = map_point(poles, origin, scene.tissue_classes), main_mode(poles)
     std = found.std
     relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
     blank = unmeasured_result(
@@ -73,8 +73,12 @@ def measured_result(
         damping_ratio_std=float(std[1]),
         f0_damping_covariance_hz=float(found.covariance[0, 1]),
         **relative,
-        pole_real_rad_s=pole.real,
-        pole_imag_rad_s=pole.imag,
+        f0_drift_hz_per_s=float(mode.drift[0]),
+        f0_drift_std_hz_per_s=float(mode.drift_std[0]),
+        damping_drift_per_s=float(mode.drift[1]),
+        damping_drift_std_per_s=float(mode.drift_std[1]),
+        pole_real_rad_s=mode.pole_rad_s.real,
+        pole_imag_rad_s=mode.pole_rad_s.imag,
         cost=float(poles.cost),
         expected_cost=float(poles.expected_cost),
         poles_status=poles.status.value,

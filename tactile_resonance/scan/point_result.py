@@ -69,6 +69,10 @@ class PointResult:
     f0_over_air_std: float = NAN
     damping_shift: float = NAN
     damping_shift_std: float = NAN
+    f0_drift_hz_per_s: float = NAN
+    f0_drift_std_hz_per_s: float = NAN
+    damping_drift_per_s: float = NAN
+    damping_drift_std_per_s: float = NAN
     pole_real_rad_s: float = NAN
     pole_imag_rad_s: float = NAN
     cost: float = NAN

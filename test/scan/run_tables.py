@@ -6,7 +6,7 @@ from dataclasses import asdict, fields
 
 import numpy as np
 
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
 from tactile_resonance.scan.scan_point import ScanPoint
 
@@ -49,32 +49,8 @@ def plan(count):
 
 def record_cdr(index, samples=200):
     """A record whose content tells which point it is of."""
-    types = message_types().types
     counts = (np.arange(samples, dtype=np.int32) * 7 + index).astype(np.int32)
-    return message_types().serialize_cdr(blank(types, RECORD, actuator_counts=counts), RECORD)
-
-
-def blank(types, name, **values):
-    """Message with every field zero or empty but those given."""
-    kinds = {
-        "string": "",
-        "bool": False,
-        "float64": 0.0,
-    }
-    content = {}
-    for field, (node, detail) in message_types().fielddefs[name][1]:
-        if field in values:
-            content[field] = values[field]
-        elif int(node) == 1:
-            base = detail[0] if isinstance(detail, tuple) else detail
-            content[field] = kinds.get(base, 0)
-        elif int(node) == 2:
-            content[field] = blank(types, detail)
-        else:
-            base = detail[0][1]
-            base = base[0] if isinstance(base, tuple) else base
-            content[field] = np.zeros(0, {"float64": float}.get(base, base))
-    return types[name](**content)
+    return to_cdr(make_message(RECORD, actuator_counts=counts))
 
 
 def result(index, attempt=0, **values):

@@ -9,36 +9,32 @@ import pytest
 
 from tactile_resonance.report.point_table import point_table, repeats_sentence, table_notes
 from tactile_resonance.scan.bench_truth import deviations, truths_of
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.map_messages import header_message
+from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from run_tables import POLES, START_NS, blank, plan, result
+from run_tables import POLES, START_NS, plan, result
 
 TRUTH = 100
 
 
 def poles(recording, topic, status, measurement_id, middle_ns, f0_hz):
-    types = message_types().types
     stamp_ns = START_NS + middle_ns
-    time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id="tip")
     values = {"f0_hz": [f0_hz], "damping_ratio": [0.03], "real_rad_s": [-50.0]}
     values |= {"imag_rad_s": [1600.0], "residue_real": [1.0], "residue_imag": [0.0]}
-    message = blank(
-        types,
+    message = make_message(
         POLES,
-        header=header,
+        header=header_message("tip", stamp_ns),
         status=status,
         measurement_id=measurement_id,
         label="gel10",
         **{name: np.array(value) for name, value in values.items()},
     )
-    cdr = message_types().serialize_cdr(message, POLES)
-    recording.write(topic, POLES, stamp_ns, cdr)
+    recording.write(topic, POLES, stamp_ns, to_cdr(message))
 
 
 @pytest.fixture

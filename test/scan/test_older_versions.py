@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import to_message
 from tactile_resonance.scan.recorded import EXCITATION, read_recorded, recorded_results
@@ -21,7 +21,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from run_tables import RECORD, START_NS, blank, plan, result
+from run_tables import RECORD, START_NS, plan, result
 
 KEY, N = 7, 200
 LACKS_TODAY = ("contact_coverage", "contact_reason")
@@ -53,15 +53,11 @@ def excitation():
     values = {name: getattr(made, name) for name in names}
     arrays = {name: getattr(made, name) for name in ("harmonics", "amplitude_v", "phase_rad")}
     arrays["harmonics"] = arrays["harmonics"].astype(np.uint32)
-    types = message_types().types
-    return blank(types, EXCITATION, measurement_id=KEY, grid=1, **values, **arrays)
+    return make_message(EXCITATION, measurement_id=KEY, grid=1, **values, **arrays)
 
 
 def record(block):
-    types = message_types().types
-    pose = blank(types, "geometry_msgs/msg/PoseStamped")
-    return blank(
-        types,
+    return make_message(
         RECORD,
         measurement_id=KEY,
         sample_rate_hz=5000.0,
@@ -71,7 +67,6 @@ def record(block):
         actuator_counts=np.arange(N, dtype=np.int32) + block,
         actuator_scale_v=1e-3,
         sensor_v=np.arange(N) * 1e-4,
-        tip_pose=pose,
         contact_force_n=0.01,
         contact_force_std_n=1e-4,
         contact_coverage=1.0,

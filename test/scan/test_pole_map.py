@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import (
@@ -40,6 +41,21 @@ def poles(f0_hz=(250.0,), residues=None, total=None, **values):
         total_covariance=total,
         **{"status": PolesStatus.OK, **values},
     )
+
+
+def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
+    drift = {
+        "f0_drift_hz_per_s": np.array([0.1, -0.3]),
+        "damping_drift_per_s": np.array([1e-4, 2e-4]),
+        "drift_covariance": np.array([np.diag([0.01, 1e-9]), np.diag([0.04, 4e-10])]),
+    }
+    modes = poles((250.0, 280.0), residues=[1.0, 2.0], **drift)
+    mode = main_mode(modes)
+    assert mode.estimate[0] == 280.0
+    np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
+    np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
+    constant = main_mode(poles((250.0, 280.0), residues=[1.0, 2.0]))
+    assert np.isnan([*constant.drift, *constant.drift_std]).all()
 
 
 def origin(x=0.0, y=0.0, z=0.0, key=1, normal=(0.0, 0.0, 1.0)):

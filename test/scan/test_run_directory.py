@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_file import offered_qos
 from tactile_resonance.scan.point_result import COLUMNS, Kind, Outcome, as_csv
 from tactile_resonance.scan.run_content import read_run
@@ -28,7 +28,6 @@ from run_tables import (
     RECORD,
     START_NS,
     assert_same,
-    blank,
     plan,
     record_cdr,
     record_point,
@@ -131,7 +130,7 @@ def test_replays_offer_what_the_nodes_offered(tmp_path):
     """As rosbag2 writes it, both where it reads: else a replayed topic is offered as volatile."""
     with create(tmp_path / "run") as run:
         with run.begin_reference("air-before") as reference:
-            poles = message_types().serialize_cdr(blank(message_types().types, POLES), POLES)
+            poles = to_cdr(make_message(POLES))
             reference.write("/poles", POLES, START_NS, poles, offered_qos(1024, latched=True))
             wrench = offered_qos(5, reliable=False)
             reference.write("/wrench", RECORD, START_NS, record_cdr(0), wrench)
