@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map: which mode, which place, and where its ellipses lie."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from scipy.stats import chi2
 
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import tip_orientation
+from tactile_resonance.scan.point_outcome import air_point, measured_result
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
@@ -22,6 +26,9 @@ from tactile_resonance.scan.pole_map import (
     point_of_result,
 )
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import scene
 
 COVARIANCE = np.array([[0.02**2, 0.5 * 0.02 * 8e-5], [0.5 * 0.02 * 8e-5, 8e-5**2]])
 SOFT = TissueClass("soft", np.array([250.0, 0.03]), np.diag([0.5**2, 0.001**2]))
@@ -54,6 +61,13 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     assert mode.estimate[0] == 280.0
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
+    result = measured_result(
+        *(air_point(3), 0, scene(), modes, origin(), Decision(Verdict.MOST_BLOCKS, "", 8)),
+        **{"time_ns": 1, "duration_s": 1.0},
+    )
+    assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
+    assert result.f0_drift_std_hz_per_s == pytest.approx(0.2)
+    assert result.damping_drift_std_per_s == pytest.approx(2e-5)
     constant = main_mode(poles((250.0, 280.0), residues=[1.0, 2.0]))
     assert np.isnan([*constant.drift, *constant.drift_std]).all()
 
