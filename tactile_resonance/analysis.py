@@ -133,13 +133,7 @@ def analyse(
     def fit(structure: ModelStructure) -> Poles:
         return _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
 
-    if candidates:
-        choice = choose_among(fit, candidates)
-        poles = choice.poles[choice.chosen]
-        orders = f"{choice.structure.order} and {choice.structure.numerator_order}"
-        warnings.append(f"orders: {orders} chosen by description length from {len(choice.mdl)}")
-    else:
-        poles = fit(structure)
+    poles = choose_among(fit, candidates).best if candidates else fit(structure)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:

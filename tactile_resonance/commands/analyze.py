@@ -19,6 +19,7 @@ from tactile_resonance.analysis import (
     write_whole,
 )
 from tactile_resonance.frf.estimate import METHODS
+from tactile_resonance.identification.order_choice import CANDIDATES
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
@@ -215,7 +216,7 @@ def run(options: argparse.Namespace) -> int:
     if options.order is None:
         if options.numerator_order is not None:
             raise ValueError("numerator_order: chosen with --order auto, expected none")
-        structures = [ModelStructure.with_residual(n, r) for n in (2, 4, 6) for r in (6, 8, 10)]
+        structures = list(CANDIDATES)
     elif options.numerator_order is not None:
         structures = [replace(structures[0], numerator_order=options.numerator_order)]
     if options.domain == "z":

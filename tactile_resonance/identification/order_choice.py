@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tactile_resonance.frf.result import FRF
-from tactile_resonance.identification.identify import identify_poles
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
+
+CANDIDATES = tuple(ModelStructure.with_residual(n, r) for n in (2, 4, 6) for r in (6, 8, 10))
+"""One to three modes, with six to ten residual terms."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +28,19 @@ class OrderChoice:
         correction for few lines. Infinite where there is no result.
     chosen : int
         Index of the smallest.
-    explained : bool
-        Whether the cost of the chosen one is what noise explains.
     """
 
     poles: tuple[Poles, ...]
     mdl: tuple[float, ...]
     chosen: int
-    explained: bool
+
+    @property
+    def best(self) -> Poles:
+        """Of the chosen structure; the message says that it was chosen."""
+        poles = self.poles[self.chosen]
+        orders = f"{poles.structure.order} and {poles.structure.numerator_order}"
+        note = f"orders {orders} chosen by description length from {len(self.mdl)}"
+        return replace(poles, message="; ".join(filter(None, [poles.message, note])))
 
     @property
     def structure(self) -> ModelStructure:
@@ -42,52 +48,26 @@ class OrderChoice:
         return self.poles[self.chosen].structure
 
 
-def choose_order(
-    frf: FRF,
-    band_hz: tuple[float, float] | None = None,
-    candidates: Sequence[ModelStructure] | None = None,
-) -> OrderChoice:
-    """Fit several structures and choose by minimum description length.
-
-    Parameters
-    ----------
-    frf : FRF
-        With (F,) arrays and a variance.
-    band_hz : (low, high), optional
-    candidates : sequence of ModelStructure, optional
-        One to three modes with 1 to 8 residual terms when absent.
-
-    Raises
-    ------
-    ValueError
-        If the variance is unknown (the cost then says nothing) or no candidate has a result.
-
-    References
-    ----------
-    De Ridder, Pintelon, Schoukens & Gillikin, *Modified AIC and MDL model selection criteria for
-    short data records*, IEEE Trans. Instrum. Meas. 54 (2005) 144-150.
-    """
-    if frf.variance is None or frf.dof < 1:
-        raise ValueError("frf.variance: None, choosing an order needs the variance of the response")
-    if candidates is None:
-        candidates = [
-            ModelStructure.with_residual(order, terms)
-            for order in (2, 4, 6)
-            for terms in (1, 2, 4, 6, 8)
-        ]
-    return choose_among(lambda structure: identify_poles(frf, band_hz, structure), candidates)
-
-
 def choose_among(
-    fit: Callable[[ModelStructure], Poles], candidates: Sequence[ModelStructure]
+    fit: Callable[[ModelStructure], Poles], candidates: Sequence[ModelStructure] = CANDIDATES
 ) -> OrderChoice:
-    """As `choose_order`, for any fit of a structure to the same data.
+    """Fit several structures to the same data and choose by minimum description length.
 
     Parameters
     ----------
     fit : callable
         May raise a `ValueError` where the data are too few for a structure, which is then left out.
     candidates : sequence of ModelStructure
+
+    Raises
+    ------
+    ValueError
+        If there is no candidate, or none has a result whose noise is known: the cost then says nothing.
+
+    References
+    ----------
+    De Ridder, Pintelon, Schoukens & Gillikin, *Modified AIC and MDL model selection criteria for
+    short data records*, IEEE Trans. Instrum. Meas. 54 (2005) 144-150.
     """
     if not candidates:
         raise ValueError("candidates: none given, expected one structure at least")
@@ -108,7 +88,7 @@ def choose_among(
             "candidates: none has a result with a known level of noise, more lines or smaller orders "
             "are needed"
         )
-    return OrderChoice(poles, mdl, chosen, poles[chosen].status is not PolesStatus.MODEL_ERROR)
+    return OrderChoice(poles, mdl, chosen)
 
 
 def _description_length(poles: Poles) -> float:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_frf
+from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.nodes.conversions import (
@@ -20,7 +21,14 @@ from tactile_resonance.nodes.running import POLES, RESULTS, run_node
 PARAMETERS = (
     Parameter("band_low_hz", 200.0, "Lower end of the band of the fit [Hz].", 0.0, 1e6),
     Parameter("band_high_hz", 300.0, "Upper end of the band of the fit [Hz].", 0.0, 1e6),
-    Parameter("order", 2, "Order of the denominator: two poles per mode.", 1, 20),
+    Parameter(
+        "order",
+        2,
+        "Order of the denominator: two poles per mode; 0: the data choose one to three modes and six to "
+        "ten residual terms, which takes nine fits.",
+        0,
+        20,
+    ),
     Parameter(
         "residual_terms",
         6,
@@ -64,8 +72,13 @@ class PolesNode(ManagedNode):
         low_hz, high_hz, order, terms, method = values(
             self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )
-        structure = ModelStructure.with_residual(order, terms)
-        return poles_of_frf(frf, (low_hz, high_hz), structure, method)
+
+        def fit(structure: ModelStructure) -> Poles:
+            return poles_of_frf(frf, (low_hz, high_hz), structure, method)
+
+        if order == 0:
+            return choose_among(fit).best
+        return fit(ModelStructure.with_residual(order, terms))
 
 
 def main() -> None:

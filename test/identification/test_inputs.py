@@ -29,7 +29,7 @@ from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import (
     identify_poles_from_bins,
 )
-from tactile_resonance.identification.order_choice import choose_order
+from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -158,7 +158,7 @@ def test_harmonics_kept_with_bins_are_whole_too():
 
 def test_no_candidates_are_named():
     with pytest.raises(ValueError, match="candidates: none given"):
-        choose_order(frf(), candidates=[])
+        choose_among(lambda structure: identify_poles(frf(), None, structure), candidates=[])
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,24 @@ def test_a_broken_frf_gets_a_failure_with_a_reason(node, case):
     assert after.f0_hz[0] == pytest.approx(250, rel=1e-6)
 
 
+@pytest.mark.parametrize("modes", [1, 2])
+def test_the_data_choose_how_many_modes_there_are(node, modes):
+    rng = np.random.default_rng(modes)
+    s = 2j * np.pi * LINES_HZ
+    g = np.full(LINES_HZ.size, 0.02 + 0j)
+    for f0_hz in (240.0, 262.0)[:modes]:
+        w0 = 2 * np.pi * f0_hz
+        g += 100 * s / (s**2 + 0.04 * w0 * s + w0**2)
+    g += 1e-3 * rng.standard_normal((2, g.size)).T @ [1, 1j] / np.sqrt(2)
+    frf = FRF(LINES_HZ, g, variance_noise=np.full(g.size, 1e-6), noise_dof=20)
+    node.set_parameters([rclpy.Parameter("order", value=0)])
+    node._on_frf(frf_to_message(frf, Origin(), 1.0, False))
+    (message,) = node.published
+    assert (message.order, message.status) == (2 * modes, msg.Poles.STATUS_OK)
+    assert list(message.f0_hz) == pytest.approx([240.0, 262.0][:modes], abs=0.1)
+    assert f"orders {2 * modes} and" in message.message
+
+
 def test_a_fit_that_raises_gets_a_failure_with_its_reason(node, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("division by zero")
