@@ -18,6 +18,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_yaml, require
 from tactile_resonance.scan.notes import parse_notes
+from tactile_resonance.scan.patterns import require_near
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
@@ -223,6 +224,7 @@ def _poses_in_scene(
         places = seen.position_m + seen.rotation.apply(poses[:, :3])
         turns = (seen.rotation * Rotation.from_quat(poses[:, 3:])).as_quat()
         poses = np.concatenate([places, turns], axis=1)
+    require_near(poses[:, :3], "poses")
     return poses
 
 

@@ -15,6 +15,8 @@ FloatArray = npt.NDArray[np.float64]
 FORMS = ("grid", "spiral", "list", "around", "region")
 ORDERS = ("serpentine", "raster")
 MOST_POINTS = 100_000
+FARTHEST_M = 10.0
+"""From the origin of its frame: out of the reach of any arm that carries the sensor."""
 
 
 def grid(
@@ -85,6 +87,20 @@ def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     """
     known_keys(fields, set(FORMS), where)
     require(len(fields) == 1, where, sorted(fields), f"exactly one of {', '.join(FORMS)}")
+    positions = _read_form(fields, where)
+    require_near(positions, where)
+    return positions
+
+
+def require_near(positions_m: FloatArray, where: str) -> None:
+    """Raise ``ValueError`` that names the first of (n, 3) places beyond `FARTHEST_M`; NaN is no place."""
+    (far,) = np.nonzero(np.any(np.abs(positions_m) > FARTHEST_M, axis=-1))
+    if far.size:
+        accepted = f"within {FARTHEST_M:g} m of the frame's origin"
+        require(False, f"{where}[{far[0]}]", positions_m[far[0]].tolist(), accepted)
+
+
+def _read_form(fields: Mapping[str, Any], where: str) -> FloatArray:
     form = next(iter(fields))
     if form == "list":
         return read_list(fields["list"], f"{where}.list")
@@ -94,6 +110,7 @@ def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
         centres, offsets = (
             read_list(content.get(key), f"{where}.{key}") for key in ("centres_m", "offsets_m")
         )
+        _check_count(float(len(centres)) * len(offsets), f"{where}.offsets_m")
         return (centres[:, None] + offsets).reshape(-1, 3)  # centre by centre
     if form == "spiral":
         known_keys(content, {"center_m", "radius_m", "spacing_m"}, where)
@@ -154,7 +171,5 @@ def _spacing(content: Mapping[str, Any], where: str) -> tuple[float, float]:
     return spacing, spacing
 
 
-def _check_count(count: float) -> None:
-    require(
-        count <= MOST_POINTS, "spacing_m", f"{count:.3g} points", f"at most {MOST_POINTS} points"
-    )
+def _check_count(count: float, where: str = "spacing_m") -> None:
+    require(count <= MOST_POINTS, where, f"{count:.3g} points", f"at most {MOST_POINTS} points")

@@ -105,6 +105,7 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
         ({"damping_ratio_std": math.inf}, "damping_ratio_std: got inf"),
         ({"notes": "{tip_wetness: damp}"}, "notes.tip_wetness: got 'damp'"),
         ({"poses": ((0, math.nan, 0, 0, 0, 0, 1),)}, r"poses\[0\]: y: got nan"),
+        ({"poses": (POSES[0], (0, 1e200, 0, 0, 0, 0, 1))}, r"poses\[1\]: got \[0.0, 1e\+200, 0.0\]"),
         ({"poses": (POSES[0], (0,) * 7)}, r"poses\[1\].orientation: got \(0, 0, 0, 0\)"),
     ],
 )

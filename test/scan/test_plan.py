@@ -82,6 +82,8 @@ def test_region_keeps_the_grid_points_in_it():
         ({"spiral": {"center_m": [0, 0], "radius_m": -1, "spacing_m": 1}}, "radius_m: got -1"),
         ({"list": []}, "one position or more"),
         ({"list": [[0, 0], [1]]}, r"list\[1\]"),
+        ({"list": [[0, 0], [0, 1e200]]}, r"positions\[1\]: got .*1e\+200.* within 10 m"),
+        ({"around": dict.fromkeys(("centres_m", "offsets_m"), [[0, 0]] * 400)}, "at most 100000"),
         ({"region": {"polygon_m": [[0, 0], [1, 0]], "spacing_m": 1}}, "three corners"),
     ],
 )
