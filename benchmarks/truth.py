@@ -38,7 +38,7 @@ CUBIC = {None: 0.0, -45: 2.8e-5, -36: 8e-5, -27: 2.5e-4}
 """Distortion over response in the band [dB]: k [1/V^2]."""
 REALISATIONS, PERIODS, SNR_DB = (2, 3, 4, 8), (2, 8), (40.0, 60.0)
 STRUCTURE = ModelStructure(2, 2)
-RECORDS, QUICK_RECORDS, TISSUE, LEVEL_V = 240, 24, "gel10", 4.0
+RECORDS, QUICK_RECORDS, TISSUE, LEVEL_V = 1200, 24, "gel10", 4.0
 BENCH_REALISATIONS = (2, 3, 4, 6, 8)
 INSIDE = stats.chi2.ppf(0.95, 2)
 
@@ -145,14 +145,15 @@ def bench_table(count: int) -> list[str]:
     bench, tissue = SimulatedBench.from_configuration(), read_tissues()[TISSUE]
     effects = replace(DEFAULT_EFFECTS, nonlinearity=True)
     design = design_multisine(level_v=LEVEL_V)
-    rate_hz, samples = design.sample_rate_hz, design.samples_per_period
-    u, y = np.empty((2, count, 2, samples))
+    options = (design.sample_rate_hz, design.samples_per_period, 2, design.harmonics, BAND_HZ)
+    plan = JointPlan(*options)
+    u, y = np.empty((2, count, plan.bins.size), complex)
     for k in tqdm(range(count), desc="records", disable=None):
         excitation = design_multisine(level_v=LEVEL_V, seed=k)
         block = bench.start(tissue, seed=k, effects=effects).block(Lines.of(excitation), 2)
-        u[k], y[k] = (c.volts.reshape(2, -1) for c in (block.actuator, block.sensor))
-    options = (rate_hz, samples, 2, design.harmonics, BAND_HZ)
-    alone = JointPlan(*options)(u, y)
+        for bins, channel in ((u, block.actuator), (y, block.sensor)):
+            bins[k] = plan.transform(channel.volts.reshape(2, -1))
+    alone = plan.from_bins(u, y)
     each = np.stack([alone.f0_hz[:, 0], alone.damping_ratio[:, 0]], axis=-1)
     lines = [
         f"## Realisations of the simulated bench at {LEVEL_V:g} V rms",
@@ -167,8 +168,8 @@ def bench_table(count: int) -> list[str]:
     for realisations in BENCH_REALISATIONS:
         groups = count // realisations
         part = slice(0, groups * realisations)
-        pairs = (v[part].reshape(groups, realisations, 2, -1) for v in (u, y))
-        result = RealisationsPlan(*options)(*pairs)
+        pairs = (v[part].reshape(groups, realisations, -1) for v in (u, y))
+        result = RealisationsPlan(*options).from_bins(*pairs)
         row = _judged(result, each[part].reshape(groups, realisations, 2), each.mean(axis=0))
         lines.append(
             f"| {realisations} | {groups} | {row.ok.mean():.3f} "

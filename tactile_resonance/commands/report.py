@@ -32,7 +32,13 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_table import point_table, table_notes
     from tactile_resonance.report.pole_map_figure import draw_pole_map
-    from tactile_resonance.report.run_report import as_page, pole_map_of, skipped_lines, summary
+    from tactile_resonance.report.run_report import (
+        as_page,
+        pole_map_of,
+        silent_lines,
+        skipped_lines,
+        summary,
+    )
     from tactile_resonance.scan.bench_truth import truths_of
 
     content = read_run(options.run_folder)
@@ -48,7 +54,8 @@ def run(options: argparse.Namespace) -> int:
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
-    for line in (*summary(content), *(f"left out: {line}" for line in skipped_lines(content))):
+    told = [*summary(content), *(f"silent record: {line}" for line in silent_lines(content))]
+    for line in (*told, *(f"left out: {line}" for line in skipped_lines(content))):
         print(line)
     for problem in content.problems:
         print(f"damaged: {problem}")

@@ -84,6 +84,10 @@ class MeasurementFrf:
                 f"record: {u.size} and {y.size} samples, expected whole periods of {n} on both "
                 "channels"
             )
+        if excitation.level_v == 0:
+            self._remember(record)
+            self._note("nothing was played")
+            return self.frf()
         if self._stream is None:
             self._stream = FrfStream(
                 excitation.harmonics,

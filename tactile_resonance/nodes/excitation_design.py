@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 from rclpy.node import Node
 
 from tactile_resonance.action import Measure
@@ -94,6 +96,8 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
         node, *(parameter.name for parameter in PARAMETERS)
     )
     periods, realisations, seed, passes = rest
+    if goal.silent and goal.level_v:
+        raise ValueError(f"level_v: {goal.level_v:g}, a silent measurement plays nothing: 0")
     level = goal.level_v or level
     if not level <= max_level:
         raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
@@ -120,6 +124,8 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
         )
         for realisation in range(realisations)
     ]
+    if goal.silent:
+        return [replace(each, amplitude_v=np.zeros(each.harmonics.size)) for each in excitations]
     if passes:
         return [compress_crest_factor(each, passes=passes) for each in excitations]
     return excitations
@@ -128,7 +134,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
 def check_output(excitations: Sequence[Excitation], info: DeviceInfo) -> None:
     """ValueError if a peak is more than the device can put out."""
     for excitation in excitations:
-        peak_v = excitation.level_v * excitation.crest_factor()
+        peak_v = float(np.max(np.abs(excitation.period())))
         if peak_v > info.output_peak_v:
             raise ValueError(
                 f"level_v: peak {peak_v:.3g} V, {info.name} puts out at most "

@@ -18,7 +18,7 @@ from tactile_resonance.report.point_table import table_notes
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
-from tactile_resonance.scan.references import SensorHealth, sensor_health
+from tactile_resonance.scan.references import SensorHealth, read_silent, sensor_health
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits, read_scan_scene
 
@@ -83,6 +83,9 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
     health, sentence = sensor_health(run, _drift_limits(run))
     css = "" if health is SensorHealth.STEADY else ' class="mark"'
     parts += ["<h2>Sensor in free air</h2>", f"<p{css}>{html.escape(sentence)}</p>"]
+    if silent := silent_lines(run):
+        parts += ["<h2>Silent record</h2><ul>"]
+        parts += [f"<li>{html.escape(line)}</li>" for line in silent] + ["</ul>"]
     notes = run.facts.get("notes") or {"notes": "none"}
     parts += ["<h2>Notes of the session</h2><ul>"]
     parts += [f"<li>{html.escape(f'{name}: {value}')}</li>" for name, value in notes.items()]
@@ -138,6 +141,15 @@ def summary(run: RunContent) -> list[str]:
         named = ", ".join(f"{name} {count}" for name, count in sorted(classes.items()))
         lines.append(f"Tissue called: {named}.")
     return lines
+
+
+def silent_lines(run: RunContent) -> list[str]:
+    """Noise and tones of both channels without drive; empty where no silent record was taken."""
+    try:
+        silent = read_silent(run)
+    except ValueError as error:
+        return [str(error)]
+    return [] if silent is None else silent.text().splitlines()
 
 
 def skipped_lines(run: RunContent) -> list[str]:

@@ -88,6 +88,8 @@ class MeasurementDesign:
     block_s : float
         Duration of a block [s].
     skipped : tuple of Skipped
+    silent : bool
+        Nothing is played.
     """
 
     grid: Grid
@@ -99,6 +101,7 @@ class MeasurementDesign:
     lines: int
     block_s: float
     skipped: tuple[Skipped, ...]
+    silent: bool = False
 
 
 def design_measurement(scene: ScanScene, offered: SensorRange | None = None) -> MeasurementDesign:
@@ -135,6 +138,9 @@ def design_measurement(scene: ScanScene, offered: SensorRange | None = None) -> 
         skipped.append(Skipped("a second realisation at every point", why, saved))
     if Output.RELAXATION not in scene.outputs:
         skipped.append(Skipped("relaxation after contact", "relaxation is not wanted"))
+    if Output.SILENT not in scene.outputs:
+        saved = scene.blocks.least * offered.period_s
+        skipped.append(Skipped("a silent record", "silent is not wanted", saved))
     if Output.MAP not in scene.outputs:
         skipped.append(Skipped("the map", "no map is wanted"))
     return MeasurementDesign(

@@ -33,19 +33,21 @@ from tactile_resonance.scan.progress import Phase, Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
+    SILENT,
     AirReference,
     read_reference,
     sensor_health,
 )
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import OnFailure, ScanScene
+from tactile_resonance.scan.scene import OnFailure, Output, ScanScene
 
 POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
 """Between the seeds of two attempts at a point: beyond the points of a scan."""
 SKIPPED = "skipped on request"
 LEFT = "left on request"
+NOTHING_PLAYED = "silent record: nothing was played"
 
 
 class ScanRunner:
@@ -87,11 +89,13 @@ class ScanRunner:
         self._air: AirReference | None = None
 
     def run(self) -> Summary:
-        """Finish every point that is not; the references of free air are taken before and after."""
+        """Finish every point that is not; references, of free air and silent, are taken before and after."""
         begun_s = self._hands.now_s()
         message = ""
         try:
             self._hands.retract()
+            if Output.SILENT in self._scene.outputs:
+                self._reference(SILENT)
             self._reference(BEFORE)
             self._air = read_reference(self._run.content, BEFORE)
             while (point := self._next()) is not None:
@@ -228,13 +232,21 @@ class ScanRunner:
         return decide(estimate, noise, total, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
-        """Measure in free air: the sensor's health and drift; one that fails does not end the scan."""
-        if not self._hands.free_air:
+        """Measure in free air: the sensor's health and drift; one that fails does not end the scan.
+
+        The silent one needs no free air: nothing is played.
+        """
+        silent = name == SILENT
+        if not (self._hands.free_air or silent):
             return
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
         point = air_point(len(self._plan.points) + (name == AFTER))
+        design = replace(self._plan.measurement, periods=self._scene.blocks.least)
+        if silent:
+            design = replace(design, realisations=1, silent=True)
+            point = replace(point, label=SILENT)
         told = 0
 
         def all_blocks(poles: Poles, blocks: int) -> bool:
@@ -251,7 +263,7 @@ class ScanRunner:
                 begun_s = self._hands.now_s()
                 try:
                     measured = self._hands.measure(
-                        replace(self._plan.measurement, periods=self._scene.blocks.least),
+                        design,
                         point.label,
                         self._seed + point.index,
                         all_blocks,
@@ -268,16 +280,23 @@ class ScanRunner:
                 except (Interrupted, ScanEnded) as error:
                     self._discard(point, recording, str(error) or LEFT)
                     raise
-                result = measured_result(
-                    point,
-                    recording.attempt,
-                    replace(self._scene, tissue_classes=()),
-                    measured.poles,
-                    measured.origin,
-                    Decision(Verdict.MOST_BLOCKS, "", told),
-                    time_ns=time.time_ns(),
-                    duration_s=self._hands.now_s() - begun_s,
-                )
+                duration_s = self._hands.now_s() - begun_s
+                if silent:
+                    result = self._unmeasured(
+                        point, recording, Outcome.SKIPPED, NOTHING_PLAYED, duration_s
+                    )
+                    result = replace(result, simulated=measured.origin.simulated)
+                else:
+                    result = measured_result(
+                        point,
+                        recording.attempt,
+                        replace(self._scene, tissue_classes=()),
+                        measured.poles,
+                        measured.origin,
+                        Decision(Verdict.MOST_BLOCKS, "", told),
+                        time_ns=time.time_ns(),
+                        duration_s=duration_s,
+                    )
                 result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
                 result = replace(result, kind=Kind.AIR)
                 self._publish(recording.finish(result))

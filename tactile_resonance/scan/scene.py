@@ -59,6 +59,7 @@ class Output(str, Enum):
     DISTORTION = "distortion"
     RELAXATION = "relaxation"
     MAP = "map"
+    SILENT = "silent"  # tones and noise, from a record without drive before the first point
 
 
 class OnFailure(str, Enum):

@@ -100,6 +100,14 @@ def test_nothing_but_later_blocks_is_a_failure_with_a_reason(channels):
     assert "blocks lost" in frf.message
 
 
+def test_of_a_silent_record_there_is_no_frf(channels):
+    played = excitation()
+    silent = replace(played, amplitude_v=np.zeros(played.harmonics.size))
+    frf = MeasurementFrf(1).add(record(*channels[:, 0, :1], 0, 0), silent)
+    assert (frf.status, frf.message) == (FrfStatus.FAILED, "nothing was played")
+    assert frf.g.size == 0
+
+
 def test_saturation_is_said(channels):
     u, y = channels
     measurement = MeasurementFrf(1)

@@ -22,6 +22,7 @@ from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.references import read_silent
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
@@ -35,6 +36,7 @@ regions:
   - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.0, 0.0], radius_m: 0.025}}
 positions:
   list: [[0.0, 0.0], [0.004, 0.0], [0.004, 0.004]]
+outputs: [poles, map, silent]
 precision: {f0_std_hz: 0.02}
 blocks: {least: 3, most: 4}
 """
@@ -80,7 +82,7 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         client._node.create_subscription(
             msg.PointResult, "point_result", told.append, POINT_RESULTS
         )
-        client.wait(lambda: len(told) == 5, 20.0, "all results")
+        client.wait(lambda: len(told) == 6, 20.0, "all results")
     assert result.ending is Ending.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (3, 0, 0)
     run = read_run(run_path)
@@ -95,22 +97,31 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         modes = truth_of(bench.coupled(read_tissues().gelatine(10.0), force_n=point.force_n)).modes
         f0_hz = min((mode.f0_hz for mode in modes), key=lambda f: abs(f - 250))
         assert abs(point.f0_hz - f0_hz) < 0.2 + 5 * point.f0_std_hz
+        assert 1.01 < point.f0_over_air < 1.05  # the pole in air, not in the silent record
         assert point.simulated
 
     # an independent reader finds every block's record, FRF and poles
     with Reader(run_path / "recording") as reader:
         counts = Counter(connection.topic for connection, _, _ in reader.messages())
-    air = 2 * 3
-    blocks = sum(point.blocks for point in run.results) + air
+    references = 3 * 3  # silent, and in free air before and after
+    blocks = sum(point.blocks for point in run.results) + references
     assert counts["/record"] == counts["/frf"] == counts["/poles"] == blocks
-    assert counts["/point_result"] == 3 + 2
+    assert counts["/point_result"] == 3 + 3
     # a late reader gets those of the node that was killed too
     assert [(r.kind, r.index, r.outcome) for r in told] == [
+        ("air", 3, Outcome.SKIPPED),
         *[("air", 3, Outcome.DONE), *[("tissue", k, Outcome.DONE) for k in range(3)]],
         ("air", 4, Outcome.DONE),
     ]
-    assert max(r.f0_hz for r in told if r.kind == "air") < min(
+    assert max(r.f0_hz for r in told if r.kind == "air" and r.outcome == Outcome.DONE) < min(
         r.f0_hz for r in told if r.kind == "tissue"
     )
     assert counts["/wrench"] > 100
     assert np.isfinite([point.force_std_n for point in run.results]).any()
+
+    # nothing was played: noise of the bench's sensor channel, and no hum
+    silent = read_silent(run)
+    assert silent.tones == ()
+    # 0.5 mV rms in 25 kHz, of the sensor's configuration
+    assert silent.sensor_noise == pytest.approx(5e-4 / np.sqrt(25e3), rel=0.05)
+    assert silent.actuator_noise == 0

@@ -3,7 +3,9 @@
 
 import os
 import re
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
 
@@ -112,6 +114,23 @@ def test_compressed_phases_for_one_realisation_only(ros):
             excitation_design.design(node, Measure.Goal(realisations=10**6), 0)
         with pytest.raises(ValueError, match="compressed phases are not random"):
             excitation_design.design(node, Measure.Goal(realisations=2), 0)
+    finally:
+        node.destroy_node()
+
+
+def test_a_silent_measurement_plays_nothing(ros):
+    from tactile_resonance.action import Measure
+
+    from tactile_resonance.nodes import excitation_design
+
+    node = excitation_node.ExcitationNode()
+    try:
+        node.set_parameters([RosParameter("compression_passes", value=300)])
+        (silent,) = excitation_design.design(node, Measure.Goal(silent=True), 0)
+        assert not np.any(silent.period())
+        excitation_design.check_output([silent], SimpleNamespace(name="none", output_peak_v=0.0))
+        with pytest.raises(ValueError, match="level_v: 1.0*, a silent measurement plays nothing"):
+            excitation_design.design(node, Measure.Goal(silent=True, level_v=1.0), 0)
     finally:
         node.destroy_node()
 

@@ -36,6 +36,7 @@ class Bench:
     free_air: bool = True
     time_s: float = 1000.0
     seeds: list = field(default_factory=list)
+    silent: list = field(default_factory=list)
 
     def now_s(self):
         return self.time_s
@@ -60,6 +61,7 @@ class Bench:
 
     def measure(self, design, label, seed, enough, recording, check):
         blocks = 0
+        self.silent.append(design.silent)
         recording.measurement_id = 1000 + seed
         recording.write("/note", "std_msgs/msg/String", time.time_ns(), note(label))
         while blocks < design.periods:

@@ -21,6 +21,7 @@ from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
+from tactile_resonance.scan.scene import Output
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import BLOCK_S, SPREAD_HZ, TOUCH_S, Bench, begin, scan, scene
@@ -49,6 +50,23 @@ def test_each_point_is_measured_until_it_is_precise_enough_and_kept(tmp_path):
     )
     assert not bench.holding
     assert told[-1].finished == 4
+
+
+def test_a_silent_record_is_taken_before_all_else_where_the_scene_asks_for_it(tmp_path):
+    bench = Bench()
+    made = scene(2, outputs=(Output.POLES, Output.SILENT))
+    summary, run, _ = scan(tmp_path / "run", made, bench)
+    assert summary.complete
+    measured = [entry[1] for entry in bench.log if entry[0] == "measure"]
+    assert measured == ["silent", "air", *(point.label for point in run.points), "air"]
+    assert bench.silent == [True, *4 * [False]]
+    assert [file.name for file in run.files if "silent" in file.name] == [
+        "reference-00-silent.mcap"
+    ]
+    # it is taken once
+    with RunDirectory.open(tmp_path / "run") as again:
+        ScanRunner(made, make_plan(made), again, bench, Controls(), print).run()
+    assert len([entry for entry in bench.log if entry[1] == "silent"]) == 1
 
 
 def test_without_free_air_nothing_is_called_a_reference(tmp_path):
