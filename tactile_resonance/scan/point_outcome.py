@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +101,7 @@ def measured_result(
     )
 
 
-def _nominal(found: MapPoint) -> dict[str, float]:
+def _nominal(found: MapPoint) -> dict[str, Any]:
     """Fields of the pole at the nominal force and age; none where it could not be referred to them."""
     at = found.for_tissue
     if at is None or not at.referred:

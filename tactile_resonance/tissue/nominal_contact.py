@@ -170,8 +170,8 @@ def refer_to_nominal(
     To V belong noise and scale of the force sensor and the uncertain c. The last term is what curvature may
     leave: b = |d pole / dF| D^2 / (3 F0), in any direction of the complex plane. A shift that goes as a power p
     of the force leaves (1 - p) / 2 of D^2 / F0 times its slope; stiffness goes with the contact radius,
-    F^(1/3), radiated waves with its square and cube, so that p is 1/3 or more. A force that is unknown counts as
-    the nominal one with the deviation `NominalContact.unknown_force_std_n`, an age likewise.
+    F^(1/3), radiated waves with its square and cube, so that p is 1/3 or more. A force that is unknown counts
+    as the nominal one with the deviation `NominalContact.unknown_force_std_n`, an age likewise.
     """
     x, own = np.array(estimate, float), np.array(covariance, float)
     if nominal is None:

@@ -21,6 +21,7 @@ from tactile_resonance.scan.pole_map import (
     point_of_result,
 )
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
+from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
 
 COVARIANCE = np.array([[0.02**2, 0.5 * 0.02 * 8e-5], [0.5 * 0.02 * 8e-5, 8e-5**2]])
 SOFT = TissueClass("soft", np.array([250.0, 0.03]), np.diag([0.5**2, 0.001**2]))
@@ -71,6 +72,33 @@ def test_tissue_is_called_where_there_are_classes():
     called = [map_point(poles((f0,)), origin(), (SOFT, FIRM)).tissue_class for f0 in (250.2, 262.0)]
     assert called == ["soft", UNKNOWN]
     assert map_point(poles(), origin()).tissue_class == ""
+
+
+def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown():
+    """3 mN too much move a soft tissue to where it is neither; without a force nothing is said of it."""
+    sensitivity = ForceSensitivity(np.array([1000.0, 0.0]), np.diag([10.0**2, 0.01**2]))
+    nominal = NominalContact(0.01, 1.0, sensitivity)
+    given = {"classes": (SOFT, FIRM), "nominal": nominal, "age_s": 1.0}
+
+    def pressed(force_n, force_std_n=1e-4):
+        contact = replace(origin().contact, force_n=force_n, force_std_n=force_std_n)
+        return replace(origin(), contact=contact)
+
+    plain = map_point(poles((253.0,)), pressed(0.013), (SOFT, FIRM))
+    assert plain.tissue_class == UNKNOWN
+    assert "farther from" in plain.tissue_reason
+    assert "force and age of contact are not accounted for" in plain.tissue_reason
+    found = map_point(poles((253.0,)), pressed(0.013), **given)
+    assert (found.tissue_class, found.tissue_reason) == ("soft", "")
+    assert found.for_tissue.compared[0] == pytest.approx(250.0)
+    np.testing.assert_array_equal(found.estimate, [253.0, 0.03])
+    np.testing.assert_array_equal(found.covariance, COVARIANCE)
+    assert found.for_tissue.covariance[0, 0] > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
+    unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given)
+    assert unknown.tissue_class == UNKNOWN
+    assert np.isnan(unknown.tissue_probability)
+    assert unknown.tissue_reason.startswith("the force is unknown")
+    np.testing.assert_array_equal(unknown.estimate, [250.0, 0.03])
 
 
 def test_each_place_once_whatever_comes():

@@ -21,6 +21,10 @@ CLASSES = {
     name: {"f0_hz": f0, "damping_ratio": 0.03, "f0_std_hz": 0.1, "damping_ratio_std": 1e-4}
     for name, f0 in (("a", 250.0), ("b", 255.0))
 }
+NOMINAL = {
+    **{"force_n": 0.02, "age_s": 3.0, "f0_hz_per_n": 220.0, "damping_ratio_per_n": 1.3},
+    **{"f0_std_hz_per_n": 20.0, "damping_ratio_std_per_n": 0.1},
+}
 
 
 def read(tmp_path, **content):
@@ -114,9 +118,17 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     points = [[250.0, 0.03], [250.1, 0.031], [249.8, 0.0305], [250.3, 0.0302]]
     content = {"tissue_classes": {"measured": {"points": points, "prior": 2.0}}}
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content))
-    (tissue,) = read(tmp_path, tissue_classes="classes.yaml").tissue_classes
+    scene = read(tmp_path, tissue_classes="classes.yaml")
+    assert scene.nominal_contact is None
+    (tissue,) = scene.tissue_classes
     np.testing.assert_allclose(tissue.mean, np.mean(points, axis=0))
     assert (tissue.degrees_of_freedom, tissue.prior) == (2.0, 2.0)
+    # the contact to which they refer stands beside them
+    (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content | {"nominal_contact": NOMINAL}))
+    scene = read(tmp_path, tissue_classes="classes.yaml")
+    assert (scene.nominal_contact.force_n, scene.nominal_contact.age_s) == (0.02, 3.0)
+    with pytest.raises(ValueError, match="nominal_contact: got 'one'; accepted is none: it belongs"):
+        read(tmp_path, tissue_classes="classes.yaml", nominal_contact=NOMINAL)
 
 
 @pytest.mark.parametrize(
@@ -143,6 +155,11 @@ def test_classes_from_a_file_and_from_points(tmp_path):
         ),
         ({"tissue_classes": {"a": {"f0_hz": 250.0}}}, "tissue_classes.a.damping_ratio: got None"),
         ({"tissue_classes": "none.yaml"}, "none.yaml"),
+        ({"nominal_contact": NOMINAL}, "nominal_contact: got 'one'; accepted is none without tissue_c"),
+        (
+            {"tissue_classes": CLASSES, "nominal_contact": NOMINAL | {"age_s": 0}},
+            "scene.yaml: nominal_contact.age_s: got 0.0; accepted is a number above 0",
+        ),
         ({"positions": None}, "positions: got None"),
         (
             {"positions": {"around": {"centres_m": [[0, 0]]}}},
