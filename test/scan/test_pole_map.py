@@ -94,6 +94,9 @@ def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown(
     np.testing.assert_array_equal(found.estimate, [253.0, 0.03])
     np.testing.assert_array_equal(found.covariance, COVARIANCE)
     assert found.for_tissue.covariance[0, 0] > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
+    # a force that is known to 1 mN only makes 1 Hz
+    unsure = [map_point(poles((252.0,)), pressed(0.01, std), **given) for std in (1e-4, 1e-3)]
+    assert [point.tissue_class for point in unsure] == [UNKNOWN, "soft"]
     unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given)
     assert unknown.tissue_class == UNKNOWN
     assert np.isnan(unknown.tissue_probability)

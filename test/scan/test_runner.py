@@ -9,11 +9,13 @@ import sys
 import textwrap
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
@@ -90,6 +92,16 @@ def test_tissues_are_told_apart_at_the_nominal_force(tmp_path):
     ((_, _, reference),) = read_messages(run.path / "recording" / air.name, "/point_result")
     assert np.isnan(reference.nominal_f0_hz)
     assert reference.tissue_class == ""
+
+
+def test_a_report_states_that_force_and_age_are_not_accounted_for(tmp_path):
+    _, run, _ = scan(tmp_path / "run", replace(pressed_scene(), nominal_contact=None), Bench())
+    reason = "force and age of contact are not accounted for: no nominal_contact is given"
+    assert all(reason in result.tissue_reason for result in run.latest)
+    assert any(
+        line.startswith("No pole is referred to a nominal contact") and reason in line
+        for line in sentences(run)
+    )
 
 
 def test_nothing_is_said_of_tissue_where_the_force_is_unknown(tmp_path):

@@ -116,7 +116,15 @@ def test_report_needs_nothing_else(run_folder, capsys):
     printed = capsys.readouterr().out
     assert "25 of 25 points finished: 25 with poles, 0 failed, 0 skipped." in printed
     assert re.search(r"\d+ blocks measured; \d+ more were allowed and not needed", printed)
+    assert "Tissue is called from 25 poles at the nominal force and age of contact" in printed
     text = (run_folder / "report.html").read_text()
+    assert "nominal f0 [Hz]" in text
+    for result in read_run(run_folder).latest:
+        for value, std in (
+            (result.f0_hz, result.f0_std_hz),
+            (result.nominal_f0_hz, result.nominal_f0_std_hz),
+        ):
+            assert f"{value:.3f} ± {std:.2g}" in text
     page = Page()
     page.feed(text)
     assert page.open == []
