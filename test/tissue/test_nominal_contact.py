@@ -102,6 +102,18 @@ def test_age_is_a_force_by_the_creep_compliance(tissue):
     np.testing.assert_allclose(at.covariance, NOISE, rtol=1e-9)
 
 
+@pytest.mark.parametrize("age_s", [0.5, 2.0, 4.0])
+def test_a_force_that_relaxes_under_a_held_place_leaves_the_pole_where_it_is(age_s):
+    """The contact stays, and so does the pole; the force alone would have it moved."""
+    tissue = TISSUES["gel10"]
+    force_n = FORCE_N * float(tissue.relaxation_modulus(age_s) / tissue.relaxation_modulus(AGE_S))
+    x, contact = poles(), ContactState(force_n, 0.0, age_s)
+    at = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal(creep=0.03, creep_std=0.003))
+    assert np.all(np.abs(at.compared - x) < np.sqrt(np.diag(at.covariance)))
+    off = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal())
+    assert np.abs(off.compared - x)[0] > 4 * np.abs(at.compared - x)[0]
+
+
 def test_creep_of_the_scenes_is_that_of_the_bench():
     compliance, told = TISSUES["gel10"].creep_compliance, DEMO.nominal_contact
     for age_s in (0.5, 2.0, 4.0, 5.0):
