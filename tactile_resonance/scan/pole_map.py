@@ -20,7 +20,7 @@ from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import (
-    ContactState,
+    ContactLoad,
     NominalContact,
     PoleForTissue,
     refer_to_nominal,
@@ -142,7 +142,7 @@ def map_point(
     mode = main_mode(poles)
     name, probability, reason, referred = "", float("nan"), "", None
     if classes and mode.found:
-        pressed = ContactState(contact.force_n, contact.force_std_n, age_s)
+        pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
         referred = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
         call = classify(referred.compared, referred.covariance, classes, unknown_level)
         name, probability = call.name, call.probability

@@ -42,7 +42,7 @@ from tactile_resonance.scan.references import (
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, ScanScene
-from tactile_resonance.tissue.nominal_contact import ContactState, refer_to_nominal
+from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 
 POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
@@ -231,7 +231,7 @@ class ScanRunner:
         if isinstance(wanted, Separate):
             # tissues are told apart by what can be said of tissue, precision is that of the measured pole
             mode, force = main_mode(poles), measured.origin.contact
-            pressed = ContactState(force.force_n, force.force_std_n, measured.contact_age_s)
+            pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
             at = refer_to_nominal(
                 mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
             )

@@ -47,7 +47,7 @@ class ForceSensitivity:
 
 
 @dataclass(frozen=True)
-class ContactState:
+class ContactLoad:
     """Force on the tissue and age of contact, as they were measured.
 
     Attributes
@@ -142,7 +142,7 @@ class PoleForTissue:
 def refer_to_nominal(
     estimate: npt.ArrayLike,
     covariance: npt.ArrayLike,
-    contact: ContactState,
+    contact: ContactLoad,
     nominal: NominalContact | None,
 ) -> PoleForTissue:
     """Pole at the nominal force and age of contact, with its covariance for tissue.
@@ -153,7 +153,7 @@ def refer_to_nominal(
         f0 [Hz] and damping ratio as measured.
     covariance : (2, 2) float
         Of the estimate, total where known.
-    contact : ContactState
+    contact : ContactLoad
         Under which it was measured.
     nominal : NominalContact or None
         None: nothing is known of the sensitivity. The measured pole is then compared as it is, without a term
@@ -190,7 +190,7 @@ def refer_to_nominal(
 
 
 def _equivalent_force(
-    contact: ContactState, nominal: NominalContact
+    contact: ContactLoad, nominal: NominalContact
 ) -> tuple[float, float, str] | str:
     """Equivalent less nominal force [N], its variance and a note; a sentence where it is unknown."""
     notes = []

@@ -13,7 +13,7 @@ from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.tissue.classify import classify
-from tactile_resonance.tissue.nominal_contact import ContactState, refer_to_nominal
+from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 
 SCENES = sorted(path.name for path in share_path("config/scenes").glob("*.yaml"))
 LEAST = {"force_n": 0.01, "positions": {"list": [[0, 0], [0.01, 0]]}}
@@ -74,7 +74,7 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
     # members at any force of 0.15 mN about nominal and any age are as often unknown as the level says
     def tail(percent, force_n, age_s):
         x = poles(gelatine(percent), force_n, age_s)
-        at = refer_to_nominal(x, noise, ContactState(force_n, 5e-5, age_s), nominal)
+        at = refer_to_nominal(x, noise, ContactLoad(force_n, 5e-5, age_s), nominal)
         return classify(at.compared, at.covariance, [plain]).tail_probability
 
     tails = [

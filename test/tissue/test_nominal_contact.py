@@ -12,7 +12,7 @@ from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.tissue.classify import UNKNOWN, classify
 from tactile_resonance.tissue.nominal_contact import (
-    ContactState,
+    ContactLoad,
     ForceSensitivity,
     NominalContact,
     refer_to_nominal,
@@ -59,7 +59,7 @@ def call(x, contact, reference=DEMO.nominal_contact):
 @pytest.mark.parametrize("age_s", [1.0, 2.0, 5.0])
 def test_gelatine_is_called_so_whatever_its_force_and_age(force_n, age_s):
     x = poles(force_n=force_n, age_s=age_s)
-    found = call(x, ContactState(force_n, 1e-5, age_s))
+    found = call(x, ContactLoad(force_n, 1e-5, age_s))
     assert (found.name, found.reason) == ("gelatine 10 %", "")
     assert found.probability > 0.9
     assert found.tail_probability > 0.3
@@ -68,7 +68,7 @@ def test_gelatine_is_called_so_whatever_its_force_and_age(force_n, age_s):
 def test_unreferred_the_same_gelatine_is_unknown():
     """What is mended: 0.5 mN less than nominal is outside of 99 % of the class, by its damping."""
     x = poles(force_n=9.5e-3, age_s=1.0)
-    assert call(x, ContactState(9.5e-3, 1e-5, 1.0), None).name == UNKNOWN
+    assert call(x, ContactLoad(9.5e-3, 1e-5, 1.0), None).name == UNKNOWN
 
 
 @pytest.mark.parametrize("tissue", ["gel10", "gel16", "cortex", "white", "liver", "tumour"])
@@ -76,7 +76,7 @@ def test_unreferred_the_same_gelatine_is_unknown():
 def test_poles_at_another_force_are_referred_to_the_truth_at_the_nominal_one(tissue, force_n):
     """Within what curvature alone is stated to leave: the sensitivity is exact, there is no noise."""
     x, truth = poles(tissue, force_n), poles(tissue)
-    contact = ContactState(force_n, 0.0, AGE_S)
+    contact = ContactLoad(force_n, 0.0, AGE_S)
     at = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal(tissue))
     std = np.sqrt(np.diag(at.covariance))
     assert np.all(np.abs(at.compared - truth) < std)
@@ -96,7 +96,7 @@ def test_age_is_a_force_by_the_creep_compliance(tissue):
     np.testing.assert_allclose(poles(tissue, age_s=4.0), poles(tissue, FORCE_N * grown), rtol=1e-9)
     # a force that makes up for it leaves nothing to refer
     x = poles(tissue, FORCE_N / grown, 4.0)
-    contact = ContactState(FORCE_N / grown, 0.0, 4.0)
+    contact = ContactLoad(FORCE_N / grown, 0.0, 4.0)
     at = refer_to_nominal(x, NOISE, contact, nominal(tissue, creep=power))
     np.testing.assert_allclose(at.compared, poles(tissue), rtol=1e-9)
     np.testing.assert_allclose(at.covariance, NOISE, rtol=1e-9)
@@ -107,7 +107,7 @@ def test_a_force_that_relaxes_under_a_held_place_leaves_the_pole_where_it_is(age
     """The contact stays, and so does the pole; the force alone would have it moved."""
     tissue = TISSUES["gel10"]
     force_n = FORCE_N * float(tissue.relaxation_modulus(age_s) / tissue.relaxation_modulus(AGE_S))
-    x, contact = poles(), ContactState(force_n, 0.0, age_s)
+    x, contact = poles(), ContactLoad(force_n, 0.0, age_s)
     at = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal(creep=0.03, creep_std=0.003))
     assert np.all(np.abs(at.compared - x) < np.sqrt(np.diag(at.covariance)))
     off = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal())
@@ -149,7 +149,7 @@ def test_the_covariance_for_tissue_holds_the_truth_as_often_as_it_says():
         equivalent = force * (age_s / AGE_S) ** power
         x = rng.multivariate_normal(truth + own * (equivalent - FORCE_N), NOISE)
         told = force * (1 + scale_std * rng.standard_normal()) + force_std * rng.standard_normal()
-        at = refer_to_nominal(x, NOISE, ContactState(told, force_std, age_s), reference)
+        at = refer_to_nominal(x, NOISE, ContactLoad(told, force_std, age_s), reference)
         inside["all"] += distance2(at.compared - truth, at.covariance) < 5.991
         inside["pole"] += distance2(x - truth, NOISE) < 5.991
     share, std = inside["all"] / runs, np.sqrt(0.95 * 0.05 / runs)
@@ -184,11 +184,11 @@ def test_each_source_of_uncertainty_widens_the_covariance_for_tissue_alone(chang
         spread = changes.pop("covariance")
         extra = spread * (equivalent - FORCE_N) ** 2
         base = replace(base, sensitivity=ForceSensitivity(slope(), spread))
-    contact = ContactState(force_n, force_std, age_s)
+    contact = ContactLoad(force_n, force_std, age_s)
     at = refer_to_nominal(x, NOISE, contact, replace(base, **changes))
     expected = NOISE + np.outer(slope(), slope()) * variance + extra
     curved = refer_to_nominal(
-        x, np.zeros((2, 2)), ContactState(force_n, 0.0, age_s), exact
+        x, np.zeros((2, 2)), ContactLoad(force_n, 0.0, age_s), exact
     ).covariance
     np.testing.assert_allclose(at.covariance, expected + curved, rtol=1e-9)
     moved_hz = np.hypot(slope()[0], x[0] * slope()[1]) * (equivalent - FORCE_N) ** 2 / FORCE_N / 3
@@ -198,7 +198,7 @@ def test_each_source_of_uncertainty_widens_the_covariance_for_tissue_alone(chang
 
 
 def test_an_unknown_force_is_no_shift_and_wide_or_no_statement():
-    x, unknown = poles(), ContactState(age_s=AGE_S)
+    x, unknown = poles(), ContactLoad(age_s=AGE_S)
     at = refer_to_nominal(x, NOISE, unknown, nominal(unknown_force_std_n=3e-4))
     np.testing.assert_array_equal(at.compared, x)
     expected = NOISE + np.outer(slope(), slope()) * 3e-4**2
@@ -207,7 +207,7 @@ def test_an_unknown_force_is_no_shift_and_wide_or_no_statement():
     assert at.note == "force unknown, taken as 10 +- 0.3 mN"
     # a force without a deviation is worth no more than none
     unsure = refer_to_nominal(
-        x, NOISE, ContactState(9e-3, np.nan, AGE_S), nominal(unknown_force_std_n=3e-4)
+        x, NOISE, ContactLoad(9e-3, np.nan, AGE_S), nominal(unknown_force_std_n=3e-4)
     )
     np.testing.assert_array_equal(unsure.compared, x)
     assert unsure.note == at.note
@@ -222,7 +222,7 @@ def test_an_unknown_force_is_no_shift_and_wide_or_no_statement():
 
 
 def test_an_unknown_age_is_no_shift_and_wide_or_no_statement():
-    x, unknown = poles(), ContactState(FORCE_N, 0.0)
+    x, unknown = poles(), ContactLoad(FORCE_N, 0.0)
     at = refer_to_nominal(x, NOISE, unknown, nominal(creep=0.03, unknown_age_factor=2.0))
     np.testing.assert_array_equal(at.compared, x)
     variance = (FORCE_N * 0.03 * np.log(2)) ** 2
@@ -240,14 +240,14 @@ def test_an_unknown_age_is_no_shift_and_wide_or_no_statement():
 def test_a_force_never_measured_makes_tissue_less_sure_not_the_pole():
     """Gelatine at a force that nobody measured: called with the deviation stated for it, unknown without."""
     x = poles(force_n=9.7e-3)
-    assert call(x, ContactState(age_s=AGE_S)).name == "gelatine 10 %"
+    assert call(x, ContactLoad(age_s=AGE_S)).name == "gelatine 10 %"
     silent = replace(DEMO.nominal_contact, unknown_force_std_n=float("nan"))
-    assert call(x, ContactState(age_s=AGE_S), silent).name == UNKNOWN
+    assert call(x, ContactLoad(age_s=AGE_S), silent).name == UNKNOWN
 
 
 def test_without_a_nominal_contact_the_pole_is_compared_as_it_is_and_that_is_said():
     x = poles()
-    at = refer_to_nominal(x, NOISE, ContactState(9e-3, 1e-5, 1.0), None)
+    at = refer_to_nominal(x, NOISE, ContactLoad(9e-3, 1e-5, 1.0), None)
     np.testing.assert_array_equal(at.compared, x)
     np.testing.assert_array_equal(at.covariance, NOISE)
     assert not at.referred
