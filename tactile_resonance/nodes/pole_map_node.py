@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from tactile_resonance.scan.pole_map import (
     map_point,
 )
 from tactile_resonance.tissue.classify import TissueClass
+from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
 
 PARAMETERS = (
@@ -66,7 +68,8 @@ PARAMETERS = (
     Parameter(
         "classes_file",
         "",
-        "YAML file with tissue_classes, a scene for example; empty: no tissue is called.",
+        "YAML file with tissue_classes and their nominal_contact, a scene for example; empty: no tissue is "
+        "called.",
         read_only=True,
     ),
     Parameter(
@@ -129,8 +132,9 @@ class PoleMapNode(ManagedNode):
         # poles in it are shown in frame_id
         self._moved_frame = base_frame if self._frame_id not in ("", base_frame) else None
         self._classes: tuple[TissueClass, ...] = ()
+        self._nominal: NominalContact | None = None
         if classes_file:
-            self._classes = read_classes(Path(classes_file))
+            self._classes, self._nominal = read_classes(Path(classes_file))
         self._map = PoleMap()
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
@@ -181,17 +185,17 @@ class PoleMapNode(ManagedNode):
             return
         now = self._map.without(result.position_m, result.frame_id)
         if result.outcome is not Outcome.SKIPPED and message.poles:
-            point = self._point(message.poles[0])
+            point = self._point(message.poles[0], result.contact_age_s)
             if point is not None:
                 now = now.with_point(accepted_point(result, point))
         self._set(now)
 
-    def _point(self, message: msg.Poles) -> MapPoint | None:
+    def _point(self, message: msg.Poles, age_s: float = math.nan) -> MapPoint | None:
         """Where poles lie on the map; None where they do not, with the reason in the diagnostics."""
         try:
             poles, origin = poles_from_message(message)
             (level,) = values(self, "unknown_level")
-            point = map_point(poles, origin, self._classes, level)
+            point = map_point(poles, origin, self._classes, level, self._nominal, age_s)
             frame_id = origin.contact.frame_id
             if not self._frame_id:
                 self._frame_id = frame_id

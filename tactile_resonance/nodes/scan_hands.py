@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,6 @@ from rclpy.duration import Duration
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
 from tactile_resonance.nodes.goal_client import GoalClient
@@ -171,7 +171,7 @@ class NodeHands:
         design: MeasurementDesign,
         label: str,
         seed: int,
-        enough: Callable[[Poles, int], bool],
+        enough: Callable[[Measured, int], bool],
         recording: Recording,
         check: Check,
     ) -> Measured:
@@ -198,7 +198,8 @@ class NodeHands:
             self._recorder.stop()
         if not seen:
             raise PointFailed("measurement: it ended before its first block")
-        poles, origin = poles_from_message(seen[-1])
+        measured = self._measured(seen[-1])
+        origin = measured.origin
         touching = self._tip is not None and self._tip.touching
         if touching and np.isnan(origin.contact.force_n):
             reason = self._recorder.force_reason or "no record states why"
@@ -208,7 +209,7 @@ class NodeHands:
             reason = self._recorder.force_reason or "no record states why"
             text = f"measurement: the place of the tip is unknown: {reason}"
             raise PointDisturbed(text, "place unknown")
-        return Measured(poles, origin)
+        return measured
 
     def retract(self) -> None:
         """Draw the tip back and wait until it is free."""
@@ -220,8 +221,14 @@ class NodeHands:
     def _is_stopped(self) -> bool:
         return self._tip is not None and self._tip.stopped
 
+    def _measured(self, message: msg.Poles) -> Measured:
+        poles, origin = poles_from_message(message)
+        touched_ns = None if self._tip is None else self._tip.touched_ns
+        age_s = math.nan if touched_ns is None else (origin.time_ns - touched_ns) * 1e-9
+        return Measured(poles, origin, age_s)
+
     def _record(
-        self, goal: Measure.Goal, enough: Callable[[Poles, int], bool], check: Check
+        self, goal: Measure.Goal, enough: Callable[[Measured, int], bool], check: Check
     ) -> list[msg.Poles]:
         """The poles of a measurement, all of whose messages have come."""
         if self._is_stopped():
@@ -240,7 +247,7 @@ class NodeHands:
                 news_s[0] = time.monotonic()
                 if stopping[0]:
                     continue
-                if enough(poles_from_message(message)[0], len(seen)):
+                if enough(self._measured(message), len(seen)):
                     stopping[0] = True
                     handle.cancel_goal_async()
                 else:

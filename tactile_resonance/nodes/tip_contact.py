@@ -12,6 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.result import Cause
+from tactile_resonance.nodes.conversions import time_from_message
 from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -60,6 +61,8 @@ class TipContact:
         The tip is on the tissue, or may be.
     stopped : bool
         Somebody keeps it out, and contact_node refuses goals.
+    touched_ns : int or None
+        First touch of the contact that is held (ROS time) [ns]; None where none is.
     """
 
     def __init__(
@@ -79,6 +82,8 @@ class TipContact:
         """Hear of contacts, for one scan; where the tip is now nobody knows."""
         self.touching = True  # a scan that was killed may have left it there
         self.stopped, self._instance = False, 0
+        self.touched_ns: int | None = None
+        self._held_ns = 0  # when the contact was first seen to be held
         self._stop_asked_s = 0.0
         self._state: msg.ContactState | None = None
         # the newest only: the recorder's may have to wait behind what else is recorded
@@ -89,13 +94,14 @@ class TipContact:
         """Press there until the force is held."""
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
-        self._make(goal, check, poll)
+        result = self._make(goal, check, poll)
         while (state := self._state) is None or state.state != state.STATE_HOLD:
             poll()
             check()
             if state is not None and state.cause not in ("", Cause.NONE.value):
                 raise self._failure(state)
             time.sleep(POLL_S)
+        self.touched_ns = self._held_ns - round(result.contact_s * 1e9)
 
     def touch(
         self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
@@ -123,9 +129,11 @@ class TipContact:
             self._end_if_hung()
             self._time.go()
             if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
-                self.touching = False
+                self.touching, self.touched_ns = False, None
                 return
-        raise ScanEnded(f"the tip was not drawn back within {within_s:g} s: is contact_node active?")
+        raise ScanEnded(
+            f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
+        )
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
@@ -175,7 +183,11 @@ class TipContact:
         return False
 
     def _on_state(self, message: msg.ContactState) -> None:
-        self._state = message
+        before, self._state = self._state, message
+        if message.state == message.STATE_HOLD and (
+            before is None or before.state != message.state
+        ):
+            self._held_ns = time_from_message(message.header.stamp)
         if not self.stopped or message.stopped or message.instance == self._instance:
             self.stopped, self._instance = message.stopped, message.instance
         elif time.monotonic() - self._stop_asked_s > ASK_AGAIN_S:

@@ -38,8 +38,14 @@ _COLUMNS = (
     ("y [mm]", lambda r: _number(1e3 * r.y_m, 2)),
     ("z [mm]", lambda r: _number(1e3 * r.z_m, 2)),
     ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
+    ("age of contact [s]", lambda r: _number(r.contact_age_s, 2)),
     ("f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
     ("damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
+    ("nominal f0 [Hz]", lambda r: _with_std(r.nominal_f0_hz, r.nominal_f0_std_hz, 3)),
+    (
+        "nominal damping ratio",
+        lambda r: _with_std(r.nominal_damping_ratio, r.nominal_damping_ratio_std, 5),
+    ),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
     ("tissue", lambda r: _tissue(r)),
     ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
@@ -140,6 +146,7 @@ def summary(run: RunContent) -> list[str]:
     if classes:
         named = ", ".join(f"{name} {count}" for name, count in sorted(classes.items()))
         lines.append(f"Tissue called: {named}.")
+        lines.append(_compared([r for r in run.latest if r.tissue_class]))
     return lines
 
 
@@ -150,6 +157,19 @@ def silent_lines(run: RunContent) -> list[str]:
     except ValueError as error:
         return [str(error)]
     return [] if silent is None else silent.text().splitlines()
+
+
+def _compared(called: Sequence[PointResult]) -> str:
+    """What classes were compared with."""
+    referred = [r for r in called if np.isfinite(r.nominal_f0_std_hz)]
+    if not referred:
+        reasons = "; ".join(sorted({r.tissue_reason for r in called if r.tissue_reason}))
+        return f"No pole is referred to a nominal contact: {reasons or 'of an earlier version'}."
+    std = np.median([r.nominal_f0_std_hz for r in referred])
+    return (
+        f"Tissue is called from {len(referred)} poles at the nominal force and age of contact, standard "
+        f"deviation of f0 {std:.2g} Hz (median)."
+    )
 
 
 def skipped_lines(run: RunContent) -> list[str]:
@@ -251,5 +271,6 @@ def _tissue(result: PointResult) -> str:
 
 
 def _outcome(result: PointResult) -> str:
-    parts = [result.outcome.name.lower(), result.verdict, result.reason, result.notes]
+    parts = [result.outcome.name.lower(), result.verdict, result.reason, result.tissue_reason]
+    parts.append(result.notes)
     return "; ".join(part for part in parts if part)

@@ -85,10 +85,13 @@ class Measured:
         Of all blocks.
     origin : Origin
         Of the poles; its contact is that of the measurement.
+    contact_age_s : float
+        From the first touch until the middle of the measurement [s]; NaN where unknown.
     """
 
     poles: Poles
     origin: Origin
+    contact_age_s: float = float("nan")
 
 
 class Hands(Protocol):
@@ -130,13 +133,13 @@ class Hands(Protocol):
         design: MeasurementDesign,
         label: str,
         seed: int,
-        enough: Callable[[Poles, int], bool],
+        enough: Callable[[Measured, int], bool],
         recording: Recording,
         check: Check,
     ) -> Measured:
         """Measure; every message of it, and its id, goes into the recording.
 
-        After each block `enough` is asked with the poles of all blocks so far and their number.
+        After each block `enough` is asked with what all blocks so far gave and their number.
         """
         ...
 

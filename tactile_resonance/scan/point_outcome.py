@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
-from tactile_resonance.identification.result import Poles
-from tactile_resonance.record import Origin
+import numpy as np
+
 from tactile_resonance.scan.decision import Decision
+from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import NAN, Outcome, PointResult
-from tactile_resonance.scan.pole_map import map_point
+from tactile_resonance.scan.pole_map import MapPoint, map_point
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
@@ -26,8 +28,7 @@ def measured_result(
     point: ScanPoint,
     attempt: int,
     scene: ScanScene,
-    poles: Poles,
-    origin: Origin,
+    measured: Measured,
     decision: Decision,
     *,
     time_ns: int,
@@ -39,8 +40,8 @@ def measured_result(
 
     Parameters
     ----------
-    origin : Origin
-        Of the poles; its contact must tell where the tip was.
+    measured : Measured
+        Its origin must state where the tip was.
     decision : Decision
         That ended the measurement.
     air : AirReference or None
@@ -50,7 +51,15 @@ def measured_result(
     duration_s : float
         From the move to the point until the tip was free again [s].
     """
-    found, mode = map_point(poles, origin, scene.tissue_classes), main_mode(poles)
+    poles, origin = measured.poles, measured.origin
+    found = map_point(
+        poles,
+        origin,
+        scene.tissue_classes,
+        nominal=scene.nominal_contact,
+        age_s=measured.contact_age_s,
+    )
+    mode = main_mode(poles)
     std = found.std
     relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
     blank = unmeasured_result(
@@ -67,11 +76,13 @@ def measured_result(
         blank,
         force_n=origin.contact.force_n,
         force_std_n=origin.contact.force_std_n,
+        contact_age_s=measured.contact_age_s,
         f0_hz=float(found.estimate[0]),
         f0_std_hz=float(std[0]),
         damping_ratio=float(found.estimate[1]),
         damping_ratio_std=float(std[1]),
         f0_damping_covariance_hz=float(found.covariance[0, 1]),
+        **_nominal(found),
         **relative,
         f0_drift_hz_per_s=float(mode.drift[0]),
         f0_drift_std_hz_per_s=float(mode.drift_std[0]),
@@ -84,6 +95,7 @@ def measured_result(
         poles_status=poles.status.value,
         tissue_class=found.tissue_class,
         tissue_probability=found.tissue_probability,
+        tissue_reason=found.tissue_reason,
         blocks=decision.blocks,
         blocks_saved=decision.blocks_saved,
         verdict=decision.verdict.value,
@@ -91,6 +103,21 @@ def measured_result(
         measurement_id=origin.measurement_id,
         simulated=origin.simulated,
     )
+
+
+def _nominal(found: MapPoint) -> dict[str, Any]:
+    """Fields of the pole at the nominal force and age; none where it could not be referred to them."""
+    at = found.for_tissue
+    if at is None or not at.referred:
+        return {}
+    std = np.sqrt(np.diag(at.covariance))
+    return {
+        "nominal_f0_hz": float(at.compared[0]),
+        "nominal_f0_std_hz": float(std[0]),
+        "nominal_damping_ratio": float(at.compared[1]),
+        "nominal_damping_ratio_std": float(std[1]),
+        "nominal_f0_damping_covariance_hz": float(at.covariance[0, 1]),
+    }
 
 
 def unmeasured_result(

@@ -58,11 +58,17 @@ class PointResult:
     normal_z: float = NAN
     force_n: float = NAN
     force_std_n: float = NAN
+    contact_age_s: float = NAN
     f0_hz: float = NAN
     f0_std_hz: float = NAN
     damping_ratio: float = NAN
     damping_ratio_std: float = NAN
     f0_damping_covariance_hz: float = NAN
+    nominal_f0_hz: float = NAN
+    nominal_f0_std_hz: float = NAN
+    nominal_damping_ratio: float = NAN
+    nominal_damping_ratio_std: float = NAN
+    nominal_f0_damping_covariance_hz: float = NAN
     f0_shift_hz: float = NAN
     f0_shift_std_hz: float = NAN
     f0_over_air: float = NAN
@@ -80,6 +86,7 @@ class PointResult:
     poles_status: str = ""
     tissue_class: str = ""
     tissue_probability: float = NAN
+    tissue_reason: str = ""
     blocks: int = 0
     blocks_saved: int = 0
     verdict: str = ""

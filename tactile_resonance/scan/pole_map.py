@@ -19,6 +19,12 @@ from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
+from tactile_resonance.tissue.nominal_contact import (
+    ContactLoad,
+    NominalContact,
+    PoleForTissue,
+    refer_to_nominal,
+)
 
 FloatArray = npt.NDArray[np.float64]
 SAME_PLACE_M = 1e-4
@@ -45,6 +51,10 @@ class MapPoint:
     tissue_class : str
         Empty where no classes are given.
     tissue_probability : float
+    tissue_reason : str
+        Why it is unknown, and what was taken for granted.
+    for_tissue : PoleForTissue or None
+        What the classes were compared with; None where no tissue was called.
     status : PolesStatus
     reason : str
         Why there is no estimate, or why it is to be used with care.
@@ -64,6 +74,8 @@ class MapPoint:
     force_n: float = float("nan")
     tissue_class: str = ""
     tissue_probability: float = float("nan")
+    tissue_reason: str = ""
+    for_tissue: PoleForTissue | None = None
     status: PolesStatus = PolesStatus.OK
     reason: str = ""
     label: str = ""
@@ -94,9 +106,28 @@ class MapPoint:
 
 
 def map_point(
-    poles: Poles, origin: Origin, classes: Sequence[TissueClass] = (), unknown_level: float = 0.01
+    poles: Poles,
+    origin: Origin,
+    classes: Sequence[TissueClass] = (),
+    unknown_level: float = 0.01,
+    nominal: NominalContact | None = None,
+    age_s: float = float("nan"),
 ) -> MapPoint:
     """Point of identified poles; of several modes the one with the highest peak.
+
+    Parameters
+    ----------
+    poles : Poles
+    origin : Origin
+        Of the poles; with the force and the place of the tip.
+    classes : sequence of TissueClass
+        Empty: no tissue is called.
+    unknown_level : float
+        See `classify`.
+    nominal : NominalContact or None
+        To which the classes refer.
+    age_s : float
+        Of the contact in the middle of the measurement [s]; NaN where unknown.
 
     Raises
     ------
@@ -109,10 +140,14 @@ def map_point(
             f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
         )
     mode = main_mode(poles)
-    name, probability = "", float("nan")
+    name, probability, reason, referred = "", float("nan"), "", None
     if classes and mode.found:
-        call = classify(mode.estimate, mode.covariance, classes, unknown_level)
+        pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
+        referred = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
+        call = classify(referred.compared, referred.covariance, classes, unknown_level)
         name, probability = call.name, call.probability
+        known = bool(np.all(np.isfinite(referred.compared)))
+        reason = "; ".join(filter(None, [call.reason if known else "", referred.note]))
     return MapPoint(
         position_m=np.array(contact.position_m),
         normal=Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2],
@@ -121,6 +156,8 @@ def map_point(
         force_n=contact.force_n,
         tissue_class=name,
         tissue_probability=probability,
+        tissue_reason=reason,
+        for_tissue=referred,
         status=poles.status,
         reason=poles.message,
         label=origin.label,
@@ -149,6 +186,7 @@ def point_of_result(result: PointResult) -> MapPoint:
         force_n=result.force_n,
         tissue_class=result.tissue_class,
         tissue_probability=result.tissue_probability,
+        tissue_reason=result.tissue_reason,
         status=PolesStatus.FAILED if failed else names.get(result.poles_status, PolesStatus.OK),
         reason=result.reason,
         label=result.label,

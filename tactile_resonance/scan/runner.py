@@ -15,17 +15,19 @@ import numpy as np
 
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.controls import Controls, Request
-from tactile_resonance.scan.decision import Decision, Verdict, decide
+from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide
 from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Hands,
     Interrupted,
+    Measured,
     PointDisturbed,
     PointFailed,
     Recording,
     ScanEnded,
 )
+from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import NAN, Kind, Outcome, PointResult
@@ -41,6 +43,7 @@ from tactile_resonance.scan.references import (
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, Output, ScanScene
+from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 
 POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
@@ -150,9 +153,9 @@ class ScanRunner:
         scene, begun_s = self._scene, self._hands.now_s()
         decisions: list[Decision] = []
 
-        def enough(poles: Poles, blocks: int) -> bool:
-            decisions.append(self._decide(poles, blocks))
-            self._say(point, Phase.MEASURE, blocks, poles)
+        def enough(measured: Measured, blocks: int) -> bool:
+            decisions.append(self._decide(measured, blocks))
+            self._say(point, Phase.MEASURE, blocks, measured.poles)
             return decisions[-1].stop
 
         def check() -> None:
@@ -204,8 +207,7 @@ class ScanRunner:
                     point,
                     recording.attempt,
                     scene,
-                    measured.poles,
-                    measured.origin,
+                    measured,
                     decisions[-1],
                     time_ns=time.time_ns(),
                     duration_s=duration_s,
@@ -220,7 +222,8 @@ class ScanRunner:
                 f"point {point.index + 1} failed and on_failure is stop: {result.reason}"
             )
 
-    def _decide(self, poles: Poles, blocks: int) -> Decision:
+    def _decide(self, measured: Measured, blocks: int) -> Decision:
+        poles = measured.poles
         known = poles.f0_hz.size > 0
         estimate = [poles.f0_hz[0], poles.damping_ratio[0]] if known else [np.nan, np.nan]
         noise, total = (
@@ -229,6 +232,14 @@ class ScanRunner:
         )
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
+        if isinstance(wanted, Separate):
+            # tissues are told apart by what can be said of tissue, precision is that of the measured pole
+            mode, force = main_mode(poles), measured.origin.contact
+            pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
+            at = refer_to_nominal(
+                mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
+            )
+            return decide(at.compared, None, at.covariance, blocks, wanted, limits, block_s)
         return decide(estimate, noise, total, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
@@ -249,7 +260,7 @@ class ScanRunner:
             point = replace(point, label=SILENT)
         told = 0
 
-        def all_blocks(poles: Poles, blocks: int) -> bool:
+        def all_blocks(_: Measured, blocks: int) -> bool:
             nonlocal told
             told = blocks
             return False
@@ -290,9 +301,8 @@ class ScanRunner:
                     result = measured_result(
                         point,
                         recording.attempt,
-                        replace(self._scene, tissue_classes=()),
-                        measured.poles,
-                        measured.origin,
+                        replace(self._scene, tissue_classes=(), nominal_contact=None),
+                        measured,
                         Decision(Verdict.MOST_BLOCKS, "", told),
                         time_ns=time.time_ns(),
                         duration_s=duration_s,

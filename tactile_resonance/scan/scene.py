@@ -30,7 +30,12 @@ from tactile_resonance.scan.notes import Notes, read_notes
 from tactile_resonance.scan.patterns import read_positions
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.tissue.classify import TissueClass
-from tactile_resonance.tissue.references import parse_classes, read_classes
+from tactile_resonance.tissue.nominal_contact import NominalContact
+from tactile_resonance.tissue.references import (
+    parse_classes,
+    parse_nominal_contact,
+    read_classes,
+)
 
 E = TypeVar("E", bound=Enum)
 
@@ -38,8 +43,8 @@ E = TypeVar("E", bound=Enum)
 BENCH_KEYS = {"regions", "buried"}
 _KEYS = {
     *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
-    *("outputs", "precision", "blocks", "tissue_classes", "on_failure", "time_limits"),
-    *("drift_limits", "notes"),
+    *("outputs", "precision", "blocks", "tissue_classes", "nominal_contact", "on_failure"),
+    *("time_limits", "drift_limits", "notes"),
     *BENCH_KEYS,
 }
 
@@ -152,6 +157,8 @@ class ScanScene:
     blocks : BlockLimits
     tissue_classes : tuple of TissueClass
         Tissues that a point may be called; empty: none is called.
+    nominal_contact : NominalContact or None
+        Force and age of contact to which the classes refer, and how poles change beside them; None: not known.
     on_failure : OnFailure
     time_limits : TimeLimits
     drift_limits : DriftLimits
@@ -171,6 +178,7 @@ class ScanScene:
     precision: Precise | Separate | None = None
     blocks: BlockLimits = field(default_factory=BlockLimits)
     tissue_classes: tuple[TissueClass, ...] = ()
+    nominal_contact: NominalContact | None = None
     on_failure: OnFailure = OnFailure.CONTINUE
     time_limits: TimeLimits = field(default_factory=TimeLimits)
     drift_limits: DriftLimits = field(default_factory=DriftLimits)
@@ -211,7 +219,7 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     frame_id = content.get("frame_id", "table")
     good = isinstance(frame_id, str) and bool(frame_id)
     require(good, f"{where}: frame_id", frame_id, "the name of a frame")
-    classes = _read_classes(content, path)
+    classes, nominal = _read_tissues(content, path)
     outputs = _read_outputs(content, where)
     surface: Surface | TouchRequest = Plane()
     if "surface" in content:
@@ -228,6 +236,7 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
         precision=_read_precision(content, classes, where),
         blocks=_part(BlockLimits, content, "blocks", where),
         tissue_classes=classes,
+        nominal_contact=nominal,
         on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),
         time_limits=_part(TimeLimits, content, "time_limits", where),
         drift_limits=_part(DriftLimits, content, "drift_limits", where),
@@ -244,14 +253,22 @@ def _read_outputs(content: Mapping[str, Any], where: str) -> tuple[Output, ...]:
     return tuple(output for output in Output if output.value in names)
 
 
-def _read_classes(content: Mapping[str, Any], path: Path) -> tuple[TissueClass, ...]:
-    """Given in place, or the name of a file beside the scene."""
-    given = content.get("tissue_classes")
-    if given is None:
-        return ()
+def _read_tissues(
+    content: Mapping[str, Any], path: Path
+) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
+    """Classes and the contact to which they refer: given in place, or in a file beside the scene."""
+    given, where = content.get("tissue_classes"), path.name
     if isinstance(given, str):
+        good = "nominal_contact" not in content
+        require(
+            good, f"{where}: nominal_contact", "one", f"none: it belongs to the classes, in {given}"
+        )
         return read_classes(path.parent / given)
-    return parse_classes(given, f"{path.name}: tissue_classes")
+    nominal = parse_nominal_contact(content, where)
+    if given is None:
+        require(nominal is None, f"{where}: nominal_contact", "one", "none without tissue_classes")
+        return (), None
+    return parse_classes(given, f"{where}: tissue_classes"), nominal
 
 
 def _read_precision(

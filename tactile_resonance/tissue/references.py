@@ -1,29 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading tissue classes from configuration, and from the results of a run."""
+"""Reading from configuration: tissue classes, and the contact to which they refer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_resonance.fields import known_keys, number, read_yaml, require, section
+from tactile_resonance.fields import (
+    known_keys,
+    number,
+    read_dataclass,
+    read_yaml,
+    require,
+    section,
+)
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples
+from tactile_resonance.tissue.nominal_contact import (
+    ForceSensitivity,
+    NominalContact,
+    sensitivity_of_preloads,
+)
 
-_KEYS = {"f0_hz", "damping_ratio", "f0_std_hz", "damping_ratio_std", "correlation", "prior"}
+FloatArray = npt.NDArray[np.float64]
+_MEASURED = ("f0_hz", "damping_ratio", "f0_std_hz", "damping_ratio_std")
+_SENSITIVITY = ("f0_hz_per_n", "damping_ratio_per_n", "f0_std_hz_per_n", "damping_ratio_std_per_n")
 
 
-def read_classes(path: Path) -> tuple[TissueClass, ...]:
-    """Classes of the section ``tissue_classes`` of a YAML file.
+def read_classes(path: Path) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
+    """Sections ``tissue_classes`` and, where it is there, ``nominal_contact`` of a YAML file.
 
     Raises
     ------
     ValueError
         If the file or a field of it is wrong.
     """
-    content = read_yaml(Path(path))
-    return parse_classes(content.get("tissue_classes"), f"{Path(path).name}: tissue_classes")
+    content, name = read_yaml(Path(path)), Path(path).name
+    classes = parse_classes(content.get("tissue_classes"), f"{name}: tissue_classes")
+    return classes, parse_nominal_contact(content, name)
 
 
 def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:
@@ -43,6 +60,68 @@ def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:
     return tuple(_read_class(str(name), section(content, name, where), where) for name in content)
 
 
+def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalContact | None:
+    """Section ``nominal_contact`` of a file's content; None where there is none.
+
+    Its fields are those of `NominalContact`, the sensitivity as ``f0_hz_per_n``, ``f0_std_hz_per_n``,
+    ``damping_ratio_per_n``, ``damping_ratio_std_per_n`` and ``correlation`` (0), or as ``preloads``: two points
+    measured at one place, ``{force_n, force_std_n, f0_hz, f0_std_hz, damping_ratio, damping_ratio_std}`` with
+    ``correlation`` (0) at will.
+
+    Raises
+    ------
+    ValueError
+        If a field is missing or wrong.
+    """
+    if "nominal_contact" not in content:
+        return None
+    fields = dict(section(content, "nominal_contact", where))
+    where = f"{where}: nominal_contact"
+    try:
+        if "preloads" in fields:
+            sensitivity = _preloads(fields.pop("preloads"), where)
+        else:
+            f0, damping, f0_std, damping_std, correlation = _numbers_of(fields, _SENSITIVITY, where)
+            for key in (*_SENSITIVITY, "correlation"):
+                fields.pop(key, None)
+            spread = _covariance(f0_std, damping_std, correlation)
+            sensitivity = ForceSensitivity(np.array([f0, damping]), spread)
+        return read_dataclass(NominalContact, fields, where, sensitivity=sensitivity)
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
+
+
+def _preloads(rows: object, where: str) -> ForceSensitivity:
+    where = f"{where}.preloads"
+    good = isinstance(rows, list) and len(rows) == 2 and all(isinstance(r, Mapping) for r in rows)
+    require(good, where, rows, "a list of two points")
+    assert isinstance(rows, list)
+    keys = ("force_n", "force_std_n", *_MEASURED)
+    values = []
+    for index, row in enumerate(rows):
+        known_keys(row, {*keys, "correlation"}, f"{where}[{index}]")
+        values.append(_numbers_of(row, keys, f"{where}[{index}]"))
+    force_n, force_std_n, f0, damping, f0_std, damping_std, correlation = np.transpose(values)
+    covariances = [_covariance(*row) for row in zip(f0_std, damping_std, correlation, strict=True)]
+    return sensitivity_of_preloads(np.transpose([f0, damping]), covariances, force_n, force_std_n)
+
+
+def _numbers_of(fields: Mapping[str, Any], keys: Sequence[str], where: str) -> list[float]:
+    """Values of these fields, and of ``correlation``; standard deviations are checked."""
+    values = [number(fields.get(key), f"{where}.{key}") for key in keys]
+    for key, value in zip(keys, values, strict=True):
+        require("std" not in key or value >= 0, f"{where}.{key}", value, "a number of 0 or above")
+    correlation = number(fields.get("correlation", 0.0), f"{where}.correlation")
+    require(-1 <= correlation <= 1, f"{where}.correlation", correlation, "-1 to 1")
+    return [*values, correlation]
+
+
+def _covariance(first_std: float, second_std: float, correlation: float) -> FloatArray:
+    std = np.array([first_std, second_std])
+    return np.outer(std, std) * np.array([[1, correlation], [correlation, 1]])
+
+
 def _read_class(name: str, fields: Mapping, where: str) -> TissueClass:
     where = f"{where}.{name}"
     prior = number(fields.get("prior", 1.0), f"{where}.prior")
@@ -50,17 +129,10 @@ def _read_class(name: str, fields: Mapping, where: str) -> TissueClass:
         if "points" in fields:
             known_keys(fields, {"points", "prior"}, where)
             return class_from_samples(name, np.array(fields["points"], float), prior)
-        known_keys(fields, _KEYS, where)
-        mean = [number(fields.get(key), f"{where}.{key}") for key in ("f0_hz", "damping_ratio")]
-        std = [
-            number(fields.get(key), f"{where}.{key}") for key in ("f0_std_hz", "damping_ratio_std")
-        ]
-        for key, value in zip(("f0_std_hz", "damping_ratio_std"), std, strict=True):
-            require(value >= 0, f"{where}.{key}", value, "a number of 0 or above")
-        correlation = number(fields.get("correlation", 0.0), f"{where}.correlation")
-        require(-1 <= correlation <= 1, f"{where}.correlation", correlation, "-1 to 1")
-        spread = np.outer(std, std) * np.array([[1, correlation], [correlation, 1]])
-        return TissueClass(name, np.array(mean), spread, prior=prior)
+        known_keys(fields, {*_MEASURED, "correlation", "prior"}, where)
+        f0, damping, f0_std, damping_std, correlation = _numbers_of(fields, _MEASURED, where)
+        spread = _covariance(f0_std, damping_std, correlation)
+        return TissueClass(name, np.array([f0, damping]), spread, prior=prior)
     except (ValueError, TypeError) as error:
         text = str(error)
         raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error

@@ -29,6 +29,8 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB, shares
 from tactile_resonance.scan.point_result import Kind, Outcome
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 NUMPY = {PointField.FLOAT32: "<f4", PointField.UINT8: "u1"}
@@ -514,6 +516,28 @@ def test_tissue_is_called_from_a_scene():
         assert np.isnan(rows["tissue_probability"][2])
         texts = [m.text for m in bench.read(MarkerArray, "pole_map/legend")[0].markers]
         assert {"class 0, gelatine 10 %: 1", "class 255, unknown: 1"} <= set(texts)
+
+
+@pytest.mark.parametrize(("age_s", "called"), [(1.0, 0), (5.0, 255)])
+def test_force_and_age_of_a_result_are_accounted_for(age_s, called):
+    """Gelatine under 9.5 mN for 1 s is gelatine; the same pole after 5 s, in which gelatine creeps, is not."""
+    scene = share_path("config/scenes/demo.yaml")
+    arguments = ["--ros-args", "-p", f"classes_file:={scene}"]
+    mode = SimulatedBench.from_configuration().coupled(read_tissues()["gel10"], force_n=9.5e-3)
+    f0_hz, damping = (getattr(mode.mode_near(255), name) for name in ("f0_hz", "damping_ratio"))
+    message = point_result(7, 0.0, f0_hz)
+    message.contact_age_s = age_s
+    message.poles = [poles(7, 0.0, f0_hz, damping)]
+    message.poles[0].contact_force_n, message.poles[0].contact_force_std_n = 9.5e-3, 1e-5
+    given = (msg.PointResult, "point_result", POINT_RESULTS)
+    with (
+        initialised(domain_id=free_domain_id(os.environ), args=arguments),
+        Bench(*given) as bench,
+    ):
+        bench.send(message)
+        (row,) = table(bench.read(PointCloud2, "pole_map")[0])
+    assert row["tissue_class"] == called
+    assert row["f0_hz"] == pytest.approx(f0_hz, abs=1e-4)  # as measured
 
 
 def test_a_classes_file_that_is_wrong_is_refused(tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a scan without a robot puts the tip, as the bench takes it up."""
 
+import math
 import os
 import threading
 from dataclasses import replace
@@ -99,3 +100,11 @@ def test_a_measurement_at_an_unknown_place_is_disturbed_one_without_poles_has_fa
         there = replace(nowhere, contact=Contact(position_m=PLACE_M, frame_id="base"))
         came.append(poles_to_message(Poles(), there))
         assert measure().origin.contact.position_m == PLACE_M
+        assert math.isnan(measure().contact_age_s)  # nobody touched anything
+        # since the first touch, in the middle of what the poles rest on
+        hands._tip = SimpleNamespace(touched_ns=5_000_000_000, touching=True)
+        pressing = replace(there, time_ns=6_500_000_000)
+        pressing = replace(pressing, contact=replace(there.contact, force_n=0.01, force_std_n=0.0))
+        came.append(poles_to_message(Poles(), pressing))
+        assert measure().contact_age_s == pytest.approx(1.5)
+        hands._tip = None

@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a contact that ended means for the point."""
 
+from types import SimpleNamespace
+
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from geometry_msgs.msg import PoseStamped
+
 from tactile_resonance import msg
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.tip_contact import _failure
+from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.tip_contact import TipContact, _failure
 from tactile_resonance.scan.hands import PointDisturbed
+from tactile_resonance.scan.scene import Hold
 
 NOT_OF_THE_POINT = ("force_stale", "force_source", "force_invalid", "arm_stale", "arm_link", "cancelled")
 OF_THE_POINT = ("force_hard", "force_abort", "force_overload", "surface_missing", "tilt")
@@ -24,3 +30,20 @@ def test_a_point_comes_again_where_the_cause_says_nothing_of_it(cause):
     assert isinstance(failure, PointDisturbed) == (cause in NOT_OF_THE_POINT)
     assert cause in str(failure)
     assert "told" in str(failure)
+
+
+def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
+    """It took 0.3 s until the force was reached, at 5 s; that it is still held is said again and again."""
+    tip = TipContact.__new__(TipContact)
+    tip._state, tip._held_ns, tip.stopped, tip._instance = None, 0, False, 0
+
+    def make(goal, check, poll):
+        for state, seconds in (("settle", 4.9), ("hold", 5.0), ("hold", 5.04), ("hold", 5.08)):
+            message = msg.ContactState(state=state)
+            message.header.stamp = time_message(round(seconds * 1e9))
+            tip._on_state(message)
+        return SimpleNamespace(contact_s=0.3)
+
+    monkeypatch.setattr(tip, "_make", make)
+    tip.hold(PoseStamped(), 0.01, Hold.FORCE, lambda: None, lambda: None)
+    assert tip.touched_ns == 4_700_000_000

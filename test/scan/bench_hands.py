@@ -20,6 +20,7 @@ from tactile_resonance.scan.scene import ScanScene
 
 SPREAD_HZ = 0.02
 TOUCH_S, BLOCK_S = 0.01, 0.01
+AGE_S = 2.0
 
 
 @dataclass
@@ -37,6 +38,7 @@ class Bench:
     time_s: float = 1000.0
     seeds: list = field(default_factory=list)
     silent: list = field(default_factory=list)
+    force_n: float = 0.01
 
     def now_s(self):
         return self.time_s
@@ -62,6 +64,8 @@ class Bench:
     def measure(self, design, label, seed, enough, recording, check):
         blocks = 0
         self.silent.append(design.silent)
+        contact = Contact(self.force_n, 1e-4, (0.0, 0.0, 0.0), frame_id="base", time_ns=1)
+        origin = Origin(measurement_id=1000 + seed, contact=contact, simulated=True)
         recording.measurement_id = 1000 + seed
         recording.write("/note", "std_msgs/msg/String", time.time_ns(), note(label))
         while blocks < design.periods:
@@ -79,11 +83,11 @@ class Bench:
             )
             if self.on_measure is not None and label != "air":
                 self.on_measure(self, blocks)
-            if enough(poles, blocks):
+            measured = Measured(poles, origin, AGE_S)
+            if enough(measured, blocks):
                 break
         self.log.append(("measure", label, seed, blocks))
-        contact = Contact(0.01, 1e-4, (0.0, 0.0, 0.0), frame_id="base", time_ns=1)
-        return Measured(poles, Origin(measurement_id=1000 + seed, contact=contact, simulated=True))
+        return measured
 
     def retract(self):
         self.holding = False

@@ -8,6 +8,7 @@ from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide
 from tactile_resonance.scan.facts import run_facts
+from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_outcome import measured_result
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
@@ -17,6 +18,7 @@ from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 
 START_NS = 1_700_000_000_000_000_000
+AGE_S = 1.0  # of contacts of the bench that do not creep
 
 
 def begin(path, folder):
@@ -87,8 +89,7 @@ def measure(scene, phantoms, design, bench, point, attempt):
         point,
         attempt,
         scene,
-        poles,
-        origin,
+        Measured(poles, origin, AGE_S),
         decision,
         time_ns=START_NS + point.index * 10**9,
         duration_s=2.5 + decision.blocks * design.block_s,

@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import Decision, Verdict
+from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, measured_result
@@ -26,6 +27,7 @@ from tactile_resonance.scan.pole_map import (
     point_of_result,
 )
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
+from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import scene
@@ -62,7 +64,13 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
     result = measured_result(
-        *(air_point(3), 0, scene(), modes, origin(), Decision(Verdict.MOST_BLOCKS, "", 8)),
+        *(
+            air_point(3),
+            0,
+            scene(),
+            Measured(modes, origin()),
+            Decision(Verdict.MOST_BLOCKS, "", 8),
+        ),
         **{"time_ns": 1, "duration_s": 1.0},
     )
     assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
@@ -101,6 +109,36 @@ def test_tissue_is_called_where_there_are_classes():
     called = [map_point(poles((f0,)), origin(), (SOFT, FIRM)).tissue_class for f0 in (250.2, 262.0)]
     assert called == ["soft", UNKNOWN]
     assert map_point(poles(), origin()).tissue_class == ""
+
+
+def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown():
+    """3 mN too much move a soft tissue to where it is neither; without a force nothing is said of it."""
+    sensitivity = ForceSensitivity(np.array([1000.0, 0.0]), np.diag([10.0**2, 0.01**2]))
+    nominal = NominalContact(0.01, 1.0, sensitivity)
+    given = {"classes": (SOFT, FIRM), "nominal": nominal, "age_s": 1.0}
+
+    def pressed(force_n, force_std_n=1e-4):
+        contact = replace(origin().contact, force_n=force_n, force_std_n=force_std_n)
+        return replace(origin(), contact=contact)
+
+    plain = map_point(poles((253.0,)), pressed(0.013), (SOFT, FIRM))
+    assert plain.tissue_class == UNKNOWN
+    assert "farther from" in plain.tissue_reason
+    assert "force and age of contact are not accounted for" in plain.tissue_reason
+    found = map_point(poles((253.0,)), pressed(0.013), **given)
+    assert (found.tissue_class, found.tissue_reason) == ("soft", "")
+    assert found.for_tissue.compared[0] == pytest.approx(250.0)
+    np.testing.assert_array_equal(found.estimate, [253.0, 0.03])
+    np.testing.assert_array_equal(found.covariance, COVARIANCE)
+    assert found.for_tissue.covariance[0, 0] > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
+    # a force that is known to 1 mN only makes 1 Hz
+    unsure = [map_point(poles((252.0,)), pressed(0.01, std), **given) for std in (1e-4, 1e-3)]
+    assert [point.tissue_class for point in unsure] == [UNKNOWN, "soft"]
+    unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given)
+    assert unknown.tissue_class == UNKNOWN
+    assert np.isnan(unknown.tissue_probability)
+    assert unknown.tissue_reason.startswith("the force is unknown")
+    np.testing.assert_array_equal(unknown.estimate, [250.0, 0.03])
 
 
 def test_each_place_once_whatever_comes():

@@ -9,22 +9,28 @@ import sys
 import textwrap
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.scan.controls import Controls, Request
+from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import Output
+from tactile_resonance.tissue.classify import TissueClass
+from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from bench_hands import BLOCK_S, SPREAD_HZ, TOUCH_S, Bench, begin, scan, scene
+from bench_hands import AGE_S, BLOCK_S, SPREAD_HZ, TOUCH_S, Bench, begin, scan, scene
 
 
 def test_each_point_is_measured_until_it_is_precise_enough_and_kept(tmp_path):
@@ -67,6 +73,62 @@ def test_a_silent_record_is_taken_before_all_else_where_the_scene_asks_for_it(tm
     with RunDirectory.open(tmp_path / "run") as again:
         ScanRunner(made, make_plan(made), again, bench, Controls(), print).run()
     assert len([entry for entry in bench.log if entry[1] == "silent"]) == 1
+
+
+def pressed_scene():
+    """Two tissues 2.5 Hz apart, which the tip moves by 2 Hz per mN."""
+    a, b = (TissueClass(n, np.array([f0, 0.03]), np.diag([0.1**2, 1e-6])) for n, f0 in TISSUES)
+    sensitivity = ForceSensitivity(np.array([2000.0, 0.0]), np.diag([10.0**2, 1e-4]))
+    return scene(
+        2,
+        precision=Separate(a, b, 0.99),
+        tissue_classes=(a, b),
+        nominal_contact=NominalContact(0.01, AGE_S, sensitivity, creep=0.02),
+    )
+
+
+TISSUES = (("a", 255.0), ("b", 252.5))
+
+
+def test_tissues_are_told_apart_at_the_nominal_force(tmp_path):
+    """The measured 254 Hz are of neither; at 9.5 mN they are those of one."""
+    summary, run, _ = scan(tmp_path / "run", pressed_scene(), Bench(force_n=0.0095))
+    assert summary.complete
+    for result in run.latest:
+        assert (result.verdict, result.tissue_class) == ("classes separated", "a")
+        assert (result.blocks, result.tissue_reason) == (2, "")
+        # measured and referred pole beside each other, each with its own uncertainty
+        assert (result.f0_hz, result.force_n, result.contact_age_s) == (254.0, 0.0095, AGE_S)
+        assert result.f0_std_hz == pytest.approx(SPREAD_HZ / np.sqrt(2))
+        assert result.nominal_f0_hz == pytest.approx(255.0)
+        # the force is known to 0.1 mN, which is 0.2 Hz
+        assert result.nominal_f0_std_hz == pytest.approx(np.hypot(0.2, result.f0_std_hz), rel=0.05)
+        assert result.nominal_damping_ratio == pytest.approx(0.03)
+    _, run, _ = scan(tmp_path / "nominal", pressed_scene(), Bench(force_n=0.01))
+    assert [r.tissue_class for r in run.latest] == ["unknown", "unknown"]
+    (air,) = [f for f in run.files if f.name.endswith("-air-before.mcap")]
+    ((_, _, reference),) = read_messages(run.path / "recording" / air.name, "/point_result")
+    assert np.isnan(reference.nominal_f0_hz)
+    assert reference.tissue_class == ""
+
+
+def test_a_report_states_that_force_and_age_are_not_accounted_for(tmp_path):
+    _, run, _ = scan(tmp_path / "run", replace(pressed_scene(), nominal_contact=None), Bench())
+    reason = "force and age of contact are not accounted for: no nominal_contact is given"
+    assert all(reason in result.tissue_reason for result in run.latest)
+    assert any(
+        line.startswith("No pole is referred to a nominal contact") and reason in line
+        for line in sentences(run)
+    )
+
+
+def test_nothing_is_said_of_tissue_where_the_force_is_unknown(tmp_path):
+    _, run, _ = scan(tmp_path / "run", pressed_scene(), Bench(force_n=np.nan))
+    for result in run.latest:
+        assert (result.verdict, result.blocks) == ("most blocks reached", 8)
+        assert (result.tissue_class, result.f0_hz) == ("unknown", 254.0)
+        assert np.isnan([result.tissue_probability, result.nominal_f0_hz]).all()
+        assert result.tissue_reason.startswith("the force is unknown")
 
 
 def test_without_free_air_nothing_is_called_a_reference(tmp_path):

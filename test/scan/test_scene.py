@@ -13,12 +13,17 @@ from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.tissue.classify import classify
+from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 
 SCENES = sorted(path.name for path in share_path("config/scenes").glob("*.yaml"))
 LEAST = {"force_n": 0.01, "positions": {"list": [[0, 0], [0.01, 0]]}}
 CLASSES = {
     name: {"f0_hz": f0, "damping_ratio": 0.03, "f0_std_hz": 0.1, "damping_ratio_std": 1e-4}
     for name, f0 in (("a", 250.0), ("b", 255.0))
+}
+NOMINAL = {
+    **{"force_n": 0.02, "age_s": 3.0, "f0_hz_per_n": 220.0, "damping_ratio_per_n": 1.3},
+    **{"f0_std_hz_per_n": 20.0, "damping_ratio_std_per_n": 0.1},
 }
 
 
@@ -42,25 +47,18 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
     scene, phantoms = read_scan_scene(path), read_scene(read_tissues(), path)
     bench = SimulatedBench.from_configuration()
 
-    def poles(tissue, force_n=scene.force_n, hold_time_s=2.2):
+    nominal = scene.nominal_contact
+
+    def poles(tissue, force_n=nominal.force_n, hold_time_s=nominal.age_s):
         modes = bench.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s).modes
         mode = min(modes, key=lambda m: abs(m.f0_hz - 250))
         return np.array([mode.f0_hz, mode.damping_ratio])
 
     plain, _ = scene.tissue_classes
     gelatine = read_tissues().gelatine
-    # the spread is that of 0.33 % w/w, of 0.15 mN of force, and of being held for 1.2 to 5 s
+    # the spread is that of 0.33 % w/w alone: force and age of contact are told apart from it
     rng = np.random.default_rng(1)
-    drawn = np.array(
-        [
-            poles(
-                gelatine(10 + 0.33 * rng.standard_normal()),
-                0.01 + 1.5e-4 * rng.standard_normal(),
-                np.exp(rng.uniform(np.log(1.2), np.log(5))),
-            )
-            for _ in range(100)
-        ]
-    )
+    drawn = np.array([poles(gelatine(10 + 0.33 * rng.standard_normal())) for _ in range(100)])
     std = drawn.std(axis=0, ddof=1)
     assert np.all(np.abs(plain.mean - drawn.mean(axis=0)) < 4 * std / 10)
     np.testing.assert_allclose(np.sqrt(np.diag(plain.spread)), std, rtol=4 / np.sqrt(200))
@@ -72,6 +70,22 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
         for y in (0.02, -0.001, 0.001)
     ]
     assert called == ["gelatine 10 %", "inclusion", "inclusion"]
+
+    # members at any force of 0.15 mN about nominal and any age are as often unknown as the level says
+    def tail(percent, force_n, age_s):
+        x = poles(gelatine(percent), force_n, age_s)
+        at = refer_to_nominal(x, noise, ContactLoad(force_n, 5e-5, age_s), nominal)
+        return classify(at.compared, at.covariance, [plain]).tail_probability
+
+    tails = [
+        tail(
+            10 + 0.33 * rng.standard_normal(),
+            0.01 + 1.5e-4 * rng.standard_normal(),
+            np.exp(rng.uniform(np.log(1.2), np.log(5))),
+        )
+        for _ in range(200)
+    ]
+    assert np.mean(np.array(tails) < 0.1) < 0.1 + 4 * np.sqrt(0.1 * 0.9 / 200)
 
 
 def test_defaults_and_choices(tmp_path):
@@ -104,9 +118,17 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     points = [[250.0, 0.03], [250.1, 0.031], [249.8, 0.0305], [250.3, 0.0302]]
     content = {"tissue_classes": {"measured": {"points": points, "prior": 2.0}}}
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content))
-    (tissue,) = read(tmp_path, tissue_classes="classes.yaml").tissue_classes
+    scene = read(tmp_path, tissue_classes="classes.yaml")
+    assert scene.nominal_contact is None
+    (tissue,) = scene.tissue_classes
     np.testing.assert_allclose(tissue.mean, np.mean(points, axis=0))
     assert (tissue.degrees_of_freedom, tissue.prior) == (2.0, 2.0)
+    # the contact to which they refer stands beside them
+    (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content | {"nominal_contact": NOMINAL}))
+    scene = read(tmp_path, tissue_classes="classes.yaml")
+    assert (scene.nominal_contact.force_n, scene.nominal_contact.age_s) == (0.02, 3.0)
+    with pytest.raises(ValueError, match="nominal_contact: got 'one'; accepted is none: it belongs"):
+        read(tmp_path, tissue_classes="classes.yaml", nominal_contact=NOMINAL)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +155,11 @@ def test_classes_from_a_file_and_from_points(tmp_path):
         ),
         ({"tissue_classes": {"a": {"f0_hz": 250.0}}}, "tissue_classes.a.damping_ratio: got None"),
         ({"tissue_classes": "none.yaml"}, "none.yaml"),
+        ({"nominal_contact": NOMINAL}, "nominal_contact: got 'one'; accepted is none without tissue_c"),
+        (
+            {"tissue_classes": CLASSES, "nominal_contact": NOMINAL | {"age_s": 0}},
+            "scene.yaml: nominal_contact.age_s: got 0.0; accepted is a number above 0",
+        ),
         ({"positions": None}, "positions: got None"),
         (
             {"positions": {"around": {"centres_m": [[0, 0]]}}},
