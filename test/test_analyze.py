@@ -21,7 +21,7 @@ def run(*arguments):
         [sys.executable, "-m", "tactile_resonance.cli", "analyze", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
 
 

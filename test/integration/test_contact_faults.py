@@ -18,9 +18,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from tactile_resonance.contact.parameters import read_contact
+from tactile_resonance.nodes.client import HANGS_S
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contact_rig import HANGS_S, height_m, last_way_down_s
+from contact_rig import height_m, last_way_down_s
 
 PARAMETERS, LIMITS = read_contact()
 STANDOFF_M = PARAMETERS.standoff_m

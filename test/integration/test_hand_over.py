@@ -11,10 +11,10 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from lifecycle_msgs.msg import Transition
 
-from benchmarks.contact_client import HANGS_S
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.nodes.client import HANGS_S
 
 UP = (0.0, 0.0, 0.01, 0.0, 0.0, 0.0)
 

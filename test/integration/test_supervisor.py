@@ -15,6 +15,7 @@ from tactile_resonance.action import Scan
 from tactile_resonance.msg import ContactState
 
 from tactile_resonance.client import Ending
+from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
@@ -31,7 +32,6 @@ positions:
 blocks: {least: 24, most: 24}
 """
 TIME = own_time(17)
-WITHIN_S = 60.0
 
 
 class Supervisor(ScanClient):
@@ -40,6 +40,7 @@ class Supervisor(ScanClient):
     def join(self):
         super().join()
         self.contact = ""
+        self._clients = {}
         self._node.create_subscription(
             ContactState, "contact_state", self._on_contact, qos_profile_sensor_data
         )
@@ -52,33 +53,29 @@ class Supervisor(ScanClient):
         self.heard = []
         self.outcome = self.tactile.scan(**goal, on_feedback=self.heard.append)
         measures = Scan.Feedback.PHASE_MEASURE
-        self.wait(
-            lambda: self.heard and self.heard[-1].phase == measures, WITHIN_S, "a measurement"
-        )
+        self.wait(lambda: self.heard and self.heard[-1].phase == measures, HANGS_S, "a measurement")
 
     def see_it_wait(self, reason):
         """It tells the reason, and waits on with the tip free."""
-        self.wait(lambda: self.heard[-1].waiting_for == reason, WITHIN_S, "the scan to wait")
-        self.wait(lambda: self.contact == "idle", WITHIN_S, "the tip to leave")
+        self.wait(lambda: self.heard[-1].waiting_for == reason, HANGS_S, "the scan to wait")
+        self.wait(lambda: self.contact == "idle", HANGS_S, "the tip to leave")
         # for many periods of the manager nothing changes
         said = len(self.heard)
-        self.wait(lambda: len(self.heard) > said + 10, WITHIN_S, "the scan to wait on")
+        self.wait(lambda: len(self.heard) > said + 10, HANGS_S, "the scan to wait on")
         assert {feedback.waiting_for for feedback in self.heard[said:]} == {reason}
         assert self.contact == "idle"
 
     def see_it_complete(self):
         """It goes on, and repeats the point."""
-        self.wait(self.outcome.done, 180.0, "the scan")
+        self.wait(self.outcome.done, 5 * HANGS_S, "the scan")
         result = self.outcome.result()
         assert result.ending is Ending.COMPLETE, result.message
         assert (result.done, result.failed, result.repeats) == (2, 0, 1)
 
     def call(self, kind, name, request):
-        client = self._node.create_client(kind, name)
-        self.wait(client.service_is_ready, WITHIN_S, name)
-        future = client.call_async(request)
-        self.wait(future.done, WITHIN_S, name)
-        return future.result()
+        if name not in self._clients:
+            self._clients[name] = self._node.create_client(kind, name)
+        return self.answer(self._clients[name], request)
 
     def change(self, node, transition):
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -105,7 +102,7 @@ def supervisor(domain, tmp_path):
     }
     with NodeProcesses(tmp_path / "log") as nodes, Supervisor(nodes.check) as supervisor:
         nodes.bring_up(NODES, parameters)
-        supervisor.wait_until_up(90.0)
+        supervisor.wait_until_up(HANGS_S)
         supervisor.begin(scene=scene, run_directory=tmp_path / "run")
         supervisor.nodes, supervisor.parameters = nodes, parameters
         yield supervisor
@@ -117,20 +114,20 @@ def test_a_scan_waits_for_a_node_that_a_supervisor_holds(supervisor, tmp_path):
 
     supervisor.change("poles_node", Transition.TRANSITION_DEACTIVATE)
     supervisor.see_it_wait("poles: /poles_node is inactive, not active")
-    supervisor.wait(held, WITHIN_S, "the manager to report it")
+    supervisor.wait(held, HANGS_S, "the manager to report it")
     assert supervisor.state("poles_node") == "inactive"
     supervisor.change("poles_node", Transition.TRANSITION_ACTIVATE)
     supervisor.see_it_complete()
-    supervisor.wait(lambda: not held(), WITHIN_S, "the manager to report it")
+    supervisor.wait(lambda: not held(), HANGS_S, "the manager to report it")
     assert [r.disturbances for r in read_run(tmp_path / "run").results] == ["node away 1", ""]
 
 
 def test_a_scan_whose_node_is_deactivated_draws_the_tip_back_and_ends(supervisor):
     supervisor.change("scan_node", Transition.TRANSITION_DEACTIVATE)
-    supervisor.wait(supervisor.outcome.done, 30.0, "the scan to end")
+    supervisor.wait(supervisor.outcome.done, HANGS_S, "the scan to end")
     outcome = supervisor.outcome.result()
     assert (outcome.message, outcome.done) == ("cancelled", 0)
-    supervisor.wait(lambda: supervisor.contact == "idle", WITHIN_S, "the tip to leave")
+    supervisor.wait(lambda: supervisor.contact == "idle", HANGS_S, "the tip to leave")
 
 
 def test_a_scan_waits_while_the_tip_is_stopped_also_by_a_node_started_anew(supervisor):
@@ -144,7 +141,7 @@ def test_a_scan_waits_while_the_tip_is_stopped_also_by_a_node_started_anew(super
     supervisor.nodes.start("fake_hardware_node", supervisor.parameters["fake_hardware_node"])
     supervisor.wait(
         lambda: supervisor.message.instance != before and supervisor.message.stopped,
-        WITHIN_S,
+        HANGS_S,
         "the new node to be stopped",
     )
     supervisor.see_it_wait(reason)
