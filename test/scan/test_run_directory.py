@@ -37,7 +37,7 @@ from run_tables import (
 )
 
 SCENE = "name: test\nforce_n: 0.01\n"
-KILLS = 30
+KILLS = 20
 
 
 def create(path, count=4, **values):
