@@ -39,7 +39,7 @@ class Supervisor(ScanClient):
 
     def join(self):
         super().join()
-        self.contact = ""
+        self.contact, self.heard = "", []
         self._clients = {}
         self._node.create_subscription(
             ContactState, "contact_state", self._on_contact, qos_profile_sensor_data
@@ -48,9 +48,11 @@ class Supervisor(ScanClient):
     def _on_contact(self, message):
         self.contact, self.message = message.state, message
 
+    def why(self):
+        return f"{super().why()}; scan: {self.heard[-1:]}"
+
     def begin(self, **goal):
         """Ask for a scan, and wait until it measures."""
-        self.heard = []
         self.outcome = self.tactile.scan(**goal, on_feedback=self.heard.append)
         measures = Scan.Feedback.PHASE_MEASURE
         self.wait(lambda: self.heard and self.heard[-1].phase == measures, HANGS_S, "a measurement")
