@@ -35,7 +35,7 @@ regions:
   - {name: gelatine 10 %, gelatine_percent: 10.0, disc: {center_m: [0.00, 0.0], radius_m: 0.025}}
 positions:
   list: [[0.0, 0.0], [0.004, 0.0], [0.04, 0.0], [0.0, 0.008]]  # the third beside the gelatine
-blocks: {least: 24, most: 24}
+blocks: {least: 16, most: 16}
 """
 ACCEPTED = (0, 1, 3)
 
