@@ -15,7 +15,7 @@ from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 
-from tactile_resonance.nodes.goals import Goals
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, Goals
 from tactile_resonance.scan.hands import NodeAway, ScanEnded
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 HANGS_S = 120.0
 """Longest wait for what takes seconds [s]: it only ends what hangs, whatever else the machine does."""
-ASK_AGAIN_S = 5.0
-"""An answer that has not come by then may be lost: a server that does not know its client yet drops it [s]."""
 
 
 class NoAnswer(RuntimeError):
@@ -82,7 +80,10 @@ class NodeClient(ABC):
             self.spin(0.05)
 
     def answer(self, service: Client, request: Any, timeout_s: float = HANGS_S) -> Any:
-        """Answer of a service, which is waited for; what may be lost is asked again."""
+        """Answer of a service, which is waited for.
+
+        A server that does not know its client yet drops the answer: it is asked again.
+        """
         self.wait(service.service_is_ready, timeout_s, service.srv_name)
         answers: list[Future] = []
         asked_s = 0.0

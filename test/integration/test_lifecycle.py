@@ -36,7 +36,6 @@ class Watcher(NodeClient):
     def on_array(self, array):
         for status in array.status:
             self.heard[status.name] = {
-                "message": status.message,
                 **{v.key: v.value for v in status.values},
             }
 
@@ -88,7 +87,7 @@ def test_a_node_that_was_deactivated_is_held_until_start(running):
     _, watcher = running
     told = watcher.heard
     assert watcher.change("frf_node", Transition.TRANSITION_DEACTIVATE)
-    watcher.until(lambda: told["/manager_node"]["message"] == "held: frf_node")
+    watcher.until(lambda: told["/manager_node"]["state"] == "held: frf_node")
     assert told["/manager_node"]["last error"] == "frf_node was deactivated, and is held"
     assert watcher.change("frf_node", Transition.TRANSITION_CLEANUP)
     watcher.until(lambda: told["/manager_node"]["frf_node"] == "unconfigured")
