@@ -10,19 +10,16 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.client import Client
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 from tactile_resonance.action import MakeContact
 
 from tactile_resonance import msg
-from tactile_resonance.nodes.client import NodeClient
+from tactile_resonance.nodes.client import HANGS_S, NodeClient
 from tactile_resonance.nodes.conversions import time_from_message
 from tactile_resonance.nodes.running import SERIES
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
-HANGS_S = 120.0
-"""Longest wait [s]: it only ends what hangs."""
 TURN = Rotation.from_rotvec(TABLE_IN_BASE[3:]).as_quat().tolist()
 
 
@@ -91,13 +88,6 @@ class ContactClient(NodeClient):
             return self.answer(service, Trigger.Request(), timeout_s)
         finally:
             self._node.destroy_client(service)
-
-    def answer(self, service: Client, request: Any, timeout_s: float = HANGS_S) -> Any:
-        """Answer of a service that is waited for."""
-        self.wait(service.service_is_ready, timeout_s, service.srv_name)
-        future = service.call_async(request)
-        self.wait(future.done, timeout_s, f"an answer of {service.srv_name}")
-        return future.result()
 
     def until(self, state: str) -> None:
         """Wait until the newest state is this one."""

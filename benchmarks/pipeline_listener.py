@@ -21,7 +21,7 @@ from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S
 from tactile_resonance.nodes.running import RESULTS
 
 TOPICS = {"bench/block": msg.Record, "record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}
-ALL_WITHIN_S = 10.0
+ALL_WITHIN_S = 60.0
 DIAGNOSTICS_WITHIN_S = 2 * PERIOD_S
 
 

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
-from rclpy.task import Future
 from tactile_resonance.action import Measure
 from tactile_resonance.srv import Truth
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.nodes.client import NoAnswer, NodeClient
+from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
 from tactile_resonance.nodes.conversions import (
     frf_from_message,
     poles_from_message,
@@ -108,23 +107,24 @@ class ScanSession(NodeClient):
         its node is active; records published before that reach nobody.
         """
         goal = Measure.Goal(label="warm-up", periods=3)
-        deadline = time.monotonic() + timeout_s
+        deadline, patience_s = time.monotonic() + timeout_s, 2.0
         while True:
             try:
                 return self.measure(
-                    position_m, goal, lambda done, planned: None, timeout_s=10, answer_timeout_s=2
+                    position_m, goal, lambda done, planned: None, answer_timeout_s=patience_s
                 )
             except NoAnswer:
                 if time.monotonic() > deadline:
                     raise
+                patience_s *= 2.0  # lost, or late on a machine with much else to do
 
     def measure(
         self,
         position_m: tuple[float, float, float],
         goal: Measure.Goal,
         progress: Progress,
-        timeout_s: float = 60.0,
-        answer_timeout_s: float = 10.0,
+        timeout_s: float = HANGS_S,
+        answer_timeout_s: float = HANGS_S,
     ) -> PointResult:
         """Put the tip there, measure, wait for the final poles.
 
@@ -138,11 +138,9 @@ class ScanSession(NodeClient):
         self._place(position_m)
         truth = self._truth
         contact = self.truth(here=True)
-        goal_future = self._measure.send_goal_async(goal, feedback_callback=self._on_feedback)
-        handle = self._result(goal_future, timeout_s, "the goal to be taken")
-        if not handle.accepted:
-            raise NoAnswer(f"measurement of {goal.label}: rejected, the node is not active")
-        answer = self._result(handle.get_result_async(), timeout_s, "the measurement")
+        future = self.begin(self._measure, goal, timeout_s, self._on_feedback).get_result_async()
+        self.wait(future.done, timeout_s, "the measurement")
+        answer = future.result()
         if answer.result.outcome != Measure.Result.DONE:
             raise NoAnswer(f"measurement of {goal.label}: {answer.result.message}")
         key = answer.result.measurement_id
@@ -151,7 +149,7 @@ class ScanSession(NodeClient):
         frf, _ = frf_from_message(self._frfs.pop(key))
         return PointResult(origin, frf, poles, poles_from_message(truth)[0], contact)
 
-    def truth(self, timeout_s: float = 10.0, **request: object) -> Truth.Response:
+    def truth(self, timeout_s: float = HANGS_S, **request: object) -> Truth.Response:
         """What the simulated bench knows; fields of the request by name.
 
         Raises
@@ -159,8 +157,7 @@ class ScanSession(NodeClient):
         NoAnswer
             If the bench refuses, or does not answer in time.
         """
-        future = self._ask_truth.call_async(Truth.Request(**request))
-        answer = self._result(future, timeout_s, "the bench's truth")
+        answer = self.answer(self._ask_truth, Truth.Request(**request), timeout_s)
         if not answer.success:
             raise NoAnswer(f"truth: {answer.message}")
         return answer
@@ -174,7 +171,7 @@ class ScanSession(NodeClient):
             self._pose.publish(pose)
             return self._truth is not None and self._truth.tip_pose == pose
 
-        self.wait(there, 10.0, "the bench to take up the pose")
+        self.wait(there, HANGS_S, "the bench to take up the pose")
 
     def _on_truth(self, message: msg.Poles) -> None:
         self._truth = message
@@ -192,7 +189,3 @@ class ScanSession(NodeClient):
     def _keep_final(kept: dict, message: msg.FRF | msg.Poles) -> None:
         if message.final:
             kept[message.measurement_id] = message
-
-    def _result(self, future: Future, timeout_s: float, what: str):
-        self.wait(future.done, timeout_s, what)
-        return future.result()

@@ -44,4 +44,4 @@ def simulated_robot(host: str, priority: int, *options: str) -> Iterator[subproc
         yield robot
     finally:
         robot.send_signal(signal.SIGTERM)
-        robot.communicate(timeout=10)
+        robot.communicate(timeout=60)

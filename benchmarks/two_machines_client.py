@@ -16,7 +16,7 @@ from tactile_resonance import msg
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 
-UP_WITHIN_S = 90.0
+UP_WITHIN_S = 240.0
 COUNTED = {"record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}
 
 

@@ -8,6 +8,8 @@ import time
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.simulation.robot.control_port import order
 
+PATIENCE_S = 60.0
+
 
 def own_host(last):
     """Address that no other run of the tests uses; `last` tells the robots of one run apart."""
@@ -26,10 +28,10 @@ class RobotAtHand:
         self.host = host
 
     def order(self, command, **fields):
-        return order(self.host, command, **fields)
+        return order(self.host, command, timeout_s=PATIENCE_S, **fields)
 
     def dashboard(self, line):
-        with socket.create_connection((self.host, 29999), 5) as channel:
+        with socket.create_connection((self.host, 29999), PATIENCE_S) as channel:
             lines = channel.makefile()
             lines.readline()
             channel.sendall(line.encode() + b"\n")
@@ -37,14 +39,14 @@ class RobotAtHand:
 
     def until(self, **wanted):
         """Wait until the control port's state is as wanted."""
-        end = time.monotonic() + 10
+        end = time.monotonic() + PATIENCE_S
         while any(self.order("state")[name] != value for name, value in wanted.items()):
             assert time.monotonic() < end, f"{self.order('state')} is never {wanted}"
             time.sleep(0.02)
 
     def unlock(self):
         """Release a protective stop, as soon as the robot takes it."""
-        end = time.monotonic() + 10
+        end = time.monotonic() + PATIENCE_S
         while self.dashboard("unlock protective stop") != "Protective stop releasing":
             assert time.monotonic() < end
             time.sleep(0.1)

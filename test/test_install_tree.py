@@ -44,7 +44,7 @@ def test_index_executables_config_and_launch(prefix):
         assert os.access(executable, os.X_OK), name
 
 
-def wait_for_node(name, timeout_s=40):
+def wait_for_node(name, timeout_s=120):
     import rclpy
 
     context = rclpy.Context()
@@ -74,6 +74,6 @@ def test_an_executable_runs_and_ends_on_interrupt(prefix, tmp_path, monkeypatch)
     wait_for_node("poles_node")
     assert node.poll() is None, node.communicate()[0]
     node.send_signal(signal.SIGINT)
-    output, _ = node.communicate(timeout=10)
+    output, _ = node.communicate(timeout=60)
     assert node.returncode == 0, output
     assert "Traceback" not in output

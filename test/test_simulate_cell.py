@@ -15,8 +15,9 @@ COMMAND = [sys.executable, "-m", "tactile_resonance.cli", "simulate-cell", "--ho
 PATIENCE_S = 60.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("bus", ["socketcand", "slcan"])
+@pytest.mark.parametrize(
+    ("bus", "number"), [("socketcand", signal.SIGINT), ("slcan", signal.SIGTERM)]
+)
 def test_it_ends_in_order(bus, number):
     process = subprocess.Popen(
         [*COMMAND, "--port", "0", "--bus", bus],

@@ -6,13 +6,23 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import rclpy
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
+
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, Goals
+from tactile_resonance.scan.hands import NodeAway, ScanEnded
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+HANGS_S = 120.0
+"""Longest wait for what takes seconds [s]: it only ends what hangs, whatever else the machine does."""
 
 
 class NoAnswer(RuntimeError):
@@ -68,3 +78,43 @@ class NodeClient(ABC):
                 why = self.why()
                 raise NoAnswer(f"waited {timeout_s:g} s for {what}{f' ({why})' if why else ''}")
             self.spin(0.05)
+
+    def answer(self, service: Client, request: Any, timeout_s: float = HANGS_S) -> Any:
+        """Answer of a service, which is waited for.
+
+        A server that does not know its client yet drops the answer: it is asked again.
+        """
+        self.wait(service.service_is_ready, timeout_s, service.srv_name)
+        answers: list[Future] = []
+        asked_s = 0.0
+
+        def answered() -> bool:
+            nonlocal asked_s
+            if not answers or time.monotonic() - asked_s > ASK_AGAIN_S:
+                answers.append(service.call_async(request))
+                asked_s = time.monotonic()
+            return any(answer.done() for answer in answers)
+
+        self.wait(answered, timeout_s, f"an answer of {service.srv_name}")
+        return next(answer.result() for answer in answers if answer.done())
+
+    def begin(
+        self,
+        client: ActionClient,
+        goal: Any,
+        timeout_s: float = HANGS_S,
+        feedback: Callable[[Any], None] | None = None,
+    ) -> ClientGoalHandle:
+        """Send a goal until it is accepted; one whose answer may be lost is sent again under its id."""
+        deadline = time.monotonic() + timeout_s
+
+        def check() -> None:
+            self._check()
+            if time.monotonic() > deadline:
+                raise NoAnswer(f"waited {timeout_s:g} s for the goal to be accepted")
+
+        goals = Goals(client, type(goal).__qualname__, self.spin)
+        try:
+            return goals.send(goal, check, lambda: None, feedback)
+        except (NodeAway, ScanEnded) as error:
+            raise NoAnswer(str(error)) from error

@@ -27,8 +27,8 @@ PARAMETER = Parameter(
 
 ANSWER_WITHIN_S = 0.25
 """Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
-DISCOVERED_WITHIN_S = 2.0
-"""A node that has just come up is not known to all yet: so long its service is waited for [s]."""
+DISCOVERED_WITHIN_S = 10.0
+"""In simulated time a node that has just come up, and is not known to all yet, is waited for so long [s]."""
 POLL_S = 5e-4
 
 

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import os
+import faulthandler
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -96,6 +95,7 @@ BEATS = QoSProfile(
 )
 
 
+STDERR = 2  # its descriptor
 END_WITHIN_S = 20.0
 """A node must end within this after a signal; it draws the tip back first [s]."""
 
@@ -121,9 +121,9 @@ def run_node(make: Callable[[], Node]) -> None:
     interrupted = False
 
     def end_in_time(*_: object) -> None:
-        limit = threading.Timer(END_WITHIN_S, os._exit, (1,))
-        limit.daemon = True
-        limit.start()
+        # by a thread that needs no interpreter: the middleware hangs with the interpreter's lock where another
+        # process was killed while it held a port of the shared memory
+        faulthandler.dump_traceback_later(END_WITHIN_S, exit=True, file=STDERR)
 
     def interrupt(*_: object) -> None:
         nonlocal interrupted

@@ -49,10 +49,11 @@ a slow machine may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
+"""A place is received within this, on the machine's clock; in simulated time as `RESULTS_WITHIN_S`."""
 DISCOVERED_WITHIN_S = 10.0
 NOT_MOVED = "the tip is not moved (parameter contact is none)"
 RECORDERS = 1  # of the subscribers of tcp_pose: the scan's own
-MET_WITHIN_S = 1.0
+MET_WITHIN_S, MET_SIMULATED_WITHIN_S = 1.0, 10.0
 """Nodes of this package give a sign of life much sooner, those of other packages never."""
 
 
@@ -124,7 +125,8 @@ class NodeHands:
 
     def meet(self) -> None:
         """Wait until the nodes have discovered the subscriptions of this scan."""
-        deadline = time.monotonic() + MET_WITHIN_S
+        simulated = self._time.simulated
+        deadline = time.monotonic() + (MET_SIMULATED_WITHIN_S if simulated else MET_WITHIN_S)
         while not self._nodes.met() and time.monotonic() < deadline:
             time.sleep(POLL_S)
 
@@ -278,8 +280,7 @@ class NodeHands:
 
     def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
         """Until every block's record, FRF and poles are in the recording, and all excitations."""
-        within_s = self._time.silent_s if self._time.simulated else RESULTS_WITHIN_S
-        deadline = time.monotonic() + within_s
+        deadline = time.monotonic() + self._patience_s(RESULTS_WITHIN_S)
         while missing := self._recorder.missing(result.blocks):
             if time.monotonic() > deadline:
                 raise PointDisturbed(missing, "messages lost")
@@ -343,4 +344,8 @@ class NodeHands:
             check()
             time.sleep(POLL_S)
         self._pose.publish(pose)
-        self._pose.wait_for_all_acked(Duration(seconds=PLACED_WITHIN_S))
+        self._pose.wait_for_all_acked(Duration(seconds=self._patience_s(PLACED_WITHIN_S)))
+
+    def _patience_s(self, real_s: float) -> float:
+        """Longest wait for nodes at work: in simulated time for as long as one may be silent."""
+        return self._time.silent_s if self._time.simulated else real_s

@@ -32,6 +32,18 @@ def module_domain():
         yield _fresh_domain(patch)
 
 
+@pytest.fixture(scope="session")
+def demonstration(tmp_path_factory):
+    """A whole demo that nothing disturbs."""
+    pytest.importorskip("rtde_control", reason="ur-rtde is not here")
+    sys.path.insert(0, str(Path(__file__).parent))
+    from demonstrated import undisturbed
+
+    with pytest.MonkeyPatch.context() as patch:
+        domain = _fresh_domain(patch)
+        return undisturbed(tmp_path_factory.mktemp("demonstration"), domain)
+
+
 @pytest.fixture(scope="module")
 def bench(module_domain, tmp_path_factory):
     """contact_node on a simulated robot, for the tests of one file."""

@@ -23,10 +23,9 @@ from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
 from benchmarks import contact_client
-from benchmarks.contact_client import HANGS_S
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import Demand, SimulatedClock
-from tactile_resonance.nodes.client import NoAnswer
+from tactile_resonance.nodes.client import HANGS_S, NoAnswer
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses, end_with_parent
 from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
@@ -133,7 +132,7 @@ class Bench(RobotAtHand):
             text=True,
             preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
-        ready, _, _ = select.select([self.plant.stdout], [], [], 60)
+        ready, _, _ = select.select([self.plant.stdout], [], [], HANGS_S)
         line = self.plant.stdout.readline() if ready else "nothing"
         assert line.startswith(READY), line
         self.time = SimulatedClock(server, "test")
@@ -202,7 +201,7 @@ class Bench(RobotAtHand):
         self.time.close()
         self.nodes.stop()
         self.plant.terminate()
-        output, _ = self.plant.communicate(timeout=10)
+        output, _ = self.plant.communicate(timeout=HANGS_S)
         return output
 
 

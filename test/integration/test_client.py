@@ -52,7 +52,7 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes:
         nodes.bring_up(NODES, parameters)
         answer = subprocess.run(
-            [sys.executable, EXAMPLE], capture_output=True, text=True, timeout=240
+            [sys.executable, EXAMPLE], capture_output=True, text=True, timeout=600
         )
     assert answer.returncode == 0, answer.stderr
     *told, last = answer.stdout.splitlines()

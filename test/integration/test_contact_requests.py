@@ -11,8 +11,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
-from benchmarks.contact_client import HANGS_S, goal_message
+from benchmarks.contact_client import goal_message
 from tactile_resonance.contact.parameters import read_contact
+from tactile_resonance.nodes.client import HANGS_S
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contact_rig import height_m, last_way_down_s

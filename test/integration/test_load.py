@@ -4,6 +4,7 @@
 `make load` does it at length: more loads, all sixteen points, and the wall clock.
 """
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,20 +14,19 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
-from robot_at_hand import own_host
-
 from benchmarks.load_case import BRIEFLY, Demonstration, Load, demonstrate, faults, findings
 
-SCENE = Path(__file__).resolve().parents[2] / ".ci" / "two_points.yaml"
-HOST = own_host(18)
+sys.path.insert(0, str(Path(__file__).parent))
+from demonstrated import HOST
+
 # nodes that hold the time, that compute, and that are not needed; the robot's client, and the robot
 STOPPED = ("contact_node", "frf_node", "pole_map_node", "scan_node", *BRIEFLY)
 
 
 @pytest.fixture(scope="module")
-def idle(module_domain, tmp_path_factory):
+def idle(demonstration):
     """Two points of a demo that nothing disturbs."""
-    shown = demonstrate(tmp_path_factory.mktemp("idle"), SCENE, HOST, Load("no load"))
+    shown = demonstration.shown
     assert shown.status == 0, shown.errors
     found = findings(shown.run_folder)
     assert faults(shown, found, found) == []
@@ -34,9 +34,9 @@ def idle(module_domain, tmp_path_factory):
     return found
 
 
-def test_a_load_costs_time_and_nothing_else(idle, domain, tmp_path):
+def test_a_load_costs_time_and_nothing_else(idle, demonstration, domain, tmp_path):
     load = Load("busy, and stopped", busy_loops=2, without_priority=True, stopped=STOPPED)
-    shown = demonstrate(tmp_path, SCENE, HOST, load)
+    shown = demonstrate(tmp_path, demonstration.scene, HOST, load)
     assert faults(shown, findings(shown.run_folder), idle) == []
     assert len(shown.stopped) >= 3, "it was over before they were stopped"
 

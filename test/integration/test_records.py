@@ -7,14 +7,13 @@ import struct
 import time
 
 import pytest
-import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
 from robot_at_hand import own_time
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
+from tactile_resonance.nodes.client import HANGS_S, NodeClient
 from tactile_resonance.nodes.conversions import pose_to_message, record_to_message
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM
 from tactile_resonance.processes import NodeProcesses
@@ -28,33 +27,31 @@ TOPICS = {
     "poles": (msg.Poles, RESULTS),
     "bench/block": (msg.Record, RESULTS),
 }
+STREAMED = ("record", "frf", "poles")
 TIME = own_time(15)
 # short periods: many blocks in little time
 SHORT = {"samples_per_period": 2000, "f_min_hz": 100.0}
+SILENT_S = 1.0
+"""Periods are 0.04 s."""
 
 
-class Client:
+class Client(NodeClient):
     """Asks for measurements and hears everything; moves the tip as a robot would."""
 
-    def __enter__(self):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("client", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+    def __init__(self):
+        super().__init__("client", lambda: None)
+
+    def join(self):
         self.heard = {topic: [] for topic in TOPICS}
         for topic, (kind, qos) in TOPICS.items():
-            self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
-        self.pose = self.node.create_publisher(PoseStamped, "tcp_pose", STREAM)
-        self.node.create_timer(0.05, self.move)
+            self._node.create_subscription(kind, topic, self.heard[topic].append, qos)
+        self.pose = self._node.create_publisher(PoseStamped, "tcp_pose", STREAM)
+        self._node.create_timer(0.05, self.move)
         self.moves = 0
-        self.client = ActionClient(self.node, Measure, "measure")
-        return self
+        self.client = ActionClient(self._node, Measure, "measure")
 
-    def __exit__(self, *_):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+    def why(self):
+        return str({topic: len(messages) for topic, messages in self.heard.items()})
 
     def move(self):
         self.moves += 1
@@ -63,37 +60,26 @@ class Client:
         )
         self.pose.publish(pose_to_message(contact))
 
-    def wait(self, done, timeout_s=30.0):
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            assert time.monotonic() < deadline, {t: len(m) for t, m in self.heard.items()}
-            self.executor.spin_once(timeout_sec=0.05)
+    def until(self, done, what):
+        self.wait(done, HANGS_S, what)
 
     def ask(self, **goal):
         """Future of the result of a goal; asked until the node is active."""
-        self.wait(self.client.server_is_ready)
-        deadline = time.monotonic() + 30.0
-        while time.monotonic() < deadline:
-            answer = self.client.send_goal_async(Measure.Goal(**goal))
-            self.wait(answer.done)
-            if answer.result().accepted:
-                return answer.result().get_result_async()
-            self.executor.spin_once(timeout_sec=0.1)
-        raise AssertionError("no node takes the goal")
+        return self.begin(self.client, Measure.Goal(**goal)).get_result_async()
 
     def measure(self, **goal):
         result = self.ask(**goal)
-        self.wait(result.done)
+        self.until(result.done, "the measurement")
         return result.result().result
 
-    def join(self, **goal):
+    def meet(self, **goal):
         """Measure until every topic is heard, and the bench hears the tip's place."""
-        for _ in range(20):
+        for attempt in range(10):
             key = self.measure(**goal).measurement_id
-            deadline = time.monotonic() + 1.0
+            deadline = time.monotonic() + 2.0 * (1 + attempt)
             while time.monotonic() < deadline:
-                self.executor.spin_once(timeout_sec=0.05)
-                if all(self.finished(topic, key) for topic in ("record", "frf", "poles")):
+                self.spin(0.05)
+                if all(self.finished(topic, key) for topic in STREAMED):
                     if self.of("record", key)[-1].tip_pose.pose.position.x > 0:
                         return
                     break
@@ -102,8 +88,20 @@ class Client:
     def measure_to_the_end(self, **goal):
         """Measure, and wait for its poles before the next, as a scan does; the id."""
         key = self.measure(**goal).measurement_id
-        self.wait(lambda: all(self.finished(topic, key) for topic in ("record", "frf", "poles")))
+        self.until(lambda: all(self.finished(topic, key) for topic in STREAMED), "its poles")
         return key
+
+    def until_silent(self, topic):
+        """Wait until nothing has come on a topic for a while."""
+        count, news_s = -1, 0.0
+
+        def silent():
+            nonlocal count, news_s
+            if count != (count := len(self.heard[topic])):
+                news_s = time.monotonic()
+            return time.monotonic() - news_s > SILENT_S
+
+        self.until(silent, f"{topic} to be silent")
 
     def of(self, topic, key):
         return [m for m in self.heard[topic] if m.measurement_id == key]
@@ -146,15 +144,14 @@ def test_kill_leaves_every_published_record_on_disk(domain, tmp_path):
             excitation_node={"record_folder": records, "time_server": TIME, **SHORT},
             fake_hardware_node={"time_server": TIME},
         )
-        client.join(periods=3)
+        client.meet(periods=3)
         client.heard["record"].clear()
         client.ask(periods=100_000, label="to be killed")
-        client.wait(lambda: len(client.heard["record"]) >= 25)
+        client.until(lambda: len(client.heard["record"]) >= 25, "records")
         node = nodes._processes["excitation_node"]
         node.send_signal(signal.SIGKILL)
         node.wait()
-        for _ in range(20):  # what was on its way
-            client.executor.spin_once(timeout_sec=0.05)
+        client.until_silent("record")  # what was on its way
     content = read_store(records)
     assert content.problems == ()
     last = content.measurements[-1]
@@ -205,21 +202,17 @@ def test_a_disk_that_goes_away_ends_the_measurement(domain, tmp_path):
             fake_hardware_node={"time_server": TIME},
         )
         result = client.ask(periods=100_000)
-        client.wait(lambda: len(client.heard["record"]) >= 5)
+        client.until(lambda: len(client.heard["record"]) >= 5, "records")
         records.rename(tmp_path / "gone")
-        client.wait(result.done)
+        client.until(result.done, "the measurement to end")
         result = result.result().result
         assert result.outcome == Measure.Result.FAILED
         assert result.message.startswith("record_folder: ")
         # only what had been written was handed out
-        client.wait(lambda: client.heard["record"][-1].block_index == result.blocks - 1)
-        # and the bench is silent
-        for _ in range(10):
-            client.executor.spin_once(timeout_sec=0.05)
-        before = len(client.heard["bench/block"])
-        for _ in range(20):
-            client.executor.spin_once(timeout_sec=0.05)
-        assert len(client.heard["bench/block"]) == before
+        last = result.blocks - 1
+        client.until(lambda: client.heard["record"][-1].block_index == last, "the last record")
+        client.until_silent("bench/block")
+        assert client.heard["record"][-1].block_index == last
 
 
 def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
@@ -236,14 +229,14 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
             },
             fake_hardware_node={"time_server": TIME},
         )
-        client.join(periods=3)
+        client.meet(periods=3)
         keys = [
             client.measure_to_the_end(periods=4, realisations=2, label=f"point {k}", seed=k)
             for k in (1, 2)
         ]
         recorded = {
             (topic, key): [bits(m) for m in client.of(topic, key)]
-            for topic in ("record", "frf", "poles")
+            for topic in STREAMED
             for key in keys
         }
         assert {len(messages) for messages in recorded.values()} == {8}
@@ -264,7 +257,9 @@ def test_replay_gives_the_same_frfs_and_poles_to_the_bit(domain, tmp_path):
                 "frame_id": "elsewhere",
             },
         )
-        client.join(measurement_id=warm_up[0])
+        client.meet(
+            measurement_id=warm_up[-1]
+        )  # the first may have been before the bench heard of the tip
         # out of turn, the warm-up did not count
         replayed = [client.measure_to_the_end() for _ in content.measurements]
         assert replayed == [m.measurement_id for m in content.measurements]

@@ -4,7 +4,9 @@
 import array
 import dataclasses
 import struct
+import time
 from collections import defaultdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,13 +15,13 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from rclpy.action import ActionClient
-from rclpy.serialization import deserialize_message
 from robot_at_hand import own_time
 from rosbags.highlevel import AnyReader
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.client import Ending
+from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
@@ -47,50 +49,48 @@ READERS = ("frf_node", "poles_node")
 
 
 class Client(ScanClient):
-    """Asks for scans and measurements, and keeps everything that is published, as it travelled."""
+    """Asks for scans and measurements, and keeps everything that is published.
+
+    Attributes
+    ----------
+    heard : dict
+        Messages in their order, by topic and measurement.
+    """
 
     def join(self):
         super().join()
-        self.heard = {topic: [] for topic in TOPICS}
+        self.heard = defaultdict(list)
         for topic, (kind, qos) in TOPICS.items():
-            self._node.create_subscription(kind, topic, self.heard[topic].append, qos, raw=True)
+            self._node.create_subscription(kind, topic, partial(self._hear, topic), qos)
         self._measure = ActionClient(self._node, Measure, "measure")
+
+    def _hear(self, topic, message):
+        self.heard[topic, message.measurement_id].append(message)
 
     def ask(self, **goal):
         """Future of a measurement's result."""
-        self.wait(self._measure.server_is_ready, 30.0, "the action measure")
-        answer = self._measure.send_goal_async(Measure.Goal(**goal))
-        self.wait(answer.done, 10.0, "the goal to be taken")
-        assert answer.result().accepted
-        return answer.result().get_result_async()
+        return self.begin(self._measure, Measure.Goal(**goal)).get_result_async()
 
     def measure(self, **goal):
         future = self.ask(**goal)
-        self.wait(future.done, 60.0, "the measurement")
+        self.wait(future.done, HANGS_S, "the measurement")
         return future.result().result
+
+    def has(self, key, blocks):
+        """Whether everything of a measurement has come."""
+        return all(len(self.heard[t, key]) == blocks for t in TOPICS if t != "/excitation")
 
     def join_all(self, **goal):
         """Measure until everything of a measurement is heard: all have found each other by then."""
-        for _ in range(20):
-            for heard in self.heard.values():  # a replay has the same id again
-                heard.clear()
+        for attempt in range(10):
+            self.heard.clear()  # a replay has the same id again
             result = self.measure(**goal)
-            for _ in range(40):
+            deadline = time.monotonic() + 2.0 * (1 + attempt)
+            while time.monotonic() < deadline:
                 self.spin(0.05)
-                messages = self.by_measurement()
-                if all(len(messages[t, result.measurement_id]) == result.blocks for t in self.heard
-                       if t != "/excitation"):  # fmt: skip
+                if self.has(result.measurement_id, result.blocks):
                     return
         raise AssertionError("the nodes are not heard")
-
-    def by_measurement(self):
-        """(topic, measurement) -> messages in their order."""
-        found = defaultdict(list)
-        for topic, (kind, _) in TOPICS.items():
-            for cdr in self.heard[topic]:
-                message = deserialize_message(cdr, kind)
-                found[topic, message.measurement_id].append(message)
-        return found
 
 
 def bits(message, *without):
@@ -120,18 +120,22 @@ def recorded(module_domain, tmp_path_factory):
     }
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up(("fake_hardware_node", "excitation_node", *READERS, "scan_node"), parameters)
-        client.wait_until_up(60.0)
+        client.wait_until_up(HANGS_S)
         client.join_all(periods=3)
         # somebody else is measuring when the scan begins: it waits, and records none of that
-        other = client.ask(periods=60)
-        result = client.scan(90.0, scene=scene, run_directory=run)
-        assert other.done()
+        other = client.ask(periods=20)
+        result = client.scan(5 * HANGS_S, scene=scene, run_directory=run)
+        assert result.ending is Ending.COMPLETE, result.message
+        assert (result.done, result.failed, result.skipped) == (4, 0, 0)
+        client.wait(other.done, HANGS_S, "the result of the other measurement")
         assert other.result().result.outcome == Measure.Result.DONE
-        for _ in range(10):
-            client.spin(0.05)
-        heard = client.by_measurement()
-    assert result.ending is Ending.COMPLETE, result.message
-    assert (result.done, result.failed, result.skipped) == (4, 0, 0)
+        points = read_run(run).results
+        client.wait(
+            lambda: all(client.has(point.measurement_id, point.blocks) for point in points),
+            HANGS_S,
+            "what the scan has heard",
+        )
+        heard = client.heard
     return run, heard, other.result().result.measurement_id
 
 
@@ -169,19 +173,16 @@ def test_a_replay_gives_every_pole_again_to_the_bit(recorded, domain, tmp_path):
     with NodeProcesses(tmp_path / "log") as nodes, Client(nodes.check) as client:
         parameters = {"device": "replay", "device_config": run, "replay_speed": 0.0}
         nodes.bring_up(("excitation_node", *READERS), {"excitation_node": parameters})
-        client.wait_until_up(60.0)
+        client.wait_until_up(HANGS_S)
         points = {r.measurement_id for r in read_run(run).results}
         client.join_all(measurement_id=min(points))  # out of turn, it does not count
-        for heard_now in client.heard.values():
-            heard_now.clear()
+        client.heard.clear()
         replayed = []
         while (result := client.measure()).outcome == Measure.Result.DONE:
             replayed.append(result.measurement_id)
-            for _ in range(400):
-                again = client.by_measurement()
-                if len(again["/poles", result.measurement_id]) == result.blocks:
-                    break
-                client.spin(0.05)
+            key, blocks = result.measurement_id, result.blocks
+            client.wait(lambda key=key, n=blocks: client.has(key, n), HANGS_S, "the replay")
+        again = client.heard
         assert "the recording is over" in result.message
     assert len(set(replayed)) == len(replayed) == len(list((run / "recording").glob("*.mcap")))
     assert points == set(replayed)

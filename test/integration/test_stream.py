@@ -5,16 +5,14 @@ import time
 
 import numpy as np
 import pytest
-import rclpy
 from geometry_msgs.msg import Point
-from rclpy.executors import SingleThreadedExecutor
 from robot_at_hand import own_time
 from tactile_resonance.action import Measure
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
 from tactile_resonance.frf.estimate import estimate_frf
-from tactile_resonance.nodes.client import NoAnswer
+from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
 from tactile_resonance.nodes.conversions import (
     excitation_from_message,
     frf_from_message,
@@ -32,40 +30,26 @@ GEL_10 = (0.0, 0.0, 0.0)
 GEL_16 = (0.18, 0.0, 0.0)
 
 
-class Listener:
+class Listener(NodeClient):
     """Collects what is published, as a user's own node would."""
 
-    def __enter__(self):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("listener", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+    def join(self):
         self.heard = {"excitation": [], "record": [], "frf": [], "poles": []}
         types = (msg.Excitation, msg.Record, msg.FRF, msg.Poles)
         for (topic, list_), kind in zip(self.heard.items(), types, strict=False):
             qos = EXCITATIONS if topic == "excitation" else RESULTS
-            self.node.create_subscription(kind, topic, list_.append, qos)
-        return self
+            self._node.create_subscription(kind, topic, list_.append, qos)
 
-    def __exit__(self, *_):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+    def why(self):
+        return str({topic: len(list_) for topic, list_ in self.heard.items()})
 
-    def listen(self, until, timeout_s=10.0):
-        deadline = time.monotonic() + timeout_s
-        while not until() and time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.05)
-        assert until(), {topic: len(list_) for topic, list_ in self.heard.items()}
-
-    def join(self, session):
+    def meet(self, session):
         """Measure until a whole measurement has been heard: only then has everybody found the listener."""
-        for _ in range(20):
-            key = session.warm_up(GEL_10, 30.0).origin.measurement_id
-            deadline = time.monotonic() + 1.0
+        for attempt in range(10):
+            key = session.warm_up(GEL_10, HANGS_S).origin.measurement_id
+            deadline = time.monotonic() + 2.0 * (1 + attempt)
             while time.monotonic() < deadline:
-                self.executor.spin_once(timeout_sec=0.05)
+                self.spin(0.05)
                 if [len(self.of(topic, key)) for topic in self.heard] == [1, 3, 3, 3]:
                     return
         raise AssertionError("the listener does not hear the nodes")
@@ -87,8 +71,8 @@ def session(module_domain, tmp_path_factory):
         }
         nodes.bring_up(NODES, parameters)
         with ScanSession(nodes.check) as session:
-            session.wait_for_nodes(30.0)
-            session.warm_up(GEL_10, 30.0)
+            session.wait_for_nodes(HANGS_S)
+            session.warm_up(GEL_10, HANGS_S)
             yield session
 
 
@@ -97,17 +81,21 @@ def quiet(done, planned):
 
 
 def test_messages_of_a_measurement(session):
-    with Listener() as listener:
-        listener.join(session)
+    with Listener("listener", lambda: None) as listener:
+        listener.meet(session)
         goal = Measure.Goal(label="here", periods=5, realisations=2, seed=3, level_v=0.5)
         result = session.measure(GEL_10, goal, quiet)
         key = result.origin.measurement_id
-        listener.listen(
-            lambda: all(
-                any(m.final for m in listener.of(topic, key))
-                for topic in ("record", "frf", "poles")
-            )
-            and len(listener.of("excitation", key)) == goal.realisations  # no order between topics
+        listener.wait(
+            lambda: (
+                all(
+                    any(m.final for m in listener.of(topic, key))
+                    for topic in ("record", "frf", "poles")
+                )
+                and len(listener.of("excitation", key)) == goal.realisations
+            ),  # no order between topics
+            HANGS_S,
+            "all messages",
         )
         excitations = [excitation_from_message(m) for m in listener.of("excitation", key)]
         messages = listener.of("record", key)
@@ -223,7 +211,7 @@ def test_a_node_that_refuses_to_come_up_says_why(domain, tmp_path):
         nodes.bring_up(NODES, {"fake_hardware_node": {"scene": "nowhere.yaml"}})
         refusal = r"fake_hardware_node is unconfigured: .*nowhere.yaml"
         with ScanSession(nodes.check) as session, pytest.raises(NoAnswer, match=refusal):
-            session.wait_for_nodes(30.0)
+            session.wait_for_nodes(HANGS_S)
 
 
 def test_a_node_that_ended_is_named(domain, tmp_path):
@@ -234,7 +222,7 @@ def test_a_node_that_ended_is_named(domain, tmp_path):
 
 
 def wait_for_an_end(nodes):
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + HANGS_S
     while time.monotonic() < deadline:
         nodes.check()
         time.sleep(0.1)

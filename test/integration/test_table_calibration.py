@@ -21,6 +21,7 @@ from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, TRUTH, true_table
 from tactile_resonance.configuration import share_path
+from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.nodes.scan_node import RUNNING
@@ -65,7 +66,7 @@ class Bench:
         self.nodes = NodeProcesses(self.folder / "log").__enter__()
         self.client = ScanClient(self.nodes.check).__enter__()
         self.nodes.bring_up(self.names, self.parameters)
-        self.client.wait_until_up(90.0)
+        self.client.wait_until_up(HANGS_S)
         return self
 
     def __exit__(self, *raised):
@@ -73,14 +74,14 @@ class Bench:
         self.nodes.__exit__(*raised)
 
     def calibrate(self, points=POINTS, **wanted):
-        return self.client.calibrate_table(180.0, points=points, **wanted)
+        return self.client.calibrate_table(5 * HANGS_S, points=points, **wanted)
 
     def idle(self):
         """The tip is free, by what contact says from now on."""
         node, states = self.client._node, []
         # a new one, which has nothing from before in its queue
         topic = node.create_subscription(ContactState, "contact_state", states.append, STREAM)
-        self.client.wait(lambda: states, 30.0, "the state of the contact")
+        self.client.wait(lambda: states, HANGS_S, "the state of the contact")
         node.destroy_subscription(topic)
         return states[-1].state == ContactState.STATE_IDLE
 
@@ -190,12 +191,12 @@ def test_one_goal_at_a_time_and_a_cancelled_one_draws_the_tip_back(ideal):
     with ScanClient(ideal.nodes.check, "other") as other:
         long = POINTS * 400  # nobody waits for its end
         future = client.tactile.calibrate_table(long, on_feedback=heard.append)
-        client.wait(lambda: len(heard) > 1, 60.0, "the second touch")
-        assert other.calibrate_table(60.0, points=POINTS).message == RUNNING
-        outcome = other.scan(60.0, **scan)
+        client.wait(lambda: len(heard) > 1, HANGS_S, "the second touch")
+        assert other.calibrate_table(HANGS_S, points=POINTS).message == RUNNING
+        outcome = other.scan(HANGS_S, **scan)
         assert (outcome.ending, outcome.message) == (Ending.REJECTED, RUNNING)
         client.tactile.cancel()
-        client.wait(future.done, 60.0, "the end")
+        client.wait(future.done, HANGS_S, "the end")
         outcome = future.result()
         assert outcome.ending is Ending.CANCELLED
         assert np.all(np.isnan(outcome.table_in_base))
@@ -204,11 +205,11 @@ def test_one_goal_at_a_time_and_a_cancelled_one_draws_the_tip_back(ideal):
         heard.clear()
         path = ideal.folder / "scan"
         future = client.tactile.scan(**scan, run_directory=path, on_feedback=heard.append)
-        client.wait(lambda: heard, 60.0, "the scan")
-        outcome = other.calibrate_table(60.0, points=POINTS)
+        client.wait(lambda: heard, HANGS_S, "the scan")
+        outcome = other.calibrate_table(HANGS_S, points=POINTS)
         assert (outcome.ending, outcome.message) == (Ending.REJECTED, RUNNING)
         client.tactile.cancel()
-        client.wait(future.done, 60.0, "the end")
+        client.wait(future.done, HANGS_S, "the end")
 
 
 def test_the_command_prints_what_was_found_or_why_it_was_not(ideal, capsys):
@@ -235,7 +236,7 @@ def test_an_interrupt_has_the_tip_drawn_back_and_ends_the_goal(ideal):
             raise interrupts.pop()
 
     with ScanClient(check, "interrupted") as client, pytest.raises(KeyboardInterrupt):
-        client.calibrate_table(60.0, points=POINTS * 400, on_feedback=heard.append)
+        client.calibrate_table(HANGS_S, points=POINTS * 400, on_feedback=heard.append)
     assert ideal.idle()
     assert ideal.calibrate().ending is Ending.COMPLETE  # nothing is under way any more
 

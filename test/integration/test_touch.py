@@ -14,6 +14,7 @@ from tactile_resonance.action import Scan
 
 from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
+from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
@@ -54,16 +55,16 @@ def test_a_tilted_table_is_found_by_touch(domain, tmp_path):
         node["time_server"] = TIME
     with NodeProcesses(tmp_path / "log") as nodes, ScanClient(nodes.check) as client:
         nodes.bring_up(NODES, parameters)
-        client.wait_until_up(90.0)
+        client.wait_until_up(HANGS_S)
         result = client.scan(
-            240.0, scene=scene, run_directory=run_path, notes="{tip_wetness: wet}"
+            5 * HANGS_S, scene=scene, run_directory=run_path, notes="{tip_wetness: wet}"
         )
         assert result.ending is Ending.COMPLETE, result.message
         assert result.done == 1, read_run(run_path).latest[0].reason
         # gone on with, there is nothing left to do and nothing is touched again
         phases = []
         again = client.scan(
-            60.0,
+            HANGS_S,
             run_directory=run_path,
             resume=True,
             on_feedback=lambda feedback: phases.append(feedback.phase),

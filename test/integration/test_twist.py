@@ -9,6 +9,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from benchmarks.contact_client import ContactClient
 from benchmarks.twist_stub import TwistStub, stub_parameters
+from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.processes import NodeProcesses
 
 STILL_M = 5e-5
@@ -122,12 +123,14 @@ def test_a_node_that_is_shut_down_in_contact_draws_the_tip_back_and_commands_not
     assert result.reached, result.message
     held_m = lab.stub.controller.height_m[-1]
     assert lab.client.ask("manager_node/shut_down").success
-    lab.client.wait(lambda: lab.stub.controller.force_n[-1][1] == 0, 60.0, "the tip to leave")
-    lab.client.wait(lambda: not any(lab.stub.commands[-1][1]), 60.0, "zero")
+    lab.client.wait(lambda: lab.stub.controller.force_n[-1][1] == 0, HANGS_S, "the tip to leave")
+    lab.client.wait(lambda: not any(lab.stub.commands[-1][1]), HANGS_S, "zero")
     assert lab.stub.controller.height_m[-1] > held_m + 2e-3
     lab.client.state = None
     assert lab.client.ask("manager_node/start").success
-    lab.client.until("idle")  # a goal before that may be lost with the server that is being taken down
+    lab.client.until(
+        "idle"
+    )  # a goal before that may be lost with the server that is being taken down
     again = lab.client.result(lab.start())
     assert again.reached, again.message
     lab.client.ask("retract")

@@ -77,7 +77,7 @@ class TestStream(unittest.TestCase):
         for status in array.status:
             cls.states[status.name] = {v.key: v.value for v in status.values}.get("state")
 
-    def wait(self, done, timeout_s=60.0):
+    def wait(self, done, timeout_s=120.0):
         deadline = time.monotonic() + timeout_s
         while not done():
             assert time.monotonic() < deadline, self.states
@@ -87,14 +87,14 @@ class TestStream(unittest.TestCase):
         self.wait(lambda: self.states.get(f"/{NAMESPACE}/manager_node") == "active")
         client = ActionClient(self.node, Measure, "measure")
         self.wait(client.server_is_ready)
-        for _ in range(10):  # until every reader has been matched
+        for attempt in range(10):  # until every reader has been matched
             goal = client.send_goal_async(Measure.Goal(periods=3, label="launch test"))
             self.wait(goal.done)
             assert goal.result().accepted
             result = goal.result().get_result_async()
             self.wait(result.done)
             assert result.result().result.outcome == Measure.Result.DONE
-            deadline = time.monotonic() + 2.0
+            deadline = time.monotonic() + 2.0 * (1 + attempt)
             while time.monotonic() < deadline and not any(m.final for m in self.poles):
                 self.executor.spin_once(timeout_sec=0.05)
             if any(m.final for m in self.poles):

@@ -144,7 +144,7 @@ class TestScan(unittest.TestCase):
             assert outcome.ending is Ending.CANCELLED, outcome.message
             assert outcome.done == 1, outcome.message
             del states[:]
-            client.wait(lambda: states, 30.0, "the state of the contact")
+            client.wait(lambda: states, 120.0, "the state of the contact")
             assert states[-1].state == ContactState.STATE_IDLE
 
 

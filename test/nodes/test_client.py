@@ -259,6 +259,7 @@ def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypat
     other.destroy()
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
 def test_a_node_that_is_not_active_is_waited_for(stack):
     outcome = stack.ended(stack.client.scan(**GOAL, wait_s=0.3))
     assert outcome.ending is Ending.REJECTED

@@ -2,7 +2,6 @@
 """Nodes are brought up one after the other, each as soon as the one before it has answered."""
 
 import os
-import time
 
 import pytest
 
@@ -16,8 +15,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.manager_node import ManagerNode
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
-
-WITHIN_S = 10.0
+from test.spinning import spin_until
 
 
 class Managed(ManagedNode):
@@ -46,10 +44,7 @@ class Stack:
             self._executor.add_node(node)
 
     def spin_until(self, done):
-        deadline_s = time.monotonic() + WITHIN_S
-        while not done() and time.monotonic() < deadline_s:
-            self._executor.spin_once(0.05)
-        return done()
+        return spin_until(self._executor, done)
 
     def bring_up(self):
         """One tick of the manager once it knows all nodes; whether all came up."""

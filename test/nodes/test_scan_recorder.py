@@ -2,7 +2,6 @@
 """What is told of a measurement is in its file, however close together it is told, in any order."""
 
 import os
-import time
 
 import pytest
 
@@ -27,6 +26,7 @@ from tactile_resonance.scan.recorded import file_of
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.simulation.bench_tip import BenchTip
+from test.spinning import spin_until
 
 KEY, TRUTHS = 7, 12
 
@@ -76,17 +76,10 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
             recorder.record_into(recording, KEY)
-            deadline_s = time.monotonic() + 20.0
-            while (
-                not bench._truth._publisher.get_subscription_count()
-                and time.monotonic() < deadline_s
-            ):
-                executor.spin_once(0.05)
+            assert spin_until(executor, bench._truth._publisher.get_subscription_count)
             if not late:
                 tell(bench, TRUTHS)
-            deadline_s = time.monotonic() + 10.0
-            while recorder._counts["bench/truth"] < TRUTHS and time.monotonic() < deadline_s:
-                executor.spin_once(0.05)
+            assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)
             recorder.stop()
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
@@ -111,16 +104,12 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
         )
     }
 
-    def spin_until(done):
-        deadline_s = time.monotonic() + 20.0
-        while not done() and time.monotonic() < deadline_s:
-            executor.spin_once(0.05)
-        assert done()
-
     def tell(topic, **fields):
         publishers[topic].publish(publishers[topic].msg_type(measurement_id=KEY, **fields))
 
-    spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()))
+    assert spin_until(
+        executor, lambda: all(p.get_subscription_count() for p in publishers.values())
+    )
     plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
     with (
         RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run,
@@ -132,9 +121,9 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
             for topic in ("record", "frf", "poles"):
                 tell(topic, excitation_id=excitation_id)
         without = "of 2 blocks came 2 records, 2 FRFs, 2 poles; excitations without a message: 1"
-        spin_until(lambda: recorder.missing(2) == without)
+        assert spin_until(executor, lambda: recorder.missing(2) == without)
         tell("excitation", excitation_id=5)
-        spin_until(lambda: recorder.missing(2) == "")
+        assert spin_until(executor, lambda: recorder.missing(2) == "")
         assert recorder.missing(3).startswith("of 3 blocks came 2 records")
         recorder.stop()
         recording.finish(PointResult(0, measurement_id=KEY))

@@ -139,7 +139,7 @@ def test_a_packet_of_the_wrong_size_writes_nothing(robot, connect):
     reader.ask(Kind.START)
 
     def bits():
-        reader.socket.settimeout(5)
+        reader.socket.settimeout(60)
         return [struct.unpack(">BQ", reader.next(Kind.DATA))[1] for _ in range(30)][-1]
 
     writer.send(Kind.DATA, bytes([1, 1, 1, 1]))  # one byte too many
@@ -201,7 +201,7 @@ def test_second_robot_on_an_address_says_why_it_ends(robot, capsys):
 def test_ends_in_order(start_robots, number):
     (robot,) = start_robots()
     robot.process.send_signal(number)
-    output, _ = robot.process.communicate(timeout=10)
+    output, _ = robot.process.communicate(timeout=60)
     assert robot.process.returncode == 0
     assert "robot time" in output
 
