@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poles that change over the periods of a record: a test, and poles with their drift.
+"""A mode that changes over the periods of a record: a test, and its mean poles with their drift.
 
-A mode ``x' = p(t) x + r u`` whose pole moves by ``d t`` answers a line ``U exp(s t)`` with its own answer,
-``r U exp(s t) / (s - p)``, times one and, to second order in d,
-
-    d (t / (s - p) - 1 / (s - p)^2) + d^2 (t^2 / (s - p)^2 - 3 t / (s - p)^3 + 3 / (s - p)^4)
-
-for t exp(s t) through H(s) is ``(t H + dH/ds) exp(s t)``. The powers of t spread each line over the bins
-around it, where a constant mode has nothing. Time counts from the middle of the record; the free decay,
-at its start, has the pole of that instant.
+A mode ``x' = (p + d(t)) x + r u`` answers with ``x0 + x1 + x2 ...``: x0 is what the constant pole p makes of
+u, and each next term what it makes of d times the one before. The change d is a sum of Legendre polynomials
+over the record, as many as the record asks for, since creep slows down. Their transforms, spherical Bessel
+functions, spread each line over the bins around it, where a constant mode has nothing. They have no mean: p,
+the mean pole over the record, is as well known as a constant one, where the pole of an instant is known the
+less, the more polynomials there are. What decays from the start of the record has the pole of that instant.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
+import scipy.fft
+from numpy.polynomial import legendre
 from scipy import special
 
 from tactile_resonance.identification.bins import BinData
@@ -39,15 +40,24 @@ ComplexArray = npt.NDArray[np.complex128]
 
 # How often a constant mode is found to change.
 FALSE_ALARM = 2e-5
+# Of one that changes: how often one polynomial more is found than there are, and how many at most.
+ONE_MORE = 1e-3
+MOST_DEGREES = 6
+# Terms x1, x2 ...
+TERMS = 4
 # Refits of the other coefficients, and the change of the drift, in deviations, that is the last one.
 MOST_RETURNS = 12
 SAME_DRIFT = 0.02
 # Share of the drift itself that is as good as none, for records next to without noise.
 SAME_SHARE = 1e-4
+# Of the drift, what the changes of all else in the response move it by: .8 to 1.3 % on the simulated bench.
+SHARE_OF_OTHERS = 0.01
 GAIN_TOO = (
     "the gain changes over the record as well, as where contact is lost: the drift is no property of "
     "the mode"
 )
+# Of the record, from -1 to 1, among which that is found where the change is nearest to its mean.
+TIMES = np.linspace(-1, 1, 2001)
 USABLE = (PolesStatus.OK, PolesStatus.MODEL_ERROR)
 
 
@@ -57,11 +67,11 @@ class _Step:
 
     Attributes
     ----------
-    step : (2 m,) float
+    step : (c,) float
         To the drift that fits best.
-    inverse : (2 m, 2 m) float
+    inverse : (c, c) float
         Of the normal matrix of the drift, without what the coefficients can do.
-    coefficients : (n, 2 m) float
+    coefficients : (n, c) float
         What the coefficients change by with the drift, with a minus.
     level, dof : float
         Of the noise, in units of the variances weighted with, and its complex degrees of freedom.
@@ -75,32 +85,30 @@ class _Step:
 
     @property
     def covariance(self) -> FloatArray:
-        """(2 m, 2 m) of the drift."""
+        """(c, c) of the drift."""
         return np.asarray(self.inverse * self.level * self.dof / (self.dof - 1) / 2)
 
-    def chance(self, drift: FloatArray) -> float:
-        """Of a drift as large where there is none: an F test."""
-        return self._chance(float(drift @ np.linalg.solve(self.inverse, drift)), drift.size)
-
-    @property
-    def chance_of_last(self) -> float:
-        """As `chance`, of the last one beside all others."""
-        return self._chance(float(self.step[-1] ** 2 / self.inverse[-1, -1]), 1)
-
-    def _chance(self, fall: float, count: int) -> float:
+    def chance(self, drift: FloatArray, of: slice = slice(None)) -> float:
+        """Of some values of a drift as large beside all others where there are none: an F test."""
+        values = drift.ravel()[of]
+        fall = float(values @ np.linalg.solve(self.inverse[of, of], values))
         rest = self.level * self.dof
-        return float(special.betainc(self.dof, count / 2, rest / (rest + fall)))
+        return float(special.betainc(self.dof, values.size / 2, rest / (rest + fall)))
 
 
 @dataclass(frozen=True, eq=False)
 class DriftingModes:
-    """What drifting poles add to Y on the bins of the band, to second order in the drift.
+    """What modes whose poles change add to Y on the bins of the band.
+
+    A drift has rows of a complex number for each mode: what the residue grows by of itself, steadily, then
+    what the pole changes by [rad/s], with the polynomials of first, second ... degree. Each goes from -1 to 1
+    over the record.
 
     Parameters
     ----------
     plan : JointPlan
     fit : PolesBatch
-        Of one point, shape ().
+        Of one point, shape (), with m modes.
     u : (K,) complex
         Input on the bins; lines outside of the band are left out.
     """
@@ -109,45 +117,53 @@ class DriftingModes:
     fit: PolesBatch
     u: ComplexArray
 
+    @property
+    def there(self) -> npt.NDArray[np.int64]:
+        """(m,) places of modes."""
+        return np.flatnonzero(np.isfinite(self.fit.poles_rad_s))
+
     @cached_property
     def theta(self) -> FloatArray:
         """(n,) coefficients."""
         model = self.fit.fit
         return np.concatenate([model.denominator[:-1], model.numerator, model.transient])
 
-    @cached_property
-    def directions(self) -> ComplexArray:
-        """(2 m, K) of a drift of 1 rad/s^2 of the real and of the imaginary part of each pole."""
+    def directions(self, row: int) -> ComplexArray:
+        """(2 m, K) of 1 in the real and in the imaginary part of one row of the drift of each mode."""
         columns = []
+        times, start = self._times(max(row, 1)), (-1) ** row * self._decay
         for pole, residue in self._modes:
-            for d in (1.0, 1j):
-                about_t = _pair(self._s, pole, d * residue, 2)
-                constant = _pair(self._s, pole, -d * residue, 3)
-                first = _pair(self._s, pole, d, 1) * self._decay
-                columns.append(self._spread(constant, about_t) + first)
+            both = []
+            for p, r in ((pole, residue), (np.conj(pole), np.conj(residue))):
+                driven = r * self._lines
+                moved = self._spread(times, driven / (self._s - p) if row else driven)
+                both.append((moved + start * (row > 0)) / (self._s - p))
+            columns += [both[0] + both[1], 1j * (both[0] - both[1])]
         return np.array(columns)
 
-    @cached_property
-    def of_gain(self) -> ComplexArray:
-        """(1, K) of a gain of the output that grows by 1/s."""
-        g = self.fit.fit.response(self._s.imag / (2 * np.pi))
-        return np.asarray(self._spread(np.zeros_like(g), g) + self._decay)[None]
-
     def added(self, drift: FloatArray) -> ComplexArray:
-        """(K,) by a drift (2 m,) [rad/s^2], real and imaginary parts in turn."""
-        y = np.asarray(drift @ self.directions)
-        for (pole, residue), d in zip(self._modes, drift.view(complex), strict=True):
-            parts = (
-                _pair(self._s, pole, factor * d**2 * residue, power)
-                for factor, power in ((3, 5), (-3, 4), (1, 3))
-            )
-            y = y + self._spread(*parts)
+        """(K,) by a drift (rows, m, 2), real and imaginary parts last."""
+        changes = drift.view(complex)[..., 0]  # (rows, m)
+        degrees = range(1, len(changes))
+        times = np.array([self._times(degree) for degree in degrees])
+        start = np.array([(-1) ** degree for degree in degrees])
+        y = np.zeros(self._s.size, complex)
+        for (pole, residue), change in zip(self._modes, changes.T, strict=True):
+            for p, r, d in (
+                (pole, residue, change),
+                (np.conj(pole), np.conj(residue), np.conj(change)),
+            ):
+                more = self._spread(d[0] * times[0], r * self._lines) / (self._s - p)
+                x = r * self._lines / (self._s - p) + more
+                y += more + d[1:] @ start * self._decay / (self._s - p)
+                for _ in range(TERMS):
+                    x = self._spread(d[1:] @ times, x) / (self._s - p)
+                    y += x
         return y
 
     @property
     def _modes(self) -> list[tuple[complex, complex]]:
-        there = np.isfinite(self.fit.poles_rad_s)
-        both = (self.fit.poles_rad_s[there], self.fit.residues[there])
+        both = (self.fit.poles_rad_s[self.there], self.fit.residues[self.there])
         return list(zip(*(values.tolist() for values in both), strict=True))
 
     @cached_property
@@ -155,8 +171,16 @@ class DriftingModes:
         return np.asarray(2j * np.pi * self.plan.frequency_hz(self.plan.bins))
 
     @cached_property
+    def _lines(self) -> ComplexArray:
+        """(K,) the input without what is between its lines."""
+        line = self.plan.excited_at
+        lines = np.zeros(self._s.size, complex)
+        lines[line] = self.u[line]
+        return lines
+
+    @cached_property
     def _decay(self) -> ComplexArray:
-        """(K,) the free decay times the time from the middle of the record to its start."""
+        """(K,) the free decay from the start of the record."""
         plan, theta = self.plan, self.theta
         a, b, _ = plan.problem.sizes
         alpha = np.append(theta[:a], 1.0)
@@ -166,56 +190,38 @@ class DriftingModes:
         ):
             free = np.asarray(group.transient) @ theta[a + b :]
             decay[where] = free / (group.denominator @ alpha)
-        decay *= -plan.samples_per_period * plan.periods / plan.sample_rate_hz / 2
         return decay
 
-    @cached_property
-    def _powers(self) -> tuple[ComplexArray, ComplexArray]:
-        """(K, K_e) transforms of t and of t^2 from the middle of the record: of lines, on the bins."""
-        plan = self.plan
-        size = plan.samples_per_period * plan.periods
-        apart = plan.bins[:, None] - plan.bins[plan.excited_at]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            w = np.expm1(-2j * np.pi * apart / size)
-            t = np.where(apart == 0, 0, 1 / w)  # sums of geometric series
-            t_2 = np.where(apart == 0, (size**2 - 1) / 12, 1 / w - 2 * (1 + w) / w**2)
-        rate_hz = plan.sample_rate_hz
-        return np.asarray(t / rate_hz, complex), np.asarray(t_2 / rate_hz**2, complex)
+    def _times(self, degree: int) -> ComplexArray:
+        return _transform_of(degree, self.plan.samples_per_period * self.plan.periods, self.u.size)
 
-    def _spread(self, *responses: ComplexArray) -> ComplexArray:
-        """(K,) Y of responses (K,) that grow with the powers 0, 1, 2 of time."""
-        line = self.plan.excited_at
-        y = np.zeros(self._s.size, complex)
-        y[line] = responses[0][line] * self.u[line]
-        for spread, response in zip(self._powers, responses[1:], strict=False):
-            y += spread @ (response[line] * self.u[line])
-        return y
+    @staticmethod
+    def _spread(times: ComplexArray, x: ComplexArray) -> ComplexArray:
+        """(K,) bins of a signal with bins x (K,) times a function of time."""
+        return np.asarray(scipy.fft.ifft(times * scipy.fft.fft(x, times.size))[: x.size])
 
 
-def _pair(s: ComplexArray, pole: complex, factor: complex, power: int) -> ComplexArray:
-    """(K,) ``factor / (s - pole)^power`` and its conjugate partner."""
-    partner = np.conj(factor) / (s - np.conj(pole)) ** power
-    return np.asarray(factor / (s - pole) ** power + partner)
+@lru_cache(maxsize=64)
+def _transform_of(degree: int, samples: int, bins: int) -> ComplexArray:
+    """(L,) what `DriftingModes._spread` takes to multiply by a polynomial in time."""
+    apart = np.arange(1 - bins, bins)
+    # the sum over the samples is the integral to the square of apart / samples
+    turn = (-1.0) ** apart * np.exp(1j * np.pi * apart / samples)
+    transform = np.zeros(scipy.fft.next_fast_len(apart.size), complex)
+    transform[apart] = turn * (-1j) ** degree * special.spherical_jn(degree, np.pi * apart)
+    return np.asarray(scipy.fft.fft(transform))
 
 
 def _linearised(
-    plan: JointPlan,
-    fit: PolesBatch,
-    u: ComplexArray,
-    y: ComplexArray,
-    flat: bool,
-    with_gain: bool = False,
-) -> _Step:
-    """The drift that bins u, y (K,) show beside a fit to them, or to y without some drift.
+    modes: DriftingModes, y: ComplexArray, rows: Iterable[int], flat: bool = False
+) -> _Step | None:
+    """The drift that bins y (K,) show beside a fit to them, or to y without some drift.
 
-    With weights of flat noise, or of what noise a test finds: this takes a drift for noise. The drift of
-    the gain, if asked for, is the last.
+    With weights of flat noise, or of what noise a test finds: this takes a drift for noise. None where the
+    rows asked for cannot be told apart.
     """
-    modes = DriftingModes(plan, fit, u)
-    directions = modes.directions
-    if with_gain:
-        directions = np.concatenate([directions, modes.of_gain])
-    theta = modes.theta
+    plan, u, theta = modes.plan, modes.u, modes.theta
+    directions = np.concatenate([modes.directions(row) for row in rows])
     u_o, u_e = u[None, plan.others_at], u[None, plan.excited_at]
     one = np.ones((1, 1))
     data = [
@@ -238,10 +244,12 @@ def _linearised(
     own = point.jacobian(value)
     where = np.concatenate([plan.others_at, plan.excited_at])
     more = np.ascontiguousarray(-directions[:, where] * value.root).view(float)
-    inverse = np.linalg.inv(normals.sum(axis=0))
-    crossed = own @ more.T  # (n, 2 m)
-    coefficients = inverse @ crossed
-    left = np.linalg.inv(more @ more.T - crossed.T @ coefficients)
+    crossed = own @ more.T  # (n, c)
+    try:
+        coefficients = np.linalg.inv(normals.sum(axis=0)) @ crossed
+        left = np.linalg.inv(more @ more.T - crossed.T @ coefficients)
+    except np.linalg.LinAlgError:
+        return None
     score = more @ value.weighted.view(float) - coefficients.T @ gradient
     step = -left @ score
     count = len(step)
@@ -251,10 +259,34 @@ def _linearised(
     return _Step(step, left, coefficients, level, dof)
 
 
+def _converged(
+    modes: DriftingModes, y: ComplexArray, drift: FloatArray
+) -> tuple[DriftingModes, FloatArray, _Step] | None:
+    """Modes fitted to a record without its drift (rows, m, 2), the drift, its last step; None: no end.
+
+    Gauss-Newton steps of the drift, each followed by a fit of all else.
+    """
+    plan, u = modes.plan, modes.u
+    for _ in range(MOST_RETURNS):
+        at = _linearised(modes, y - modes.added(drift), range(len(drift)), flat=not drift.any())
+        if at is None or not np.isfinite(at.step).all():
+            return None
+        drift = drift + at.step.reshape(drift.shape)
+        least = np.maximum(
+            SAME_DRIFT * np.sqrt(np.diagonal(at.covariance)), SAME_SHARE * np.abs(drift.ravel())
+        )
+        if np.all(np.abs(at.step) < least):
+            return modes, drift, at
+        modes = DriftingModes(plan, plan.from_bins(u, y - modes.added(drift)), u)
+        if modes.fit.status() not in USABLE or modes.there.size != drift.shape[1]:
+            return None
+    return None
+
+
 def poles_with_drift(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, fit: PolesBatch
 ) -> tuple[Poles, float] | None:
-    """Poles in the middle of a record and their drift, where it shows that they change.
+    """Mean poles over a record and their drift, where it shows that they change.
 
     Parameters
     ----------
@@ -269,50 +301,41 @@ def poles_with_drift(
     -------
     tuple of Poles and float, or None
         With the variance of the noise that is left on a bin of Y. None where nothing changes beyond chance.
-        Status MODEL_ERROR where something changes that is no
-        steady drift of the poles: the gain too, as where contact is lost, or no fit with drift is found.
-
-    Notes
-    -----
-    Gauss-Newton steps of the drift, each followed by a fit of all else to the record without it.
+        Status MODEL_ERROR where something changes that is no drift of the poles: the gain too, as where
+        contact is lost, or no fit with drift is found.
     """
-    first: _Step | None = None
-    constant, drift = fit, np.zeros(0)
+    modes, found = DriftingModes(plan, fit, u), None
     with np.errstate(all="ignore"):
         if not fit.noise_variance[0] > ROUNDED * np.mean(np.abs(y) ** 2):
             return None  # what rounding leaves of exact data says nothing
-        for _ in range(MOST_RETURNS):
-            if fit.status() not in USABLE or not np.isfinite(fit.poles_rad_s).any():
+        if fit.status() not in USABLE or not modes.there.size:
+            return None
+        at = _linearised(modes, y, [1], flat=True)
+        if at is None or not at.chance(at.step) < FALSE_ALARM:
+            return None
+        none = np.zeros((1, modes.there.size, 2))
+        drift = none
+        while len(drift) <= MOST_DEGREES:
+            more = _converged(modes, y, np.concatenate([drift, none]))
+            if more is None:
                 break
-            rest = y if first is None else y - DriftingModes(plan, fit, u).added(drift)
-            try:
-                at = _linearised(plan, fit, u, rest, flat=first is None)
-            except np.linalg.LinAlgError:
+            found = modes, drift, _ = more
+            rest = y - modes.added(drift)
+            at = _linearised(modes, rest, range(len(drift) + 1))
+            if at is None or not at.chance(at.step, slice(drift.size, None)) < ONE_MORE:
                 break
-            if first is None:
-                if not at.chance(at.step) < FALSE_ALARM:
-                    return None
-                first, drift = at, np.zeros(at.step.size)
-            if drift.size != at.step.size or not np.isfinite(at.step).all():
-                break
-            drift = drift + at.step
-            least = np.maximum(
-                SAME_DRIFT * np.sqrt(np.diagonal(at.covariance)), SAME_SHARE * np.abs(drift)
-            )
-            if np.all(np.abs(at.step) < least):
-                if not at.chance(drift) < FALSE_ALARM:
-                    break
-                rest = y - DriftingModes(plan, fit, u).added(drift)
-                gain = _linearised(plan, fit, u, rest, flat=False, with_gain=True)
-                poles = _result(plan, fit, at, drift)
-                if not gain.chance_of_last > FALSE_ALARM:
-                    poles = _changed(poles, GAIN_TOO)
-                return poles, float(fit.noise_variance[0])
-            fit = plan.from_bins(u, y - DriftingModes(plan, fit, u).added(drift))
-    if first is None:
-        return None
+    if found is not None:
+        pole_rad_s = modes.fit.poles_rad_s[modes.there]
+        gain, change = np.abs(drift.view(complex)[:2, :, 0])
+        # a contact changes both by about as much of themselves
+        alone = np.any(gain > change / np.abs(pole_rad_s))
+        alone &= found[2].chance(drift, slice(none.size)) < FALSE_ALARM
+        if alone or found[2].chance(drift) < ONE_MORE:
+            poles = _result(*found)
+            left = float(modes.fit.noise_variance[0])
+            return (_changed(poles, GAIN_TOO) if alone else poles), left
     reason = "the mode changes over the record, and no fit with its drift is found"
-    return _changed(single(constant), reason), float(constant.noise_variance[0])
+    return _changed(single(fit), reason), float(fit.noise_variance[0])
 
 
 def _changed(poles: Poles, reason: str) -> Poles:
@@ -322,8 +345,9 @@ def _changed(poles: Poles, reason: str) -> Poles:
     return replace(poles, status=PolesStatus.MODEL_ERROR, total_covariance=total, message=message)
 
 
-def _result(plan: JointPlan, fit: PolesBatch, at: _Step, drift: FloatArray) -> Poles:
-    """`Poles` of a fit to a record without its drift (2 m,), which is not known better than it is."""
+def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
+    """`Poles` of a fit to a record without its drift (rows, m, 2), which is not known better than it is."""
+    plan, fit, there = modes.plan, modes.fit, modes.there
     covariance = at.covariance
     added = at.coefficients @ covariance @ at.coefficients.T
     pole = fit.poles_rad_s
@@ -337,18 +361,25 @@ def _result(plan: JointPlan, fit: PolesBatch, at: _Step, drift: FloatArray) -> P
         covariance=fit.covariance + in_f0,
         total_covariance=fit.total_covariance + in_f0,
     )
-    there = np.flatnonzero(np.isfinite(pole))
-    jacobian = natural_frequency_and_damping_jacobian(pole[there])
-    rates = (jacobian @ drift.reshape(-1, 2, 1))[..., 0]
-    blocks = np.stack([covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(there.size)])
+    samples = plan.samples_per_period * plan.periods
+    # the first polynomial is the straight line nearest to the change
+    per_s = 2 * plan.sample_rate_hz / samples
+    jacobian = per_s * natural_frequency_and_damping_jacobian(pole[there])
+    rates = (jacobian @ drift[1, :, :, None])[..., 0]
+    first = 2 * (there.size + np.arange(there.size))
+    blocks = np.stack([covariance[k : k + 2, k : k + 2] for k in first])
+    blocks += SHARE_OF_OTHERS**2 * np.sum(drift[1] ** 2, axis=-1)[:, None, None] * np.eye(2)
     of_rates = jacobian @ blocks @ np.swapaxes(jacobian, -1, -2)
     real = fit.significant[there]
-    middle_s = (plan.samples_per_period * plan.periods - 1) / plan.sample_rate_hz / 2
+    change = legendre.legval(TIMES, np.concatenate([0 * drift[:1], drift[1:]]))  # (m, 2, times)
+    nearest = TIMES[np.argmin(np.sum(change**2, axis=(0, 1)))]
+    instant_s = float(((1 + nearest) * samples - 1) / plan.sample_rate_hz / 2)
     poles = single(fit)
     deviations = np.sqrt(np.diagonal(of_rates, axis1=-2, axis2=-1))
     told = [
         f"the mode at {f0:.4g} Hz changes: f0 by {rate[0]:.3g} +- {std[0]:.2g} Hz/s, damping ratio by "
-        f"{rate[1]:.2g} +- {std[1]:.2g} 1/s; poles are those {middle_s:.3g} s after the start"
+        f"{rate[1]:.2g} +- {std[1]:.2g} 1/s; poles are means over the record, as about {instant_s:.3g} s "
+        "after its start"
         for f0, rate, std in zip(poles.f0_hz, rates[real], deviations[real], strict=True)
         if np.any(np.abs(rate) > 3 * std)
     ]
@@ -357,6 +388,6 @@ def _result(plan: JointPlan, fit: PolesBatch, at: _Step, drift: FloatArray) -> P
         f0_drift_hz_per_s=rates[real, 0],
         damping_drift_per_s=rates[real, 1],
         drift_covariance=of_rates[real],
-        instant_s=middle_s,
+        instant_s=instant_s,
         message="; ".join(filter(None, [poles.message, *told])),
     )

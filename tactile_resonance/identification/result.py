@@ -59,11 +59,12 @@ class Poles:
     zero_covariance : (k, 2, 2) float or None
         Of (Re, Im) of each zero, from noise.
     f0_drift_hz_per_s, damping_drift_per_s : (n,) float or None
-        What f0 and damping ratio change by; None where not estimated: nothing shows that they do.
+        What f0 and damping ratio change by over a record, of which poles are then the means: the slope
+        of the straight line nearest to the change. None where nothing shows that they do.
     drift_covariance : (n, 2, 2) float or None
         Of these two.
     instant_s : float or None
-        When, from the start of the record, poles that change are those given; None of others.
+        When, from the start of the record, poles that change are about those given; None of others.
     structure : ModelStructure
     band_hz : (float, float)
     lines : int

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mode that changes while it is measured: told, and its poles given for a stated instant."""
+"""A mode that changes while it is measured: told, and its mean poles over the record given."""
+
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -15,8 +17,19 @@ F0_HZ, DAMPING, BARE = 250.0, 0.03, ModelStructure(2, 2)
 RUNS = 40
 
 
-def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING):
-    """From rest; f0 and damping ratio are the nominal ones in the middle.
+def steady(time_s):
+    return time_s
+
+
+def creep(time_s):
+    """Logarithmic from 0.3 s on, with a mean of 0; the line nearest to it rises by 1/s."""
+    age_s = 0.3 + time_s - time_s[0]
+    curve = np.log(age_s)
+    return (curve - curve.mean()) / np.polyfit(time_s, curve, 1)[0]
+
+
+def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING, shape=steady):
+    """From rest; the nominal f0 and damping ratio are the means over the record.
 
     One interval after the other with the input straight between samples and the pole of the interval's
     middle: exact but for a smooth factor of the response, which the feed-through does not have.
@@ -27,8 +40,8 @@ def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING):
     u = np.tile(np.fft.irfft(spectrum, SAMPLES), periods) * SAMPLES / np.sqrt(2 * HARMONICS.size)
     interval = 1 / RATE_HZ
     time_s = (np.arange(u.size - 1) + 0.5) * interval - (u.size - 1) * interval / 2
-    zeta = damping + damping_drift_per_s * time_s
-    w = 2 * np.pi * (F0_HZ + f0_drift_hz_per_s * time_s)
+    zeta = damping + damping_drift_per_s * shape(time_s)
+    w = 2 * np.pi * (F0_HZ + f0_drift_hz_per_s * shape(time_s))
     q = w * (-zeta + 1j * np.sqrt(1 - zeta**2)) * interval
     residue = 2 * damping * (2 * np.pi * F0_HZ) / (2j * np.sqrt(1 - damping**2)) * interval
     late = (np.exp(q) - 1 - q) / q**2
@@ -41,8 +54,9 @@ def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING):
     return tuple(values.reshape(periods, SAMPLES) for values in (u, 0.1 * u + 2 * x.real))
 
 
-def fits(periods, f0_drift_hz_per_s=0.0, damping_drift_per_s=0.0, structure=BARE, noise=5e-3):
-    u, y = record(periods, f0_drift_hz_per_s, damping_drift_per_s)
+def fits(periods, f0_drift_hz_per_s=0.0, damping_drift_per_s=0.0, structure=BARE, shape=steady):
+    noise = 5e-3
+    u, y = record(periods, f0_drift_hz_per_s, damping_drift_per_s, shape=shape)
     rng = np.random.default_rng(2)
     for _ in range(RUNS):
         yield identify_poles_from_records(
@@ -53,6 +67,11 @@ def fits(periods, f0_drift_hz_per_s=0.0, damping_drift_per_s=0.0, structure=BARE
             band_hz=(200.0, 300.0),
             structure=structure,
         )
+
+
+@lru_cache
+def constant_fits(periods, structure=BARE):
+    return list(fits(periods, structure=structure))
 
 
 def inside(errors, covariances):
@@ -68,10 +87,26 @@ def test_drift_is_estimated_with_honest_ellipses(drift, periods, structure):
     if periods == 8:
         drift = (drift[0] / 4, drift[1] / 4)
     found = list(fits(periods, *drift, structure))
-    constant = list(fits(periods, structure=structure))
     assert all(p.status is PolesStatus.OK for p in found)
     assert all("changes: f0 by" in p.message for p in found)
     assert {p.instant_s for p in found} == {(periods * SAMPLES - 1) / RATE_HZ / 2}
+    are_honest(found, constant_fits(periods, structure), drift)
+
+
+@pytest.mark.parametrize("periods", [3, 8])
+def test_creep_slows_down_and_its_mean_is_as_precise_as_a_constant_mode(periods):
+    drift = (-0.2, 2e-3)
+    found = list(fits(periods, *drift, shape=creep))
+    assert all(p.status is PolesStatus.OK for p in found)
+    are_honest(found, constant_fits(periods), drift)
+    # the instant is when the mode passes its mean, before the middle
+    time_s = (np.arange(periods * SAMPLES) + 0.5) / RATE_HZ
+    passing_s = np.interp(0, creep(time_s), time_s)
+    assert passing_s < 0.46 * time_s[-1]
+    assert np.median([p.instant_s for p in found]) == pytest.approx(passing_s, rel=0.03)
+
+
+def are_honest(found, constant, drift):
     rates = np.array([[p.f0_drift_hz_per_s[0], p.damping_drift_per_s[0]] for p in found])
     of_rates = np.stack([p.drift_covariance[0] for p in found])
     poles = np.array([[p.f0_hz[0], p.damping_ratio[0]] for p in found])
@@ -93,7 +128,7 @@ def test_drift_is_estimated_with_honest_ellipses(drift, periods, structure):
 
 @pytest.mark.parametrize("periods", [2, 8])
 def test_a_constant_mode_does_not_change(periods):
-    for poles in fits(periods):
+    for poles in constant_fits(periods):
         assert poles.f0_drift_hz_per_s is None
         assert poles.drift_covariance is None
         assert poles.instant_s is None

@@ -12,7 +12,7 @@ from tactile_resonance.simulation.bimorph import couple
 from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
 from tactile_resonance.simulation.lines import Lines
 from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.varying import VaryingStream
+from tactile_resonance.simulation.varying import INTERVAL_S, VaryingStream
 
 RADIUS = 2.5e-3
 IDEAL = BenchEffects.none()
@@ -82,7 +82,9 @@ def test_changing_contact_satisfies_the_changing_differential_equation(sensor, l
     expected = systems[0][2] @ solution.y + d * np.array([drive(lines, t) for t in times])
     poles = pole_trajectory(sensor, history, [0.0, 0.05, 0.4, 0.5])
     speed = abs(poles[1] - poles[0]) / 0.05
-    stated = speed / poles[0].real ** 2 + (speed * 0.1 / poles[0].real) ** 2 / 8
+    stated = speed * INTERVAL_S**2 / 12
+    # without the lag of the resonance it would be more
+    assert stated < 0.7 * speed / poles[0].real ** 2
     error = np.abs(found[:25_000:5] - expected).max() / np.abs(expected).max()
     assert error < stated
     # and the change itself is far larger: the first contact throughout would be wrong
@@ -91,17 +93,16 @@ def test_changing_contact_satisfies_the_changing_differential_equation(sensor, l
     assert np.abs(still[:25_000:5] - expected).max() / np.abs(expected).max() > 5 * error
 
 
-def test_creep_of_the_library_is_slow_for_the_blend(sensor, library):
-    """What the blend leaves out from 1 s on: at most 2e-3 of the resonance, on cortex."""
+def test_creep_of_the_library_is_slow_for_the_steps(sensor, library):
+    """How far the steps are off from 1 s on: at most 1.1e-3 of the resonance."""
     stated = {}
     for name in ("gel10", "white", "cortex", "liver"):
         history = ContactHistory.under_force(library[name], RADIUS, library.contact, duration_s=3.2)
         poles = pole_trajectory(sensor, history, [0.0, 0.02])
         speed = abs(poles[1] - poles[0]) / 0.02  # fastest at the start
-        stated[name] = speed / poles[0].real ** 2 + (speed * 0.1 / poles[0].real) ** 2 / 8
-    assert max(stated, key=stated.get) == "cortex"
-    assert 1e-3 < stated["cortex"] < 2e-3
-    assert stated["gel10"] < 3e-4
+        stated[name] = speed * INTERVAL_S**2 / 12
+    assert 5e-4 < max(stated.values()) < 1.1e-3
+    assert stated["gel10"] < 1e-4
 
 
 def test_contact_at_rest_is_the_exact_response(bench, library, sensor, multisine):
