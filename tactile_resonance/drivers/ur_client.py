@@ -62,7 +62,9 @@ class Client:
         self._session: Session | None = None
         self._clock: SimulatedClock | None = None
         self._led = False  # the owner states how far simulated time may go
-        self._fed_ns = 0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
+        self._fed_ns = (
+            0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
+        )
         self._until_ns = 0  # up to when simulated time may go on
         # number and deceleration of a stop that the robot has not taken yet
         self._owed: tuple[int, float] | None = None
