@@ -162,7 +162,9 @@ class ForceRecord:
             rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
         reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, spans.coverage)
         if reason:
-            return ForceOver(math.nan, math.nan, spans.coverage, position_m, rotation_rad, reason)
+            return ForceOver(
+                math.nan, math.nan, spans.coverage, position_m, rotation_rad, reason
+            )
         heard = np.count_nonzero((times >= t0_ns) & (times <= t1_ns) & np.isfinite(rows[:, 0]))
         std_n = math.nan
         if heard >= LEAST_WRENCHES:

@@ -318,7 +318,7 @@ class CanWrench:
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
         """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
-        return frame[0] in self._ids and frame[4:] == self._kind
+        return frame.can_id in self._ids and frame[4:] == self._kind
 
     def _stamp_ns(self, frame: Frame) -> int:
         clock, tracker = self.clock, self._tracker
