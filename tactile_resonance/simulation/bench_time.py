@@ -21,7 +21,7 @@ START_NS = 1_000_000_000
 STALL_S = 0.010
 """On the wall clock a step that begins later than this is a stall: what ran meanwhile is not to be trusted."""
 AT_REST_LATE_NS = 4_000_000
-"""On the wall clock, at rest, steps begin up to this late, several at a time: a wake-up costs as much as two."""
+"""On the wall clock, at rest, steps begin up to this late, several at once: a wake-up costs as much as two."""
 REPEAT_S = 0.05
 """While time stands the newest data are sent again after so long, on this machine's clock [s]."""
 PACKETS_WITHIN_S = 0.5
