@@ -112,9 +112,8 @@ class CanDescription:
             if values[at] != wanted:
                 return None
         counts = self._counts_of(values)
-        over = self._overload_at is not None and bool(
-            values[self._overload_at] & self.overload[1]  # type: ignore[index]
-        )
+        flags = self._overload_bits
+        over = flags is not None and values[flags[0]] & flags[1] != 0
         full_scale, invalid = self.full_scale_counts, self.invalid_counts
         if full_scale is not None and (max(counts) >= full_scale or min(counts) <= -full_scale):
             over |= any(abs(count) >= full_scale and count not in invalid for count in counts)
@@ -135,8 +134,12 @@ class CanDescription:
         return tuple((self.fields.index(name), value) for name, value in self.constant.items())
 
     @cached_property
-    def _overload_at(self) -> int | None:
-        return None if self.overload is None else self.fields.index(self.overload[0])
+    def _overload_bits(self) -> tuple[int, int] | None:
+        """Where they are among the values, and their mask."""
+        if self.overload is None:
+            return None
+        name, mask = self.overload
+        return self.fields.index(name), mask
 
 
 class Assembler:
@@ -168,11 +171,11 @@ class Assembler:
 
         Frames of others are passed over.
         """
-        if can_id not in self._ids:
-            return None
         parts, ids = self._parts, self._ids
-        late = bool(parts) and not abs(time_s - self._first_s) <= self._within_s
-        if can_id != ids[len(parts)] or late:
+        if can_id not in ids:
+            return None
+        late = parts and not abs(time_s - self._first_s) <= self._within_s
+        if late or can_id != ids[len(parts)]:
             self.lost += 1
             parts.clear()
             if can_id != ids[0]:
@@ -182,9 +185,8 @@ class Assembler:
         parts.append(data)
         if len(parts) < len(ids):
             return None
-        whole = b"".join(parts)
-        parts.clear()
-        return whole
+        self._parts = []
+        return b"".join(parts)
 
 
 def read_can_description(path: Path) -> CanDescription:

@@ -132,7 +132,7 @@ class ContactNode(ManagedNode):
         if from_poles:
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
-        self.every(FEEDBACK_EVERY_S, self._tell)
+        self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
         self.act(
             MakeContact,
             "make_contact",
@@ -153,7 +153,9 @@ class ContactNode(ManagedNode):
             self._limits,
             self._tip,
             self._on_cycle,
+            self._news.trigger,
         )
+        self._teller.reset()
 
     def deactivate(self) -> None:
         """Draw the tip back and end the loop."""
@@ -305,6 +307,10 @@ class ContactNode(ManagedNode):
             self.fail(f"{self._fault}; connecting anew")
             return
         goal, controller = self._goal, thread.controller
+        if goal is None and controller.state is State.IDLE and not thread.clock.simulated:
+            self._teller.cancel()  # each call wakes the executor, and the loop tells what changes
+        elif self._teller.is_canceled():
+            self._teller.reset()
         if goal is None:
             return
         ended = (State.RETRACT, State.FAULT, State.IDLE)

@@ -41,6 +41,8 @@ class ContactThread:
     tip : TipGeometry
     listener : callable
         Called with each cycle in the loop's thread; must return at once.
+    failed : callable
+        Called in that thread where the loop has ended with an error.
 
     Attributes
     ----------
@@ -56,10 +58,11 @@ class ContactThread:
         limits: Limits,
         tip: TipGeometry,
         listener: Callable[[Cycle], None],
+        failed: Callable[[], None],
     ) -> None:
         self.controller = ContactController(parameters, limits, tip)
         self.error: Exception | None = None
-        self._arm, self._force = arm, force
+        self._arm, self._force, self._failed = arm, force, failed
         self._lock = threading.Lock()
         self._running = True
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
@@ -162,6 +165,7 @@ class ContactThread:
             with contextlib.suppress(Exception):
                 self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
             self.error = error
+            self._failed()
         finally:
             if self._led is not None:
                 with contextlib.suppress(Exception):

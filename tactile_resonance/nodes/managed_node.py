@@ -205,10 +205,11 @@ class ManagedNode(LifecycleNode):
             self.resources.callback(made.close)
         return made.close
 
-    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+    def every(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Timer until the node is cleaned up; called while it is active, by this machine's clock."""
         timer = self.steady_timer(period_s, lambda: callback() if self.active else None)
         self.resources.callback(self.destroy_timer, timer)
+        return timer
 
     def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Timer by this machine's clock, whether time is simulated or not."""

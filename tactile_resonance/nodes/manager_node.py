@@ -93,11 +93,11 @@ class ManagerNode(Node):
             raise ValueError("nodes: empty, expected names of nodes")
         self._wanted_up = True
         self._was_up = False
-        self._quiet_until_s = 0.0
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/shut_down", self._on_shut_down)
-        self.create_timer(TICK_S, self._on_timer, clock=STEADY)
+        self.create_timer(QUIET_S, self._tick, clock=STEADY)
+        self._often = self.create_timer(TICK_S, self._tick, clock=STEADY)  # until all are up
 
     def _managed(self, name: str) -> _Managed:
         node = _Managed(
@@ -136,12 +136,7 @@ class ManagerNode(Node):
         self._see(node, state)
         self._tick()
 
-    def _on_timer(self) -> None:
-        if not self._was_up or time.monotonic() >= self._quiet_until_s:
-            self._tick()
-
     def _tick(self) -> None:
-        self._quiet_until_s = time.monotonic() + QUIET_S
         ready = State.PRIMARY_STATE_ACTIVE if self._wanted_up else State.PRIMARY_STATE_UNCONFIGURED
         moves = _UP if self._wanted_up else _DOWN
         clear = True  # whether all nodes before have come as far as they should
@@ -151,6 +146,10 @@ class ManagerNode(Node):
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
         self._was_up = clear and self._wanted_up
+        if self._was_up:
+            self._often.cancel()
+        elif self._often.is_canceled():
+            self._often.reset()
 
     def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
         """One step of one node: an answer taken, or a question asked."""

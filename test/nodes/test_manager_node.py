@@ -64,6 +64,7 @@ class Stack:
 @pytest.fixture
 def stack(monkeypatch):
     monkeypatch.setattr(manager_node, "TICK_S", 3600.0)
+    monkeypatch.setattr(manager_node, "QUIET_S", 3600.0)
     names = ("first", "second", "third")
     arguments = ["--ros-args", "-p", f"manager_node:nodes:=[{','.join(names)}]"]
     with initialised(args=arguments, domain_id=free_domain_id(os.environ)):

@@ -298,3 +298,44 @@ def test_on_the_wall_clock_steps_keep_the_pace_and_say_what_was_lost():
     passed_s = times_s[-1] - times_s[0]
     assert passed_s == pytest.approx(59 * STEP_NS * 1e-9 + sum(lost_s), abs=0.03)
     assert bench.now_ns == START_NS + 60 * STEP_NS
+
+
+class Waits:
+    """A reactor and a machine's clock in one: waits take the time asked for, or until somebody speaks."""
+
+    def __init__(self, speaks_ns):
+        self.now_ns, self._speaks_ns = 0, list(speaks_ns)
+
+    def perf_counter_ns(self):
+        return self.now_ns
+
+    def serve(self, wait_s, *, patient=True):
+        end_ns = self.now_ns + round(1e9 * wait_s)
+        spoken = patient and self._speaks_ns and self._speaks_ns[0] <= end_ns
+        self.now_ns = max(self.now_ns, self._speaks_ns.pop(0)) if spoken else end_ns
+        return bool(spoken)
+
+
+def test_at_rest_steps_come_together_until_somebody_speaks(monkeypatch):
+    rest_ns, late_ns = 100 * STEP_NS, bench_time.AT_REST_LATE_NS
+    spoken_ns = 60 * STEP_NS + 300_000
+    waits = Waits([spoken_ns])
+    monkeypatch.setattr(bench_time, "time", waits)
+    bench = BenchTime(waits, STEP_NS, simulated=False)
+    bench.at_rest = lambda: waits.now_ns < rest_ns
+    begun_ns = []
+
+    def step():
+        begun_ns.append(waits.now_ns)
+        if len(begun_ns) == 150:
+            bench.stop()
+
+    bench.steps.append(step)
+    bench.run()
+    late = [begun - k * STEP_NS for k, begun in enumerate(begun_ns)]
+    assert all(0 <= each <= late_ns for each in late)  # the robot's time keeps to the machine's
+    assert len(set(begun_ns[:60])) <= 1 + 60 / (1 + late_ns / STEP_NS)  # so few wake-ups
+    # what is said meets the next step, at its time; as soon as something moves each comes at its time
+    assert min(begun for begun in begun_ns if begun > spoken_ns) == 61 * STEP_NS
+    assert set(late[102:]) == {0}
+    assert bench.pace.stalls == 0

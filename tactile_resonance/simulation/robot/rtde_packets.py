@@ -13,6 +13,7 @@ from enum import IntEnum
 from typing import Any
 
 PROTOCOL_VERSION = 2
+_HEAD = struct.Struct(">HB")
 LONGEST_PAYLOAD = 0xFFFF - 3
 
 # type -> struct code and count
@@ -47,14 +48,14 @@ def packet(kind: Kind, payload: bytes) -> bytes:
     """Return a packet with its header; ValueError where it does not fit into one."""
     if len(payload) > LONGEST_PAYLOAD:
         raise ValueError(f"RTDE packet: {len(payload)} bytes, expected at most {LONGEST_PAYLOAD}")
-    return struct.pack(">HB", 3 + len(payload), kind) + payload
+    return _HEAD.pack(3 + len(payload), kind) + payload
 
 
 class PacketReader:
     """Cuts a stream of bytes into packets."""
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
+        self._buffer = b""
 
     def add(self, data: bytes) -> Iterator[tuple[int, bytes]]:
         """Yield the type and payload of each packet that is complete.
@@ -66,13 +67,12 @@ class PacketReader:
         """
         self._buffer += data
         while len(self._buffer) >= 3:
-            size, kind = struct.unpack_from(">HB", self._buffer)
+            size, kind = _HEAD.unpack_from(self._buffer)
             if size < 3:
                 raise ValueError(f"RTDE packet: size {size}, expected at least 3")
             if len(self._buffer) < size:
                 return
-            payload = bytes(self._buffer[3:size])
-            del self._buffer[:size]
+            payload, self._buffer = self._buffer[3:size], self._buffer[size:]
             yield kind, payload
 
 
