@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
-from tactile_resonance.contact.vectors import Six
+from tactile_resonance.contact.vectors import Six, six
 
 
 class CommandLimits(Protocol):
@@ -32,16 +32,15 @@ class CommandLimits(Protocol):
 def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:
     """Return a twist [m/s, rad/s] as floats; ``ValueError`` where it is not finite or beyond a limit."""
     values = tuple(map(float, twist))
-    if len(values) != 6 or not math.isfinite(sum(values)):
+    if len(values) != 6 or not all(map(math.isfinite, values)):
         raise ValueError(f"twist: {values}, expected 6 finite numbers")
-    x, y, z, turn_x, turn_y, turn_z = values
-    for name, size, most in (
-        ("speed", math.hypot(x, y, z), limits.max_speed_m_s),
-        ("turn", math.hypot(turn_x, turn_y, turn_z), limits.max_turn_rad_s),
+    for name, part, most in (
+        ("speed", values[:3], limits.max_speed_m_s),
+        ("turn", values[3:], limits.max_turn_rad_s),
     ):
-        if size > most:
-            raise ValueError(f"{name}: {size:g}, the configuration allows {most:g}")
-    return x, y, z, turn_x, turn_y, turn_z
+        if math.hypot(*part) > most:
+            raise ValueError(f"{name}: {math.hypot(*part):g}, the configuration allows {most:g}")
+    return six(values)
 
 
 def check_acceleration(value: float, limits: CommandLimits) -> None:

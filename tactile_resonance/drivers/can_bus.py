@@ -134,14 +134,26 @@ class SocketcandBus:
         frames = []
         for message in messages:
             words = message.split()
-            if len(words) < 4 or words[1] not in (b"frame", b"error"):
+            if len(words) < 4:
                 continue
             _, kind, number, stamp, *data = words
+            if kind not in (b"frame", b"error"):
+                continue
             is_error = kind == b"error"
             try:
                 values = b"" if is_error else unhexlify(b"".join(data))
-                can_id, stamp_s, extended = int(number, 16), float(stamp), len(number) > 3
-                frames.append(Frame(can_id, values, stamp_s, arrival_ns, extended, False, is_error))
+                extended = len(number) > 3
+                frames.append(
+                    Frame(
+                        int(number, 16),
+                        values,
+                        float(stamp),
+                        arrival_ns,
+                        extended,
+                        False,
+                        is_error,
+                    )
+                )
             except (ValueError, HexError) as error:
                 text = message.decode("ascii", "replace")
                 raise ConnectionError(f"the server sends {text!r}") from error

@@ -112,8 +112,9 @@ class CanDescription:
             if values[at] != wanted:
                 return None
         counts = self._counts_of(values)
-        flags = self._overload_bits
-        over = flags is not None and values[flags[0]] & flags[1] != 0
+        over = self._overload_at is not None and bool(
+            values[self._overload_at] & self.overload[1]  # type: ignore[index]
+        )
         full_scale, invalid = self.full_scale_counts, self.invalid_counts
         if full_scale is not None and (max(counts) >= full_scale or min(counts) <= -full_scale):
             over |= any(abs(count) >= full_scale and count not in invalid for count in counts)
@@ -134,12 +135,8 @@ class CanDescription:
         return tuple((self.fields.index(name), value) for name, value in self.constant.items())
 
     @cached_property
-    def _overload_bits(self) -> tuple[int, int] | None:
-        """Where they are among the values, and their mask."""
-        if self.overload is None:
-            return None
-        name, mask = self.overload
-        return self.fields.index(name), mask
+    def _overload_at(self) -> int | None:
+        return None if self.overload is None else self.fields.index(self.overload[0])
 
 
 class Assembler:
@@ -171,11 +168,11 @@ class Assembler:
 
         Frames of others are passed over.
         """
-        parts, ids = self._parts, self._ids
-        if can_id not in ids:
+        if can_id not in self._ids:
             return None
-        late = parts and not abs(time_s - self._first_s) <= self._within_s
-        if late or can_id != ids[len(parts)]:
+        parts, ids = self._parts, self._ids
+        late = bool(parts) and not abs(time_s - self._first_s) <= self._within_s
+        if can_id != ids[len(parts)] or late:
             self.lost += 1
             parts.clear()
             if can_id != ids[0]:
@@ -185,8 +182,9 @@ class Assembler:
         parts.append(data)
         if len(parts) < len(ids):
             return None
-        self._parts = []
-        return b"".join(parts)
+        whole = b"".join(parts)
+        parts.clear()
+        return whole
 
 
 def read_can_description(path: Path) -> CanDescription:

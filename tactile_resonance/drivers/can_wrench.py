@@ -58,8 +58,6 @@ class CanWrench:
         diagonal = [row[k] for k, row in enumerate(self._scale)]
         crosstalk = sum(map(abs, sum(self._scale, ()))) > sum(map(abs, diagonal))
         self._diagonal = None if crosstalk else diagonal
-        self._ids = config.can.description.frame_ids
-        self._kind = (config.can.description.extended_ids, False, False)  # neither remote nor error
         self._begin()
 
     @property
@@ -248,18 +246,12 @@ class CanWrench:
         self._ahead = []
         samples: list[CellSample] = []
         silent_s, stamped = self._config.limits.silent_s, self._can.stamps == "adapter"
-        assembler = self._assembler
-        lost = assembler.lost
-        for frame in frames:  # of a cell at 1 kHz four a period: as few calls as may be
+        for frame in frames:
             if frame.error:
                 raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
             stamp_s = frame.stamp_s
             if self._is_of_the_cell(frame):
-                whole = assembler.add(frame.can_id, frame.data, stamp_s)
-                if assembler.lost > lost:
-                    lost = assembler.lost
-                    self._checks.lost()
-                sample = None if whole is None else self._sample(whole, frame)
+                sample = self._take(frame)
                 if sample is not None:
                     samples.append(sample)
                     self._last_stamp_s = stamp_s
@@ -299,9 +291,13 @@ class CanWrench:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
-    def _sample(self, whole: bytes, last: Frame) -> CellSample | None:
-        """The wrench of joined frames, None where they are another answer. Raises `ForceError`."""
-        decoded = self._can.description.decode(whole)
+    def _take(self, frame: Frame) -> CellSample | None:
+        """The wrench that this frame of the cell completes, or None. Raises `ForceError`."""
+        lost = self._assembler.lost
+        whole = self._assembler.add(frame.can_id, frame.data, frame.stamp_s)
+        if self._assembler.lost > lost:
+            self._checks.lost()
+        decoded = None if whole is None else self._can.description.decode(whole)
         if decoded is None:
             return None
         counts, full_scale = decoded
@@ -314,23 +310,28 @@ class CanWrench:
             wrench = tuple([sum(map(mul, row, counts)) for row in self._scale])
         overload = self._checks.check(wrench, full_scale)
         self.received += 1
-        return CellSample(self._stamp_ns(last), wrench, overload)
+        return CellSample(self._stamp_ns(frame), wrench, overload)
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
         """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
-        return frame.can_id in self._ids and frame[4:] == self._kind
+        description = self._can.description
+        return (
+            frame.can_id in description.frame_ids
+            and frame.extended == description.extended_ids
+            and not frame.remote
+            and not frame.error
+        )
 
     def _stamp_ns(self, frame: Frame) -> int:
-        clock, tracker = self.clock, self._tracker
-        arrival_ns = clock.now_ns() if clock.simulated else frame.arrival_ns
+        arrival_ns = self.clock.now_ns() if self.clock.simulated else frame.arrival_ns
         if self._can.stamps == "arrival":
             delay_s = self._can.shortest_delay_s + self._config.latency_s
             # those that were taken together came one after the other
             stamp_ns = max(arrival_ns - round(delay_s * 1e9), self._stamp_before_ns + 1)
             self._stamp_before_ns = stamp_ns
             return stamp_ns
-        tracker.add(frame.stamp_s, arrival_ns)
-        stamp_ns = tracker.to_local_ns(frame.stamp_s)
+        self._tracker.add(frame.stamp_s, arrival_ns)
+        stamp_ns = self._tracker.to_local_ns(frame.stamp_s)
         # a relation that has become better may be earlier by more than a period, but the order in which
         # the wrenches were taken is certain; a step is none of the relation's, and left to be seen
         if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:

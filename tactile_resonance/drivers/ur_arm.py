@@ -432,15 +432,15 @@ class UrArm:
         if not self._sent:
             return
         exchange, sent = self._client.exchange, self._sent
-        done, refused = exchange.done, exchange.refused
+        done = exchange.done
         for number in [number for number in sent if number <= done]:
-            kind, _ = sent.pop(number)
-            if number != refused or number <= self._refused:
+            name = {SPEED: "speed", STOP: "stop"}[sent.pop(number)[0]]
+            if number != exchange.refused or number <= self._refused:
                 continue
             self._refused = number
             if self._states.fault is not None:
                 return  # because of a stop, which the state reports
-            name, said = {SPEED: "speed", STOP: "stop"}[kind], self._client.last_error()
+            said = self._client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
         if self._time.led is None and sent:
             oldest_s = next(iter(sent.values()))[1]

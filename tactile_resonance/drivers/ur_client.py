@@ -201,11 +201,6 @@ class Client:
         seen_s = self._exchange.silence_s()
         return seen_s < HEALTHY_S and Seen.FRESH in self._exchange.seen
 
-    @property
-    def _faulty(self) -> bool:
-        """Whether the owner lives and sees a robot in a state that forbids motion."""
-        return Seen.FAULTY in self._exchange.seen and self._healthy
-
     def _do(self, action: Callable[[], bool]) -> bool:
         try:
             done = action()
@@ -236,7 +231,8 @@ class Client:
     def _keep_alive(self, session: Session) -> None:
         """Keep the watchdog quiet while nothing moves or the owner lives."""
         config, motion = session.config, session.motion
-        if self._owed is None and motion.commanded and self._faulty:
+        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
+        if faulty and self._owed is None and motion.commanded:
             # what was under way is not to go on, should the program do so
             motion.rest(config.max_acceleration_m_s2)
             self._owed = 0, config.max_acceleration_m_s2
@@ -254,7 +250,8 @@ class Client:
 
     def _feed(self, session: Session) -> None:
         """Keep the watchdog quiet, where the program runs that has one."""
-        if not self._faulty and session.listening:
+        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
+        if not faulty and session.listening:
             with contextlib.suppress(Exception):
                 session.motion.feed()
 

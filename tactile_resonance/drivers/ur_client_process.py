@@ -57,8 +57,6 @@ class ClientProcess:
             self.exchange.beat()
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the client
             self._commands = ours
-            self._hung_up = select.poll()  # reports the end of the client's side, and nothing else
-            self._hung_up.register(ours, 0)
             self._process = subprocess.Popen(
                 [
                     sys.executable,
@@ -82,7 +80,7 @@ class ClientProcess:
     def look(self) -> None:
         """Give the client a sign of life; raise `ArmError` where the client is gone."""
         with self._using:
-            if not self._ended and not self._hung_up.poll(0):
+            if not self._ended and self._process.poll() is None:
                 self.exchange.beat()
                 return
         raise self._death()

@@ -25,14 +25,13 @@ _STOPS = (
     (3, ArmFault.PROTECTIVE_STOP, "recovery mode"),
     (10, ArmFault.PROTECTIVE_STOP, "stopped by the safety system"),
 )
-_STOP_BITS = sum(1 << bit for bit, _, _ in _STOPS)
 
 
 def stop_fault(safety_bits: int, robot_mode: int) -> tuple[ArmFault, str] | None:
     """Return why the arm cannot move whatever program runs; None where it can."""
-    if safety_bits & _STOP_BITS:
-        fault, text = next((fault, text) for bit, fault, text in _STOPS if safety_bits >> bit & 1)
-        return fault, f"{text} (safety_status_bits {safety_bits:#x})"
+    for bit, fault, text in _STOPS:
+        if safety_bits >> bit & 1:
+            return fault, f"{text} (safety_status_bits {safety_bits:#x})"
     if robot_mode != ROBOT_RUNNING:
         name = _ROBOT_MODES.get(robot_mode, "unknown")
         return (

@@ -20,8 +20,6 @@ START_NS = 1_000_000_000
 """Time at which a bench begins [ns]; not 0, which in ROS means that no time is known."""
 STALL_S = 0.010
 """On the wall clock a step that begins later than this is a stall: what ran meanwhile is not to be trusted."""
-AT_REST_LATE_NS = 4_000_000
-"""On the wall clock, at rest, steps begin up to this late, several at once: a wake-up costs as much as two."""
 REPEAT_S = 0.05
 """While time stands the newest data are sent again after so long, on this machine's clock [s]."""
 PACKETS_WITHIN_S = 0.5
@@ -146,8 +144,6 @@ class BenchTime:
         of the bus sent to it.
     packets_arrived : callable
         Number of packets that the robot has received since the start; None while it is not connected.
-    at_rest : callable
-        On the wall clock: whether what the next steps bring may wait until somebody sends something.
     pace : Pace
     """
 
@@ -160,7 +156,6 @@ class BenchTime:
         self.robot_sent_ns: Callable[[int], int] = lambda port: 0
         self.frames_sent: Callable[[int], int] = lambda port: 0
         self.packets_arrived: Callable[[], int | None] = lambda: None
-        self.at_rest: Callable[[], bool] = lambda: False
         self.pace = Pace()
         self.simulated = simulated
         self._reactor, self._step_ns = reactor, step_ns
@@ -251,19 +246,14 @@ class BenchTime:
 
     def _run_on_the_wall_clock(self) -> None:
         due_ns = time.perf_counter_ns()
-        heard = False  # somebody has sent something since the last step
         while not self._stopping:
             wait_ns = due_ns - time.perf_counter_ns()
             if wait_ns > 0:
-                rests = not heard and self.at_rest()
-                if rests:  # whoever speaks is heard at once, and meets the step that was due next
-                    wait_ns += AT_REST_LATE_NS
-                heard = self._reactor.serve(wait_ns * 1e-9, patient=rests) or heard
+                self._reactor.serve(wait_ns * 1e-9, patient=False)
                 continue
             self._reactor.serve(0.0)
             due_ns = self._next_due(due_ns, time.perf_counter_ns())
             self._step()
-            heard = False
 
     def _run_simulated(self) -> None:
         due_ns = time.perf_counter_ns()

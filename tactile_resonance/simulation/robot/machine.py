@@ -171,11 +171,6 @@ class Machine:
         return difference(ZERO, self.posture.torques(self.tcp[1], self.tcp_force))
 
     @property
-    def at_rest(self) -> bool:
-        """Steady, and nothing touches the tip."""
-        return self.steady and (self.environment is None or not any(self.environment.force_n))
-
-    @property
     def steady(self) -> bool:
         """At rest, with no speed asked for, for half a second."""
         return self._rest_cycles >= STEADY_CYCLES

@@ -60,8 +60,12 @@ class Program:
         machine.force_mode.damping = _DAMPING
         self._script = Script(registers, offset)
         self._commands = Commands(self._script, machine)
-        self.command_register = f"input_int_register_{offset}"
         self._main = self._loop()
+
+    @property
+    def command_register(self) -> str:
+        """RTDE name of the register that carries the commands."""
+        return f"input_int_register_{self._script.offset}"
 
     @property
     def watchdog_s(self) -> float | None:

@@ -220,22 +220,20 @@ class Reactor:
         self.renew()
         return listener.port
 
-    def serve(self, wait_s: float, *, patient: bool = True) -> bool:
+    def serve(self, wait_s: float, *, patient: bool = True) -> None:
         """Wait for at most so long until somebody has sent something, and serve all who have.
 
-        `patient` false: without the connections that are patient. Returns whether anybody was served.
+        `patient` false: without the connections that are patient.
         """
         if self.unsent:
             for connection in list(self.unsent):
                 connection.flush()
         readers = self._readers
         heard = self._descriptors if patient else self._impatient
-        ready = select.select(heard, [], [], wait_s)[0]
-        for descriptor in ready:
+        for descriptor in select.select(heard, [], [], wait_s)[0]:
             # one served before may have closed another
             if descriptor in readers:
                 readers[descriptor]()
-        return bool(ready)
 
     def freeze(self, frozen: bool) -> None:
         """Let no packet of the freezable ports pass, or let them pass again."""

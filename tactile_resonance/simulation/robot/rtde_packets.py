@@ -13,7 +13,6 @@ from enum import IntEnum
 from typing import Any
 
 PROTOCOL_VERSION = 2
-_HEAD = struct.Struct(">HB")
 LONGEST_PAYLOAD = 0xFFFF - 3
 
 # type -> struct code and count
@@ -48,14 +47,14 @@ def packet(kind: Kind, payload: bytes) -> bytes:
     """Return a packet with its header; ValueError where it does not fit into one."""
     if len(payload) > LONGEST_PAYLOAD:
         raise ValueError(f"RTDE packet: {len(payload)} bytes, expected at most {LONGEST_PAYLOAD}")
-    return _HEAD.pack(3 + len(payload), kind) + payload
+    return struct.pack(">HB", 3 + len(payload), kind) + payload
 
 
 class PacketReader:
     """Cuts a stream of bytes into packets."""
 
     def __init__(self) -> None:
-        self._buffer = b""
+        self._buffer = bytearray()
 
     def add(self, data: bytes) -> Iterator[tuple[int, bytes]]:
         """Yield the type and payload of each packet that is complete.
@@ -67,12 +66,13 @@ class PacketReader:
         """
         self._buffer += data
         while len(self._buffer) >= 3:
-            size, kind = _HEAD.unpack_from(self._buffer)
+            size, kind = struct.unpack_from(">HB", self._buffer)
             if size < 3:
                 raise ValueError(f"RTDE packet: size {size}, expected at least 3")
             if len(self._buffer) < size:
                 return
-            payload, self._buffer = self._buffer[3:size], self._buffer[size:]
+            payload = bytes(self._buffer[3:size])
+            del self._buffer[:size]
             yield kind, payload
 
 

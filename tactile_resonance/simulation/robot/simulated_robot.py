@@ -70,7 +70,6 @@ class SimulatedRobot:
         self.time.stalled.append(self._stood_still)
         self.time.robot_sent_ns = self.rtde.sent_ns
         self.time.packets_arrived = self._packets_arrived
-        self.time.at_rest = lambda: controller.machine.at_rest
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
             self.reactor.listen(dashboard.PORT, dashboard.DashboardServer(controller).serve)
