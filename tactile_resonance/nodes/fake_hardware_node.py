@@ -312,17 +312,16 @@ class FakeHardwareNode(ManagedNode):
     ) -> Callable[[Block, int], None]:
         """What publishes a block at its end.
 
-        A contact that creeps has its truth with every block: that of the middle of all blocks so far, with
-        the stamp that their poles will have, and the plant's mean force over them.
+        A contact that creeps has its truth with every block: the mean over all blocks so far, with the stamp
+        that their poles will have, and the plant's mean force over them.
         """
 
         def hand_out(block: Block, end_ns: int) -> None:
             if tip.creeping:
-                half_s = (block.index + 1) * excitation.period_s / 2
-                middle = replace(tip, since_s=tip.since_s + half_s)
-                pose.header.stamp = time_message(start_ns + round(half_s * 1e9))
+                over_s = (block.index + 1) * excitation.period_s
+                pose.header.stamp = time_message(start_ns + round(over_s / 2 * 1e9))
                 force_n = self._plant_force_n(start_ns, end_ns)
-                self._truth.publish(pose, middle, excitation.measurement_id, force_n)
+                self._truth.publish(pose, tip, excitation.measurement_id, force_n, over_s)
             record = bench_record(block, excitation, start_ns, self._frame_id)
             self._blocks.publish(record_to_message(record))
 

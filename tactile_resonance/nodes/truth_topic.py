@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
@@ -19,6 +22,9 @@ from tactile_resonance.record import Origin
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_tip import BenchTip
 from tactile_resonance.simulation.truth import truth_of
+
+_AT, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_PARTS = (_AT + 1) / 2
 
 
 class TruthTopic:
@@ -43,6 +49,7 @@ class TruthTopic:
         tip: BenchTip,
         measurement_id: int = 0,
         force_n: float | None = None,
+        over_s: float = 0.0,
     ) -> None:
         """Publish the modes of a tip at a pose and its time.
 
@@ -54,13 +61,21 @@ class TruthTopic:
             Of the measurement whose poles they are; 0: of none.
         force_n : float, optional
             Force to be stated with them [N], where it is not that of the tip.
+        over_s : float
+            Of a contact that creeps the means over so long, as an estimate has them [s]; 0: as it is.
         """
-        modes = truth_of(tip.coupled(self._bench), ()).modes
+        tips = [replace(tip, since_s=tip.since_s + over_s * part) for part in _PARTS]
+        modes = [truth_of(each.coupled(self._bench), ()).modes for each in (tips if over_s else [tip])]
+
+        def mean(name: str) -> npt.NDArray:
+            values = np.array([[getattr(mode, name) for mode in at] for at in modes])
+            return np.asarray(np.average(values, axis=0, weights=_WEIGHTS if over_s else None))
+
         truth = Poles(
-            poles_rad_s=np.array([mode.pole_rad_s for mode in modes]),
-            f0_hz=np.array([mode.f0_hz for mode in modes]),
-            damping_ratio=np.array([mode.damping_ratio for mode in modes]),
-            residues=np.array([mode.residue_rad_s for mode in modes]),
+            poles_rad_s=mean("pole_rad_s"),
+            f0_hz=mean("f0_hz"),
+            damping_ratio=mean("damping_ratio"),
+            residues=mean("residue_rad_s"),
             method="simulation",
             status=PolesStatus.TRUTH,
             message="exact poles of the simulated sensor on this tissue",

@@ -22,7 +22,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PointTruth:
-    """The true mode of one point, in the middle of its measurement: contacts creep.
+    """The true mode of one point, the mean over its measurement: contacts creep.
 
     Attributes
     ----------
