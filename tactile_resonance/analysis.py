@@ -93,6 +93,7 @@ def analyse(
     """
     if poles_method not in POLES_METHODS:
         raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
+    recording.require_driven()
     structure = structure or ModelStructure()
     warnings = list(recording.notes)
     start = time.perf_counter()

@@ -118,7 +118,9 @@ class Excitation:
         return np.fft.irfft(self.spectrum() * n, n)
 
     def crest_factor(self) -> float:
-        """Peak over root mean square of the sampled period."""
+        """Peak over root mean square of the sampled period; NaN where nothing is played."""
+        if self.level_v == 0:
+            return float("nan")
         return float(np.max(np.abs(self.period())) / self.level_v)
 
 

@@ -111,6 +111,8 @@ class ReplayDevice:
         """
         asked = excitations[0]
         if self._file is not None:
+            if asked.level_v == 0:
+                raise DeviceError(f"replay: {self._path} holds no silent record")
             if self._next > 0:
                 raise DeviceError(f"replay: the recording is over: {self._path} was played")
             self._next_after = 1
@@ -120,7 +122,7 @@ class ReplayDevice:
                 "label": asked.label or self._path.name,
             }
             return [replace(excitation, **named) for excitation in self._file.excitations]
-        self._measurement = self._find(asked.measurement_id)
+        self._measurement = self._find(asked)
         last = self._measurement.records[-1]
         recorded = {e.realisation: e for e in self._measurement.excitations}
         planned = []
@@ -225,14 +227,19 @@ class ReplayDevice:
         self._closed = True
         self.stop()
 
-    def _find(self, measurement_id: int) -> StoredMeasurement:
-        """The one named, or the next that holds a record."""
+    def _find(self, asked: Excitation) -> StoredMeasurement:
+        """The one named, or the next that holds a record and was driven, or silent, as is asked for."""
+        measurement_id = asked.measurement_id
         if measurement_id:
             for entry in self._entries:
                 if entry.measurement_id == measurement_id:
                     # out of turn: the turn of the others stays what it is
                     self._next_after = self._next
                     measurement = self._read(entry)
+                    if measurement.records and _is_silent(measurement) != (asked.level_v == 0):
+                        raise DeviceError(
+                            f"replay: measurement {measurement_id} is silent, or the goal is: one of them"
+                        )
                     if measurement.records:
                         return measurement
                     raise DeviceError(
@@ -242,13 +249,18 @@ class ReplayDevice:
             raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
         for position in range(self._next, len(self._entries)):
             measurement = self._read(self._entries[position])
-            if measurement.records:
+            if measurement.records and _is_silent(measurement) == (asked.level_v == 0):
                 self._next_after = position + 1
                 return measurement
         raise DeviceError(
             f"replay: the recording is over: all {len(self._entries)} measurements of {self._path} "
             "were played"
         )
+
+
+def _is_silent(measurement: StoredMeasurement) -> bool:
+    played = measurement.excitations
+    return bool(played) and all(excitation.level_v == 0 for excitation in played)
 
 
 def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:

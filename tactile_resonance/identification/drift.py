@@ -52,6 +52,9 @@ SAME_DRIFT = 0.02
 SAME_SHARE = 1e-4
 # Of the drift, what the changes of all else in the response move it by: .8 to 1.3 % on the simulated bench.
 SHARE_OF_OTHERS = 0.01
+# A contact, or a spring under a constant force, changes the residue by as much of itself as the pole; chance
+# would pass a limit of 1.
+MOST_OF_GAIN = 2.0
 GAIN_TOO = (
     "the gain changes over the record as well, as where contact is lost: the drift is no property of "
     "the mode"
@@ -327,8 +330,7 @@ def poles_with_drift(
     if found is not None:
         pole_rad_s = modes.fit.poles_rad_s[modes.there]
         gain, change = np.abs(drift.view(complex)[:2, :, 0])
-        # a contact changes both by about as much of themselves
-        alone = np.any(gain > change / np.abs(pole_rad_s))
+        alone = np.any(gain > MOST_OF_GAIN * change / np.abs(pole_rad_s))
         alone &= found[2].chance(drift, slice(none.size)) < FALSE_ALARM
         if alone or found[2].chance(drift) < ONE_MORE:
             poles = _result(*found)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from tactile_resonance import msg
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_frf
 from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
@@ -76,9 +76,9 @@ class PolesNode(ManagedNode):
         def fit(structure: ModelStructure) -> Poles:
             return poles_of_frf(frf, (low_hz, high_hz), structure, method)
 
-        if order == 0:
+        if order == 0 and frf.status is not FrfStatus.FAILED:
             return choose_among(fit).best
-        return fit(ModelStructure.with_residual(order, terms))
+        return fit(ModelStructure.with_residual(order or 2, terms))
 
 
 def main() -> None:

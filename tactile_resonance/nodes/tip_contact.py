@@ -183,11 +183,12 @@ class TipContact:
         return False
 
     def _on_state(self, message: msg.ContactState) -> None:
-        before, self._state = self._state, message
+        before = self._state
         if message.state == message.STATE_HOLD and (
             before is None or before.state != message.state
         ):
             self._held_ns = time_from_message(message.header.stamp)
+        self._state = message  # last: whoever sees that it is held reads since when
         if not self.stopped or message.stopped or message.instance == self._instance:
             self.stopped, self._instance = message.stopped, message.instance
         elif time.monotonic() - self._stop_asked_s > ASK_AGAIN_S:

@@ -38,6 +38,16 @@ class Recording:
         """Distance of the lines [Hz]."""
         return self.sample_rate_hz / self.u.shape[-1]
 
+    def require_driven(self) -> None:
+        """Raise ``ValueError`` where a channel is constant over a realisation: nothing was driven."""
+        for name, samples in (("u", self.u), ("y", self.y)):
+            flat = np.ptp(samples, axis=(1, 2)) == 0
+            if np.any(flat):
+                raise ValueError(
+                    f"{name}: constant ({samples[np.argmax(flat)].flat[0]:g} V), expected a channel that "
+                    "moves; of a record without drive: analyze --silent"
+                )
+
 
 def make_recording(
     u: npt.ArrayLike,
@@ -172,15 +182,10 @@ def _period_length(
 
 
 def _check_samples(samples: npt.NDArray[np.floating], name: str) -> None:
-    """Every sample finite, no realisation constant."""
+    """Every sample finite."""
     bad = samples.size - int(np.count_nonzero(np.isfinite(samples)))
     if bad:
         raise ValueError(f"{name}: {bad} samples are NaN or infinite, expected finite voltages")
-    flat = np.ptp(samples, axis=(1, 2)) == 0
-    if np.any(flat):
-        raise ValueError(
-            f"{name}: constant ({samples[np.argmax(flat)].flat[0]:g} V), expected a channel that moves"
-        )
 
 
 def _harmonics(values: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:

@@ -33,7 +33,8 @@ def read_store_recording(
     measurement_id : int, optional
         Which one; not needed where there is only one.
     periods : int, optional
-        Use the first this many of each realisation; all that were planned when absent.
+        Use the first this many of each realisation; when absent all that were planned, or as many as the
+        longest one has where the measurement ended before.
 
     Returns
     -------
@@ -43,7 +44,7 @@ def read_store_recording(
     Raises
     ------
     ValueError
-        If the measurement is not told, not there, or no realisation is complete.
+        If the measurement is not told, not there, or no realisation has the periods asked for, or any.
     OSError
         If the folder cannot be listed.
     """
@@ -56,21 +57,20 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
     Raises
     ------
     ValueError
-        If no realisation is complete.
+        If no realisation has the periods asked for, or any.
     """
     key = measurement.measurement_id
     if not measurement.excitations:
         raise ValueError(f"measurement {key}: holds no readable excitation {measurement.problems}")
     first = measurement.excitations[0]
     notes = [*measurement.problems]
-    channels: list[tuple[npt.NDArray, npt.NDArray]] = []
+    played: list[tuple[Excitation, npt.NDArray, npt.NDArray]] = []
     for excitation in measurement.excitations:
         if not _same_lines(excitation, first):
             raise ValueError(
                 f"measurement {key}: realisation {excitation.realisation} differs from realisation "
                 f"{first.realisation} in sample rate, period or lines, expected the same"
             )
-        wanted = periods or excitation.periods
         blocks = _leading_blocks(measurement, excitation.realisation)
         n = excitation.samples_per_period
         u, y = (
@@ -78,13 +78,19 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
             for name in ("actuator", "sensor")
         )
         whole = min(u.size, y.size) // n
-        if whole < wanted:
+        u, y = (x[: whole * n].reshape(whole, n) for x in (u, y))
+        played.append((excitation, u, y))
+    wanted, longest = periods or first.periods, max(len(u) for _, u, _ in played)
+    if periods is None and 0 < longest < wanted:
+        notes.append(f"the measurement ended after {longest} of {wanted} periods")
+        wanted = longest
+    for excitation, u, _ in played:
+        if len(u) < wanted:
             notes.append(
-                f"realisation {excitation.realisation} left out: {whole} of {wanted} consecutive "
+                f"realisation {excitation.realisation} left out: {len(u)} of {wanted} consecutive "
                 "periods are there"
             )
-            continue
-        channels.append((u[: wanted * n].reshape(wanted, n), y[: wanted * n].reshape(wanted, n)))
+    channels = [(u[:wanted], y[:wanted]) for _, u, y in played if len(u) >= wanted]
     if len(measurement.excitations) < first.realisations:
         notes.append(
             f"{len(measurement.excitations)} of {first.realisations} realisations were played"

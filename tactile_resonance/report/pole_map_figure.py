@@ -107,7 +107,7 @@ def _draw_plane(axes: Axes, pole_map: PoleMap, probability: float) -> None:
             if np.all(np.isfinite(p.covariance)):
                 draw_ellipse(axes, p.estimate, p.covariance, probability, color=f"C{k}", lw=0.8)
     axes.set(xlabel="f0 [Hz]", ylabel="damping ratio")
-    axes.set_title(f"poles with {100 * probability:g} % ellipses", fontsize="medium")
+    axes.set_title(f"measured poles, {100 * probability:g} % ellipses", fontsize="medium")
     axes.ticklabel_format(useOffset=False)
     axes.legend(loc="upper left")
 

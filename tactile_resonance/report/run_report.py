@@ -20,7 +20,7 @@ from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.references import SensorHealth, read_silent, sensor_health
 from tactile_resonance.scan.run_content import RunContent
-from tactile_resonance.scan.scene import DriftLimits, read_scan_scene
+from tactile_resonance.scan.scene import DriftLimits, ScanScene, read_scan_scene
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;
@@ -39,8 +39,8 @@ _COLUMNS = (
     ("z [mm]", lambda r: _number(1e3 * r.z_m, 2)),
     ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
     ("age of contact [s]", lambda r: _number(r.contact_age_s, 2)),
-    ("f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
-    ("damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
+    ("measured f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
+    ("measured damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
     ("nominal f0 [Hz]", lambda r: _with_std(r.nominal_f0_hz, r.nominal_f0_std_hz, 3)),
     (
         "nominal damping ratio",
@@ -86,7 +86,8 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
     if picture is not None:
         data = base64.b64encode(picture).decode()
         parts.append(f'<img alt="pole map" src="data:image/png;base64,{data}">')
-    health, sentence = sensor_health(run, _drift_limits(run))
+    scene = _scene_of(run)
+    health, sentence = sensor_health(run, scene.drift_limits if scene else DriftLimits())
     css = "" if health is SensorHealth.STEADY else ' class="mark"'
     parts += ["<h2>Sensor in free air</h2>", f"<p{css}>{html.escape(sentence)}</p>"]
     if silent := silent_lines(run):
@@ -146,7 +147,7 @@ def summary(run: RunContent) -> list[str]:
     if classes:
         named = ", ".join(f"{name} {count}" for name, count in sorted(classes.items()))
         lines.append(f"Tissue called: {named}.")
-        lines.append(_compared([r for r in run.latest if r.tissue_class]))
+        lines.append(_compared(run, [r for r in run.latest if r.tissue_class]))
     return lines
 
 
@@ -159,16 +160,19 @@ def silent_lines(run: RunContent) -> list[str]:
     return [] if silent is None else silent.text().splitlines()
 
 
-def _compared(called: Sequence[PointResult]) -> str:
+def _compared(run: RunContent, called: Sequence[PointResult]) -> str:
     """What classes were compared with."""
     referred = [r for r in called if np.isfinite(r.nominal_f0_std_hz)]
     if not referred:
         reasons = "; ".join(sorted({r.tissue_reason for r in called if r.tissue_reason}))
         return f"No pole is referred to a nominal contact: {reasons or 'of an earlier version'}."
     std = np.median([r.nominal_f0_std_hz for r in referred])
+    scene = _scene_of(run)
+    nominal = scene and scene.nominal_contact
+    which = f", {1e3 * nominal.force_n:g} mN and {nominal.age_s:g} s" if nominal else ""
     return (
-        f"Tissue is called from {len(referred)} poles at the nominal force and age of contact, standard "
-        f"deviation of f0 {std:.2g} Hz (median)."
+        f"Tissue is called from {len(referred)} poles at the nominal force and age of contact{which}: "
+        f"standard deviation of f0 {std:.2g} Hz (median)."
     )
 
 
@@ -238,12 +242,12 @@ def _touches(surface: Mapping[str, Any]) -> str:
     return f"<p>A {surface['form']}. {told}</p><table>{''.join(rows)}</table>"
 
 
-def _drift_limits(run: RunContent) -> DriftLimits:
-    """Limits of the run's scene."""
+def _scene_of(run: RunContent) -> ScanScene | None:
+    """None where it cannot be read: a run is reported whatever became of its scene."""
     try:
-        return read_scan_scene(run.path / "scene.yaml").drift_limits
-    except ValueError:  # a run is reported whatever became of its scene
-        return DriftLimits()
+        return read_scan_scene(run.path / "scene.yaml")
+    except ValueError:
+        return None
 
 
 def _scene_name(run: RunContent) -> str:

@@ -171,11 +171,14 @@ def read_silent(run: RunContent) -> SilentRecord | None:
         if file.name.endswith(f"-{SILENT}.mcap"):
             for stored in measurements_of_file(run.path / RECORDING / file.name):
                 records = stored.records
+                if not records or stored.gaps:
+                    raise ValueError(f"{file.name}: {len(records)} records, expected some without a gap")
                 u, y = (
                     np.stack([getattr(record, channel).volts() for record in records])
                     for channel in ("actuator", "sensor")
                 )  # (P, N)
                 return silent_record(u, y, sample_rate_hz=records[0].sample_rate_hz)
+            raise ValueError(f"{file.name}: no measurement, expected a silent one")
     return None
 
 

@@ -223,24 +223,21 @@ class ScanRunner:
             )
 
     def _decide(self, measured: Measured, blocks: int) -> Decision:
-        poles = measured.poles
-        known = poles.f0_hz.size > 0
-        estimate = [poles.f0_hz[0], poles.damping_ratio[0]] if known else [np.nan, np.nan]
-        noise, total = (
-            c[0] if known and c is not None else None
-            for c in (poles.covariance, poles.total_covariance)
-        )
+        mode = main_mode(measured.poles)
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
         if isinstance(wanted, Separate):
             # tissues are told apart by what can be said of tissue, precision is that of the measured pole
-            mode, force = main_mode(poles), measured.origin.contact
+            force = measured.origin.contact
             pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
             at = refer_to_nominal(
                 mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
             )
-            return decide(at.compared, None, at.covariance, blocks, wanted, limits, block_s)
-        return decide(estimate, noise, total, blocks, wanted, limits, block_s)
+            decision = decide(at.compared, None, at.covariance, blocks, wanted, limits, block_s)
+            if np.isnan(at.compared).any() and at.note:
+                return replace(decision, reason=at.note)
+            return decision
+        return decide(mode.estimate, mode.noise, mode.total, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan.

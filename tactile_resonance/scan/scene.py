@@ -220,6 +220,10 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     good = isinstance(frame_id, str) and bool(frame_id)
     require(good, f"{where}: frame_id", frame_id, "the name of a frame")
     classes, nominal = _read_tissues(content, path)
+    if nominal is not None:
+        good = 0.1 <= nominal.force_n / force_n <= 10
+        accepted = f"a tenth to ten times force_n, {force_n:g}"
+        require(good, f"{where}: nominal_contact.force_n", nominal.force_n, accepted)
     outputs = _read_outputs(content, where)
     surface: Surface | TouchRequest = Plane()
     if "surface" in content:
@@ -266,7 +270,8 @@ def _read_tissues(
         return read_classes(path.parent / given)
     nominal = parse_nominal_contact(content, where)
     if given is None:
-        require(nominal is None, f"{where}: nominal_contact", "one", "none without tissue_classes")
+        accepted = "classes, to which nominal_contact belongs (they are missing)"
+        require(nominal is None, f"{where}: tissue_classes", None, accepted)
         return (), None
     return parse_classes(given, f"{where}: tissue_classes"), nominal
 

@@ -168,7 +168,8 @@ def refer_to_nominal(
         covariance = covariance of the estimate + s s' V + S (D^2 + V) + b^2 diag(1, 1 / f0^2)
 
     To V belong noise and scale of the force sensor and the uncertain c. The last term is what curvature may
-    leave: b = |d pole / dF| D^2 / (3 F0), in any direction of the complex plane. A shift that goes as a power p
+    leave: b^2 is the mean of (|d pole / dF| D'^2 / (3 F0))^2 over the D' of mean D and variance V that may be,
+    in any direction of the complex plane. A shift that goes as a power p
     of the force leaves (1 - p) / 2 of D^2 / F0 times its slope; stiffness goes with the contact radius,
     F^(1/3), radiated waves with its square and cube, so that p is 1/3 or more. A force that is unknown counts
     as the nominal one with the deviation `NominalContact.unknown_force_std_n`, an age likewise.
@@ -184,7 +185,8 @@ def refer_to_nominal(
     off_n, variance, note = equivalent
     per_n, uncertain = nominal.sensitivity.per_n, nominal.sensitivity.covariance
     total = own + np.outer(per_n, per_n) * variance + uncertain * (off_n**2 + variance)
-    bend_hz = _BEND * np.hypot(per_n[0], x[0] * per_n[1]) * off_n**2 / nominal.force_n
+    fourth = off_n**4 + 6 * off_n**2 * variance + 3 * variance**2  # of a Gaussian
+    bend_hz = _BEND * np.hypot(per_n[0], x[0] * per_n[1]) * math.sqrt(fourth) / nominal.force_n
     total = total + np.diag([bend_hz, bend_hz / x[0]]) ** 2
     return PoleForTissue(x, own, x - per_n * off_n, total, True, note)
 
@@ -195,6 +197,8 @@ def _equivalent_force(
     """Equivalent less nominal force [N], its variance and a note; a sentence where it is unknown."""
     notes = []
     force_n, std_n = contact.force_n, contact.force_std_n
+    if force_n <= 0:
+        return f"the force is {1e3 * force_n:.3g} mN: the tip was not pressed on"
     if math.isfinite(force_n) and math.isfinite(std_n):
         variance = std_n**2 + (nominal.force_scale_std * force_n) ** 2
     else:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from tactile_resonance.tissue.nominal_contact import (
 
 FloatArray = npt.NDArray[np.float64]
 _MEASURED = ("f0_hz", "damping_ratio", "f0_std_hz", "damping_ratio_std")
+_CONTACT = {field.name for field in dataclasses.fields(NominalContact)} - {"sensitivity"}
 _SENSITIVITY = ("f0_hz_per_n", "damping_ratio_per_n", "f0_std_hz_per_n", "damping_ratio_std_per_n")
 
 
@@ -75,11 +77,17 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
     """
     if "nominal_contact" not in content:
         return None
-    fields = dict(section(content, "nominal_contact", where))
     where = f"{where}: nominal_contact"
+    good = isinstance(content["nominal_contact"], Mapping)
+    require(good, where, content["nominal_contact"], "a mapping")
+    fields = dict(content["nominal_contact"])
+    known_keys(fields, {*_CONTACT, *_SENSITIVITY, "correlation", "preloads"}, where)
     try:
         if "preloads" in fields:
-            sensitivity = _preloads(fields.pop("preloads"), where)
+            beside = sorted({*_SENSITIVITY, "correlation"} & set(fields))
+            require(not beside, where, beside, "none of these beside preloads")
+            nominal_n = number(fields.get("force_n"), f"{where}.force_n")
+            sensitivity = _preloads(fields.pop("preloads"), nominal_n, where)
         else:
             f0, damping, f0_std, damping_std, correlation = _numbers_of(fields, _SENSITIVITY, where)
             for key in (*_SENSITIVITY, "correlation"):
@@ -92,7 +100,7 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
         raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
 
 
-def _preloads(rows: object, where: str) -> ForceSensitivity:
+def _preloads(rows: object, nominal_n: float, where: str) -> ForceSensitivity:
     where = f"{where}.preloads"
     good = isinstance(rows, list) and len(rows) == 2 and all(isinstance(r, Mapping) for r in rows)
     require(good, where, rows, "a list of two points")
@@ -104,14 +112,26 @@ def _preloads(rows: object, where: str) -> ForceSensitivity:
         values.append(_numbers_of(row, keys, f"{where}[{index}]"))
     force_n, force_std_n, f0, damping, f0_std, damping_std, correlation = np.transpose(values)
     covariances = [_covariance(*row) for row in zip(f0_std, damping_std, correlation, strict=True)]
-    return sensitivity_of_preloads(np.transpose([f0, damping]), covariances, force_n, force_std_n)
+    good = 0 < force_n.min() <= nominal_n <= force_n.max()
+    accepted = f"forces above 0 on either side of the nominal one, {nominal_n:g}"
+    require(good, f"{where}.force_n", force_n.tolist(), accepted)
+    estimates = np.transpose([f0, damping])
+    try:
+        return sensitivity_of_preloads(estimates, covariances, force_n, force_std_n)
+    except ValueError as error:
+        raise ValueError(f"{where}.{error}") from error
 
 
 def _numbers_of(fields: Mapping[str, Any], keys: Sequence[str], where: str) -> list[float]:
     """Values of these fields, and of ``correlation``; standard deviations are checked."""
-    values = [number(fields.get(key), f"{where}.{key}") for key in keys]
+    for key in keys:
+        require(key in fields, f"{where}.{key}", None, "a number (it is missing)")
+    values = [number(fields[key], f"{where}.{key}") for key in keys]
     for key, value in zip(keys, values, strict=True):
         require("std" not in key or value >= 0, f"{where}.{key}", value, "a number of 0 or above")
+        good = key not in ("f0_hz", "damping_ratio") or value > 0
+        require(good, f"{where}.{key}", value, "a number above 0")
+        require(key != "damping_ratio" or value < 1, f"{where}.{key}", value, "below 1")
     correlation = number(fields.get("correlation", 0.0), f"{where}.correlation")
     require(-1 <= correlation <= 1, f"{where}.correlation", correlation, "-1 to 1")
     return [*values, correlation]

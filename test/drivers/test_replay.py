@@ -3,6 +3,7 @@
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,26 @@ def test_measurements_come_in_order_once_and_by_name(tmp_path):
     with pytest.raises(DeviceError, match="no measurement 3 in"):
         device.plan(asked(3))
     assert play(device, asked(7))[0][0].measurement_id == 7
+
+
+def test_silent_and_driven_measurements_are_not_taken_for_each_other(tmp_path):
+    store = RecordStore(tmp_path)
+    silent = [
+        replace(e, amplitude_v=np.zeros(e.harmonics.size)) for e in stores.excitations(6, 1, 2)
+    ]
+    store.begin(silent)
+    store.add_excitation(silent[0])
+    for block in range(2):
+        store.add_record(stores.record(silent[0], block))
+    stores.write(store, 7)
+    driven = play(ReplayDevice(tmp_path, speed=0))[0][0]
+    assert (driven.measurement_id, driven.level_v > 0) == (7, True)
+    device = ReplayDevice(tmp_path, speed=0)
+    nothing = [replace(ASKED[0], amplitude_v=np.zeros(ASKED[0].harmonics.size))]
+    assert play(device, nothing)[0][0].measurement_id == 6
+    assert play(device)[0][0].measurement_id == 7
+    with pytest.raises(DeviceError, match="measurement 6 is silent, or the goal is"):
+        device.plan(asked(6))
 
 
 def test_an_early_end_is_played_to_its_end(tmp_path):

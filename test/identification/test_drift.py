@@ -28,8 +28,10 @@ def creep(time_s):
     return (curve - curve.mean()) / np.polyfit(time_s, curve, 1)[0]
 
 
-def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING, shape=steady):
+def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING, shape=steady, power=0):
     """From rest; the nominal f0 and damping ratio are the means over the record.
+
+    The residue goes with a power of the natural frequency.
 
     One interval after the other with the input straight between samples and the pole of the interval's
     middle: exact but for a smooth factor of the response, which the feed-through does not have.
@@ -44,6 +46,7 @@ def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING, sha
     w = 2 * np.pi * (F0_HZ + f0_drift_hz_per_s * shape(time_s))
     q = w * (-zeta + 1j * np.sqrt(1 - zeta**2)) * interval
     residue = 2 * damping * (2 * np.pi * F0_HZ) / (2j * np.sqrt(1 - damping**2)) * interval
+    residue = residue * (w / (2 * np.pi * F0_HZ)) ** power
     late = (np.exp(q) - 1 - q) / q**2
     drive = residue * ((np.expm1(q) / q - late) * u[:-1] + late * u[1:])
     x = np.zeros(u.size, complex)
@@ -167,6 +170,24 @@ def test_a_drift_of_a_narrow_mode_is_not_taken_for_tones(periods):
     rates = np.array([p.f0_drift_hz_per_s[0] for p in found])
     stated = np.array([np.sqrt(p.drift_covariance[0, 0, 0]) for p in found])
     assert np.all(np.abs(rates - drift) < 4.5 * stated)
+
+
+@pytest.mark.parametrize("power", [-1, 1])
+def test_a_spring_that_changes_is_a_drift_of_its_mode(power):
+    """Under a constant force the residue changes by as much of itself as the pole."""
+    u, y = record(8, 0.5, 0.0, power=power)
+    rng = np.random.default_rng(3)
+    for _ in range(15):
+        poles = identify_poles_from_records(
+            u,
+            y + 5e-3 * rng.standard_normal(y.shape),
+            sample_rate_hz=RATE_HZ,
+            harmonics=HARMONICS,
+            band_hz=(200.0, 300.0),
+            structure=BARE,
+        )
+        assert poles.status is PolesStatus.OK, poles.message
+        assert abs(poles.f0_hz[0] - F0_HZ) < 5 * np.sqrt(poles.covariance[0, 0, 0])
 
 
 @pytest.mark.parametrize("kind", ["gain", "step", "lost"])

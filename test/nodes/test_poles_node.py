@@ -13,7 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 import rclpy
 
 from tactile_resonance import msg
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.conversions import (
@@ -109,6 +109,18 @@ def test_the_data_choose_how_many_modes_there_are(node, modes):
     assert (message.order, message.status) == (2 * modes, msg.Poles.STATUS_OK)
     assert list(message.f0_hz) == pytest.approx([240.0, 262.0][:modes], abs=0.1)
     assert f"orders {2 * modes} and" in message.message
+
+
+@pytest.mark.parametrize("order", [0, 2])
+def test_an_frf_that_failed_keeps_its_reason(node, order):
+    failed = FRF(
+        np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message="nothing was played"
+    )
+    node.set_parameters([rclpy.Parameter("order", value=order)])
+    node._on_frf(frf_to_message(failed, Origin(), 0.0, False))
+    (message,) = node.published
+    assert (message.status, message.message) == (msg.Poles.STATUS_FAILED, "nothing was played")
+    assert not node.health._error
 
 
 def test_a_fit_that_raises_gets_a_failure_with_its_reason(node, monkeypatch):

@@ -57,7 +57,6 @@ def test_single_precision_is_not_copied():
         ({"y": Y[:-1]}, r"y: shape \(23,\), expected that of u"),
         ({"y": np.where(np.arange(24) == 3, np.nan, Y)}, "y: 1 samples are NaN or infinite"),
         ({"u": np.where(np.arange(24) == 3, np.inf, U)}, "u: 1 samples are NaN or infinite"),
-        ({"u": np.full(24, 0.5)}, r"u: constant \(0.5 V\)"),
         ({"u": np.array(["a"] * 24)}, "u: values of type"),
         ({"u": U * 1j}, "u: values of type complex"),
         ({"excited_harmonics": [0, 1]}, "excited_harmonics"),
@@ -69,6 +68,14 @@ def test_bad_input_names_field_and_value(change, message):
     good = {"u": U, "y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}
     with pytest.raises(ValueError, match=message):
         make_recording(**(good | change))
+
+
+def test_a_channel_without_drive_is_read_and_refused_where_a_drive_is_needed():
+    good = {"y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}
+    make_recording(U, **good).require_driven()
+    silent = make_recording(np.full(24, 0.5), **good)
+    with pytest.raises(ValueError, match=r"u: constant \(0.5 V\), .*analyze --silent"):
+        silent.require_driven()
 
 
 @pytest.fixture

@@ -178,10 +178,14 @@ def test_recording_of_an_early_end(tmp_path):
     for block in range(3):
         store.add_record(stores.record(planned[0], block))
     with pytest.raises(ValueError, match="no complete realisation .*3 of 4 consecutive periods"):
-        read_store_recording(tmp_path)
+        read_store_recording(tmp_path, periods=4)
     recording = read_store_recording(tmp_path, periods=3)
     assert recording.u.shape == (1, 3, stores.SAMPLES)
     assert recording.notes == ("1 of 3 realisations were played",)
+    whole = read_store_recording(tmp_path)
+    np.testing.assert_array_equal(whole.y, recording.y)
+    ended = "the measurement ended after 3 of 4 periods"
+    assert whole.notes == (ended, "1 of 3 realisations were played")
 
 
 def test_one_of_several_measurements_must_be_chosen(tmp_path):

@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.record import Origin
 from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.scan.controls import Controls, Request
-from tactile_resonance.scan.decision import Separate
+from tactile_resonance.scan.decision import Separate, Verdict
+from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import Outcome
@@ -73,6 +76,24 @@ def test_a_silent_record_is_taken_before_all_else_where_the_scene_asks_for_it(tm
     with RunDirectory.open(tmp_path / "run") as again:
         ScanRunner(made, make_plan(made), again, bench, Controls(), print).run()
     assert len([entry for entry in bench.log if entry[1] == "silent"]) == 1
+
+
+def test_precision_is_that_of_the_mode_that_is_reported(tmp_path):
+    """A precise weak mode beside it says nothing of the main one."""
+    bench = Bench()
+    made, run = begin(tmp_path / "run", scene(1))
+    runner = ScanRunner(scene(1), made, run, bench, Controls(), print)
+    poles = Poles(
+        poles_rad_s=np.array([-50 + 1400j, -50 + 1500j]),
+        f0_hz=np.array([222.0, 240.0]),
+        damping_ratio=np.array([0.03, 0.03]),
+        residues=np.array([1 + 0j, 100 + 0j]),
+        covariance=np.array([np.diag([1e-6, 1e-12]), np.diag([4.0, 1e-6])]),
+    )
+    with run:
+        decision = runner._decide(Measured(poles, Origin()), 2)
+    assert decision.verdict is not Verdict.PRECISE
+    assert decision.reason.startswith("std of f0 2 Hz")
 
 
 def pressed_scene():

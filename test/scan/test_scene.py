@@ -127,7 +127,9 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content | {"nominal_contact": NOMINAL}))
     scene = read(tmp_path, tissue_classes="classes.yaml")
     assert (scene.nominal_contact.force_n, scene.nominal_contact.age_s) == (0.02, 3.0)
-    with pytest.raises(ValueError, match="nominal_contact: got 'one'; accepted is none: it belongs"):
+    with pytest.raises(
+        ValueError, match="nominal_contact: got 'one'; accepted is none: it belongs"
+    ):
         read(tmp_path, tissue_classes="classes.yaml", nominal_contact=NOMINAL)
 
 
@@ -155,7 +157,14 @@ def test_classes_from_a_file_and_from_points(tmp_path):
         ),
         ({"tissue_classes": {"a": {"f0_hz": 250.0}}}, "tissue_classes.a.damping_ratio: got None"),
         ({"tissue_classes": "none.yaml"}, "none.yaml"),
-        ({"nominal_contact": NOMINAL}, "nominal_contact: got 'one'; accepted is none without tissue_c"),
+        (
+            {"nominal_contact": NOMINAL},
+            "tissue_classes: got None; accepted is classes, to which nominal_contact",
+        ),
+        (
+            {"tissue_classes": CLASSES, "nominal_contact": NOMINAL | {"force_n": 10.0}},
+            "nominal_contact.force_n: got 10.0; accepted is a tenth to ten times force_n, 0.0",
+        ),
         (
             {"tissue_classes": CLASSES, "nominal_contact": NOMINAL | {"age_s": 0}},
             "scene.yaml: nominal_contact.age_s: got 0.0; accepted is a number above 0",

@@ -158,6 +158,13 @@ def test_the_covariance_for_tissue_holds_the_truth_as_often_as_it_says():
     assert inside["pole"] / runs < 0.3  # the pole's own covariance is not one for tissue
 
 
+def curvature(x, off_n, variance):
+    """What is left to second order of a force off by a Gaussian, root mean square, in any direction."""
+    fourth = off_n**4 + 6 * off_n**2 * variance + 3 * variance**2
+    left_hz = np.hypot(slope()[0], x[0] * slope()[1]) * np.sqrt(fourth) / FORCE_N / 3
+    return np.diag([left_hz, left_hz / x[0]]) ** 2
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -187,12 +194,8 @@ def test_each_source_of_uncertainty_widens_the_covariance_for_tissue_alone(chang
     contact = ContactLoad(force_n, force_std, age_s)
     at = refer_to_nominal(x, NOISE, contact, replace(base, **changes))
     expected = NOISE + np.outer(slope(), slope()) * variance + extra
-    curved = refer_to_nominal(
-        x, np.zeros((2, 2)), ContactLoad(force_n, 0.0, age_s), exact
-    ).covariance
+    curved = curvature(x, equivalent - FORCE_N, variance)
     np.testing.assert_allclose(at.covariance, expected + curved, rtol=1e-9)
-    moved_hz = np.hypot(slope()[0], x[0] * slope()[1]) * (equivalent - FORCE_N) ** 2 / FORCE_N / 3
-    np.testing.assert_allclose(np.sqrt(np.diag(curved)), [moved_hz, moved_hz / x[0]], rtol=1e-9)
     assert np.sqrt(at.covariance[1, 1]) > 2 * np.sqrt(NOISE[1, 1])
     np.testing.assert_array_equal(at.measured_covariance, NOISE)
 
@@ -202,7 +205,16 @@ def test_an_unknown_force_is_no_shift_and_wide_or_no_statement():
     at = refer_to_nominal(x, NOISE, unknown, nominal(unknown_force_std_n=3e-4))
     np.testing.assert_array_equal(at.compared, x)
     expected = NOISE + np.outer(slope(), slope()) * 3e-4**2
-    np.testing.assert_allclose(at.covariance, expected)
+    np.testing.assert_allclose(at.covariance, expected + curvature(x, 0.0, 3e-4**2))
+    # a sensitivity along one axis alone says nothing of the other, but curvature may
+    along = replace(
+        nominal(unknown_force_std_n=3e-3),
+        sensitivity=ForceSensitivity(np.array([220.0, 0.0]), 0 * NOISE),
+    )
+    assert refer_to_nominal(x, NOISE, unknown, along).covariance[1, 1] > 10 * NOISE[1, 1]
+    lifted = refer_to_nominal(x, NOISE, ContactLoad(-3e-4, 1e-5, AGE_S), along)
+    assert np.isnan(lifted.compared).all()
+    assert lifted.note == "the force is -0.3 mN: the tip was not pressed on"
     assert at.referred
     assert at.note == "force unknown, taken as 10 +- 0.3 mN"
     # a force without a deviation is worth no more than none
@@ -226,7 +238,8 @@ def test_an_unknown_age_is_no_shift_and_wide_or_no_statement():
     at = refer_to_nominal(x, NOISE, unknown, nominal(creep=0.03, unknown_age_factor=2.0))
     np.testing.assert_array_equal(at.compared, x)
     variance = (FORCE_N * 0.03 * np.log(2)) ** 2
-    np.testing.assert_allclose(at.covariance, NOISE + np.outer(slope(), slope()) * variance)
+    expected = NOISE + np.outer(slope(), slope()) * variance + curvature(x, 0.0, variance)
+    np.testing.assert_allclose(at.covariance, expected)
     assert at.note == "age of contact unknown, taken as 1 s within 2 times"
     none = refer_to_nominal(x, NOISE, unknown, nominal(creep=0.03))
     assert np.isnan(none.compared).all()
@@ -306,6 +319,12 @@ def test_a_scene_gives_the_sensitivity_by_two_preloads_or_in_numbers():
     np.testing.assert_allclose(same.covariance, measured.sensitivity.covariance, rtol=1e-9)
 
 
+def preloads(*forces_n):
+    row = {"force_std_n": 1e-5, "f0_hz": 250.0, "f0_std_hz": 0.01}
+    row |= {"damping_ratio": 0.03, "damping_ratio_std": 1e-4}
+    return [{"force_n": force_n, **row} for force_n in forces_n]
+
+
 GIVEN = {
     "force_n": 0.01,
     "age_s": 2.0,
@@ -335,10 +354,19 @@ GIVEN = {
             "nominal_contact.preloads: got [{}]; accepted is a list of two points",
         ),
         ({"preloads": [{}, {}]}, "nominal_contact.preloads[0].force_n: got None"),
+        (
+            {"preloads": [], "correlation": 0.0},
+            "nominal_contact: got ['correlation']; accepted is none of these beside preloads",
+        ),
+        (
+            {"preloads": preloads(0.011, 0.012)},
+            "nominal_contact.preloads.force_n: got [0.011, 0.012]; accepted is forces above 0 on either side",
+        ),
     ],
 )
 def test_what_is_wrong_in_it_is_named(changes, message):
+    given = {"force_n": 0.01, "age_s": 2.0} if "preloads" in changes else GIVEN
     with pytest.raises(ValueError, match="nominal_contact") as error:
-        parse_nominal_contact({"nominal_contact": GIVEN | changes}, "scene.yaml")
+        parse_nominal_contact({"nominal_contact": given | changes}, "scene.yaml")
     assert str(error.value).startswith(f"scene.yaml: {message}")
     assert str(error.value).count("nominal_contact") == 1
