@@ -18,9 +18,10 @@ from tactile_resonance.report.point_table import table_notes
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.point_result import Outcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
-from tactile_resonance.scan.references import SensorHealth, read_silent, sensor_health
+from tactile_resonance.scan.references import SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits, ScanScene, read_scan_scene
+from tactile_resonance.scan.silent_reference import read_silent
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;

@@ -14,10 +14,8 @@ from tactile_resonance.recording.from_messages import poles_from_message
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
-from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits
-from tactile_resonance.silent import SilentRecord, silent_record
 
 FloatArray = npt.NDArray[np.float64]
 SILENT, BEFORE, AFTER = "silent", "air-before", "air-after"
@@ -157,29 +155,6 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
                 poles, _ = poles_from_message(message)
                 found = reference_of(poles)
     return found
-
-
-def read_silent(run: RunContent) -> SilentRecord | None:
-    """Tones and noise of a run's silent record; None where it has none.
-
-    Raises
-    ------
-    ValueError
-        If its file is damaged or holds no samples.
-    """
-    for file in run.files:
-        if file.name.endswith(f"-{SILENT}.mcap"):
-            for stored in measurements_of_file(run.path / RECORDING / file.name):
-                records = stored.records
-                if not records or stored.gaps:
-                    raise ValueError(f"{file.name}: {len(records)} records, expected some without a gap")
-                u, y = (
-                    np.stack([getattr(record, channel).volts() for record in records])
-                    for channel in ("actuator", "sensor")
-                )  # (P, N)
-                return silent_record(u, y, sample_rate_hz=records[0].sample_rate_hz)
-            raise ValueError(f"{file.name}: no measurement, expected a silent one")
-    return None
 
 
 def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:

@@ -23,8 +23,8 @@ from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import Outcome
-from tactile_resonance.scan.references import read_silent
 from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.silent_reference import read_silent
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
