@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The silent record of a run, evaluated; apart from other references, for it loads much that nodes do not need."""
+"""The silent record of a run, evaluated; apart from other references, for nodes do not need what it loads."""
 
 from __future__ import annotations
 
