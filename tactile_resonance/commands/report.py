@@ -50,7 +50,6 @@ def run(options: argparse.Namespace) -> int:
         picture = figure_bytes(draw_pole_map(pole_map, title), ".png")
         write_whole(options.run_folder / "pole_map.png", picture)
     write_whole(options.run_folder / "report.html", as_page(content, picture, truths).encode())
-    write_map_recording(content)
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
@@ -59,5 +58,6 @@ def run(options: argparse.Namespace) -> int:
         print(line)
     for problem in content.problems:
         print(f"damaged: {problem}")
+    write_map_recording(content)  # last: the page and the table do not wait for it
     print(f"page, picture and map.mcap in {options.run_folder}")
     return 0

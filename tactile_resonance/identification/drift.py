@@ -92,7 +92,7 @@ class _Step:
         return np.asarray(self.inverse * self.level * self.dof / (self.dof - 1) / 2)
 
     def chance(self, drift: FloatArray, of: slice = slice(None)) -> float:
-        """Of some values of a drift as large beside all others where there are none: an F test."""
+        """Probability that chance makes these values of the drift as large, beside all others: an F test."""
         values = drift.ravel()[of]
         fall = float(values @ np.linalg.solve(self.inverse[of, of], values))
         rest = self.level * self.dof
@@ -221,7 +221,7 @@ def _linearised(
     """The drift that bins y (K,) show beside a fit to them, or to y without some drift.
 
     With weights of flat noise, or of what noise a test finds: this takes a drift for noise. None where the
-    rows asked for cannot be told apart.
+    rows asked for cannot be distinguished.
     """
     plan, u, theta = modes.plan, modes.u, modes.theta
     directions = np.concatenate([modes.directions(row) for row in rows])

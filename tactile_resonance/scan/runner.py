@@ -227,7 +227,7 @@ class ScanRunner:
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
         if isinstance(wanted, Separate):
-            # tissues are told apart by what can be said of tissue, precision is that of the measured pole
+            # tissues are distinguished by the pole at the nominal contact, not by the measured one
             force = measured.origin.contact
             pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
             at = refer_to_nominal(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is told of a measurement is in its file, however close together it is told, in any order."""
+"""All messages of a measurement are in its file, however close together they come, and in any order."""
 
 import os
 

@@ -56,7 +56,7 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
 
     plain, _ = scene.tissue_classes
     gelatine = read_tissues().gelatine
-    # the spread is that of 0.33 % w/w alone: force and age of contact are told apart from it
+    # the spread is that of 0.33 % w/w alone: force and age of contact are accounted for separately
     rng = np.random.default_rng(1)
     drawn = np.array([poles(gelatine(10 + 0.33 * rng.standard_normal())) for _ in range(100)])
     std = drawn.std(axis=0, ddof=1)
