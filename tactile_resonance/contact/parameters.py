@@ -138,7 +138,13 @@ class ContactParameters:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Box for the tip in the base [m], its opposite corners (3,)."""
+    """Box for the tip in the base.
+
+    Attributes
+    ----------
+    low_m, high_m : tuple of 3 floats
+        Opposite corners of the box in which the tip may be, in the base [m].
+    """
 
     low_m: tuple[float, ...] = (-1.0, -1.0, -0.2)
     high_m: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -181,6 +187,17 @@ LIMIT_RANGES: dict[str, tuple[float, float]] = {
     "stop_deceleration_m_s2": (0.1, 20.0),
 }
 """Accepted range of each number of `Limits`, ends included."""
+
+STRICTER_BELOW = frozenset(
+    {
+        *("abort_force_n", "hard_force_n", "pull_force_n", "lateral_force_n", "force_rate_n_per_s"),
+        *("depth_m", "near_speed_m_s", "contact_speed_m_s", "lateral_speed_m_s", "free_speed_m_s"),
+        *("angular_speed_rad_s", "tilt_rad", "misalignment_rad", "force_age_s", "arm_age_s"),
+        "stuck_samples",
+    }
+)
+STRICTER_ABOVE = frozenset({"near_m", "clearance_m"})
+"""Limits that protect the tissue: each admits more above its value, these two below it."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action.server import ServerGoalHandle
@@ -23,7 +24,12 @@ from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
-from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
+from tactile_resonance.nodes.contact_parameters import (
+    contact_parameters,
+    limits_of_launch,
+    read_parameters,
+    require_stricter,
+)
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
@@ -88,6 +94,7 @@ class ContactNode(ManagedNode):
         self._thread: ContactThread | None = None
         self._arm: NodeArm | None = None
         self._stop = StopInput(self, self._draw_back)
+        self._launched = limits_of_launch(self)
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def configure(self) -> None:
@@ -188,11 +195,12 @@ class ContactNode(ManagedNode):
     # requests, in the executor's thread
 
     def _on_parameters(self, changes: Sequence) -> SetParametersResult:
-        """Take what is in range while nothing moves; in contact nothing is changed."""
+        """Take what is in range, and of limits what is stricter than the launch's; in contact nothing."""
         changed = {c.name: c.value for c in changes if c.name.startswith(("contact.", "limits."))}
-        if not changed or not self.has_parameter("contact.period_s"):
+        if not changed:
             return SetParametersResult(successful=True)
         try:
+            require_stricter(changed, self._launched)
             parameters, limits = self._read_parameters(**changed)
             if self._thread is not None:
                 self._thread.configure(parameters, limits)
@@ -201,7 +209,7 @@ class ContactNode(ManagedNode):
         self._settings, self._limits = parameters, limits
         return SetParametersResult(successful=True)
 
-    def _read_parameters(self, **changed: float) -> tuple[ContactParameters, Limits]:
+    def _read_parameters(self, **changed: Any) -> tuple[ContactParameters, Limits]:
         """Of the controller, as the arm allows them; ``ValueError`` where one is not accepted."""
         parameters, limits = read_parameters(self, **changed)
         (stalls_s,) = values(self, "simulated_stalls_s")
