@@ -70,8 +70,12 @@ def require_stricter(changed: Mapping[str, Any], launched: Mapping[str, Any]) ->
         good = value.shape == limit.shape and bool(
             np.all(value <= limit if at_most else value >= limit)
         )
-        accepted = f"at {'most' if at_most else 'least'} {limit.tolist()}, as launched: it may be made "
-        require(good, name, value.tolist(), accepted + "stricter here, and laxer by a new launch only")
+        accepted = (
+            f"at {'most' if at_most else 'least'} {limit.tolist()}, as launched: it may be made "
+        )
+        require(
+            good, name, value.tolist(), accepted + "stricter here, and laxer by a new launch only"
+        )
 
 
 def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limits]:
@@ -82,6 +86,7 @@ def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limi
     ValueError
         If a value is out of range or beyond the limits.
     """
+
     def value(full: str) -> Any:
         return changed.get(full, node.get_parameter(full).value)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
@@ -256,6 +257,38 @@ def test_housing_stays_clear_of_the_tissue():
     )
     with pytest.raises(ValueError, match="beam_tilt_rad: got 2"):
         TipGeometry(beam_tilt_rad=2)
+
+
+@pytest.mark.parametrize("state", [State.TRAVEL, State.TARE])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_tip_that_leaves_the_way_of_its_goal_is_stopped(state, axis):
+    made = started(start_m=0.1 if state is State.TRAVEL else 2.5e-3)
+    assert made.run_until(state)
+    made.run(0.05)
+    start = np.array(made.bench.clock.motion.reported.position_m)
+    away = np.zeros(6)
+    away[axis] = 0.1  # [m/s]: somebody else commands the arm
+    obeys = made.bench.arm.speed
+    made.bench.arm.speed = lambda twist, limit: obeys(away, limit)
+    made.bench.arm.stop, stops = lambda limit: obeys(away, limit), made.bench.arm.stop
+    made.loop.run_while(lambda: made.controller.result is None, 3.0)
+    result = made.controller.result
+    assert result.cause is Cause.WORKSPACE, result.message
+    assert "off the way of its goal" in result.message
+    gone = made.bench.clock.motion.reported.position_m[axis] - start[axis]
+    assert 0.045 < gone < 0.055
+    made.bench.arm.speed, made.bench.arm.stop = obeys, stops
+    assert made.run_until(State.IDLE, 3.0), "beside its way the tip is drawn back"
+
+
+@pytest.mark.parametrize(("start_m", "turned_rad"), [(0.3, 0.0), (1e-4, 0.0), (0.02, 0.5)])
+def test_a_way_from_afar_from_below_or_with_a_turn_is_within_its_box(start_m, turned_rad):
+    made = contact(start_m=start_m)
+    place_m, turn = made.goal.touch.position_m, made.goal.touch.rotation
+    turned = Rotation.from_rotvec([0.0, 0.0, turned_rad]) * turn
+    goal = ContactGoal(Pose(place_m, turned.as_rotvec()), made.goal.aim)
+    result = made.loop.make(goal)
+    assert result.reached, result.message
 
 
 def test_touch_pose_puts_the_ball_on_the_point():
