@@ -123,7 +123,7 @@ class Judgement:
 def way_of(
     path: TipPath, arm: ArmSample, parameters: ContactParameters, limits: Limits
 ) -> Workspace:
-    """Box around the way of one goal: from where the tip is, lifted, above the touch, and as deep as allowed."""
+    """Box around the way of a goal: where the tip is, lifted, above the touch, and as deep as allowed."""
     p = parameters
     lift_m = max(0.0, p.standoff_m - path.height_m(arm))
     lifted_m = tuple(x + lift_m * n for x, n in zip(arm.position_m, path.normal, strict=True))

@@ -34,6 +34,7 @@ from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
+from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
@@ -71,7 +72,9 @@ PARAMETERS = (
     ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
-    Parameter("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True),
+    Parameter(
+        "sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True
+    ),
     Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
     BROADCAST_TF,
     *contact_parameters(),
@@ -165,11 +168,16 @@ class ContactNode(ManagedNode):
         self._teller.reset()
 
     def deactivate(self) -> None:
-        """Draw the tip back and end the loop."""
-        if self._thread is not None:
-            self._thread.close()
-            self._finish(self._thread.controller.result)
-            self._thread = None
+        """Draw the tip back and end the loop; a node whose loop does not end is made anew."""
+        thread = self._thread
+        if thread is None:
+            return
+        if not thread.close():
+            self.fail(
+                "the control loop hangs and was given up; the arm's link is closed, its watchdog stops it"
+            )
+        self._finish(thread.controller.result)
+        self._thread = None
 
     def working(self) -> bool:
         """The loop moves on, where there is one."""
@@ -266,16 +274,18 @@ class ContactNode(ManagedNode):
         if self._thread is not None:
             self._thread.retract()
 
-    def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._thread is None:
-            response.message = f"contact_node is {self.state_name()}"
-            return response
+    async def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        thread = self._thread
         try:
-            self._thread.make_ready()
+            if thread is not None and thread.controller.state is State.FAULT:
+                await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
         except ArmError as error:
             response.message = str(error)
             return response
-        self._thread.retract()
+        if thread is None or thread is not self._thread:
+            response.message = f"contact_node is {self.state_name()}"
+            return response
+        thread.retract()
         response.success = True
         response.message = "asked; contact_state reports when it is idle"
         return response
@@ -308,7 +318,10 @@ class ContactNode(ManagedNode):
             return
         if thread.error is not None:
             self._finish(None)
-            self.fail(f"control loop ended: {thread.error!r}")
+            text = "the arm was stopped and stands"
+            if thread.moves:
+                text = f"the arm was NOT seen to stand ({thread.moves}), its link is closed"
+            self.fail(f"control loop ended: {thread.error!r}; {text}")
             return
         if self._dead:
             self._finish(thread.controller.result)

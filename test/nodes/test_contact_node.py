@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of contact_node by parameter: as launched or stricter, never laxer."""
+"""Limits of contact_node by parameter: as launched or stricter, never laxer; what ends its life."""
 
 import os
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from tactile_resonance.contact.parameters import LIMIT_RANGES, Workspace, read_contact
@@ -96,3 +98,17 @@ def test_the_workspace_of_a_launch_is_made_smaller_and_never_larger(launch):
     assert ask(node, workspace__low_m=[-0.1, -0.2, 0.1]) == ""
     assert "above low_m" in ask(node, workspace__high_m=[-0.2, 0.2, 0.5])
     assert "limits.workspace.low_m" in ask(node, workspace__low_m=[0.0, 0.0])
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_node_whose_loop_does_not_end_is_made_anew(launch, ends):
+    node, finished = launch(), []
+    controller = SimpleNamespace(result="what became of the goal")
+    node._thread = SimpleNamespace(close=lambda: ends, controller=controller)
+    node._finish = finished.append
+    node.active = True
+    answer = node.on_deactivate(None)
+    want = TransitionCallbackReturn.SUCCESS if ends else TransitionCallbackReturn.ERROR
+    assert answer is want
+    assert node._thread is None
+    assert finished == ["what became of the goal"], "nobody waits for it"
