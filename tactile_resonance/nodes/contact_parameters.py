@@ -30,7 +30,12 @@ _GROUPS = {"contact": (ContactParameters, RANGES), "limits": (Limits, LIMIT_RANG
 # The control loop's period is that of the running loop.
 _READ_ONLY = frozenset({"contact.period_s"})
 _LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
-_AT_MOST = frozenset({*(f"limits.{name}" for name in STRICTER_BELOW), _HIGH})
+_AT_MOST = frozenset(
+    {
+        *(f"{g}.{n}" for g, (_, ranges) in _GROUPS.items() for n in ranges if n in STRICTER_BELOW),
+        _HIGH,
+    }
+)
 _AT_LEAST = frozenset({*(f"limits.{name}" for name in STRICTER_ABOVE), _LOW})
 
 
@@ -58,12 +63,12 @@ def contact_parameters() -> tuple[Parameter, ...]:
 
 
 def limits_of_launch(node: Node) -> dict[str, Any]:
-    """Limits that may be made only stricter, by parameter, with the values of a node just made."""
+    """What may be made only stricter, by parameter, with the values of a node just made."""
     return {name: node.get_parameter(name).value for name in (*_AT_MOST, *_AT_LEAST)}
 
 
 def require_stricter(changed: Mapping[str, Any], launched: Mapping[str, Any]) -> None:
-    """Raise ``ValueError`` where a limit that protects the tissue would admit more than at the launch."""
+    """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
     for name in changed.keys() & launched.keys():
         value, limit = np.array(changed[name]), np.array(launched[name])
         at_most = name in _AT_MOST

@@ -13,7 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from tactile_resonance.contact.parameters import LIMIT_RANGES, Workspace, read_contact
+from tactile_resonance.contact.parameters import LIMIT_RANGES, RANGES, Workspace, read_contact
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.running import initialised
@@ -24,7 +24,8 @@ LAXER_ABOVE = [
     *("abort_force_n", "hard_force_n", "pull_force_n", "lateral_force_n", "force_rate_n_per_s"),
     *("depth_m", "near_speed_m_s", "contact_speed_m_s", "lateral_speed_m_s", "free_speed_m_s"),
     *("angular_speed_rad_s", "tilt_rad", "misalignment_rad", "force_age_s", "arm_age_s"),
-    "stuck_samples",
+    *("stuck_samples", "contact.search_m", "contact.early_m"),
+    *("contact.tare_std_n", "contact.tare_drift_n_per_s", "contact.tare_offset_n"),
 ]
 
 
@@ -45,24 +46,31 @@ def launch():
         yield make
 
 
+def full(name):
+    """Name of a limit's parameter, or of one that names its group."""
+    return name if name.startswith("contact.") else f"limits.{name.replace('__', '.')}"
+
+
 def ask(node, **limits):
     """Set limits; why it is refused, empty where not."""
-    asked = [Parameter(f"limits.{n.replace('__', '.')}", value=v) for n, v in limits.items()]
+    asked = [Parameter(full(name), value=value) for name, value in limits.items()]
     return node.set_parameters_atomically(asked).reason
 
 
 @pytest.mark.parametrize("name", LAXER_ABOVE)
 def test_a_limit_that_protects_the_tissue_is_made_stricter_and_never_laxer(launch, name):
-    node, limit = launch(), getattr(LIMITS, name)
-    above = min(LIMIT_RANGES[name][1], 2 * limit)
+    node = launch()
+    limit = node.get_parameter(full(name)).value
+    short = name.removeprefix("contact.")
+    above = min({**RANGES, **LIMIT_RANGES}[short][1], 2 * limit)
     below = limit - 1 if isinstance(limit, int) else 0.9 * limit
     if name in ("near_speed_m_s", "contact_speed_m_s"):
         below = limit  # the parameters ask for it
     reason = ask(node, **{name: above})
-    assert reason.startswith(f"limits.{name}: got {above}; accepted is at most {limit}")
-    assert node.get_parameter(f"limits.{name}").value == limit
+    assert reason.startswith(f"{full(name)}: got {above}; accepted is at most {limit}, as launched")
+    assert node.get_parameter(full(name)).value == limit
     assert ask(node, **{name: below}) == ""
-    assert node.get_parameter(f"limits.{name}").value == below
+    assert node.get_parameter(full(name)).value == below
     assert ask(node, **{name: limit}) == ""  # back to what the launch set
 
 
