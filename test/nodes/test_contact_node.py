@@ -2,6 +2,7 @@
 """Limits of contact_node by parameter: as launched or stricter, never laxer; what ends its life."""
 
 import os
+import threading
 from contextlib import ExitStack
 from types import SimpleNamespace
 
@@ -10,9 +11,12 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 
+from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import LIMIT_RANGES, RANGES, Workspace, read_contact
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.contact_parameters import read_parameters
@@ -106,6 +110,30 @@ def test_the_workspace_of_a_launch_is_made_smaller_and_never_larger(launch):
     assert ask(node, workspace__low_m=[-0.1, -0.2, 0.1]) == ""
     assert "above low_m" in ask(node, workspace__high_m=[-0.2, 0.2, 0.5])
     assert "limits.workspace.low_m" in ask(node, workspace__low_m=[0.0, 0.0])
+
+
+def test_other_requests_are_served_while_the_program_of_an_arm_is_started_again(launch):
+    node, begun, go_on, asked = launch(), threading.Event(), threading.Event(), []
+
+    def make_ready():
+        begun.set()
+        asked.append(go_on.wait(5.0))
+
+    controller = SimpleNamespace(state=State.FAULT)
+    node._thread = SimpleNamespace(
+        controller=controller, make_ready=make_ready, retract=lambda: asked.append("retract")
+    )
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    task = executor.create_task(node._on_retract, Trigger.Request(), Trigger.Response())
+    while not begun.is_set():
+        executor.spin_once(0.1)
+    go_on.set()  # only an executor that is free comes to this before the wait has ended
+    while not task.done():
+        executor.spin_once(0.1)
+    executor.remove_node(node)
+    assert asked == [True, "retract"]
+    assert task.result().success
 
 
 @pytest.mark.parametrize("ends", [True, False])
