@@ -78,7 +78,7 @@ class Envelope:
         if not is_finite(arm):
             return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is not finite")
         box = limits.workspace
-        if not _inside(arm.position_m, box.low_m, box.high_m):
+        if not inside(arm.position_m, box.low_m, box.high_m):
             x, y, z = arm.position_m
             text = f"tip at {x:.4f}, {y:.4f}, {z:.4f} m, workspace {box.low_m} to {box.high_m} m"
             return Breach(Cause.WORKSPACE, text)
@@ -176,7 +176,7 @@ class Envelope:
             most = min(most, math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room))
         share = _shrink(speed, most)
         x, y, z = share * x, share * y, share * z
-        if not _inside(position_m, self._amid_low_m, self._amid_high_m):
+        if not inside(position_m, self._amid_low_m, self._amid_high_m):
             x, y, z = self._before_walls((x, y, z), position_m)
         share = _shrink(math.hypot(turn_x, turn_y, turn_z), limits.angular_speed_rad_s)
         return x, y, z, share * turn_x, share * turn_y, share * turn_z
@@ -202,7 +202,7 @@ def _age(age_s: float) -> str:
     return f"{1e3 * age_s:.0f} ms old" if age_s > 0 else f"{-1e3 * age_s:.0f} ms ahead of the clock"
 
 
-def _inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
+def inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
     """Whether a place is in a box, its walls included."""
     x, y, z = place_m
     return low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]

@@ -144,7 +144,7 @@ class ContactController:
         self._path = TipPath(goal, self._tip)
         self._free = FreeMotion(self._path, self._observer, p, limits)
         self._pressing = Pressing(goal, self._path, self._observer, p, limits)
-        self._judgement = Judgement(self._envelope, self._observer, p, now_ns)
+        self._judgement = Judgement(self._envelope, self._observer, p, now_ns, self._path)
         self._arm_was_bad = self._pressed_too_hard = False
         self._enter(State.TRAVEL, now_ns)
 

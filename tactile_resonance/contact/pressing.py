@@ -49,6 +49,7 @@ class Pressing:
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
+        self._lost_n = limits.lost_below_n(goal.aim.force_n)
         self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
         self._hold_height_m = 0.0
@@ -109,7 +110,7 @@ class Pressing:
 
     def _early(self, arm: ArmSample, surface_m: float) -> Move:
         """The surface seems to lie higher than accepted: noise, a first guess, or so it is."""
-        if self._was_noise(self._limits.lost_force_n):
+        if self._was_noise(self._lost_n):
             return Move(None, State.APPROACH)
         if not self._looked_again:
             self._looked_again = True
@@ -128,11 +129,12 @@ class Pressing:
         if state is State.CONTACT:
             noise = self._was_noise(observer.noise_n / 4)
             return Move(None, State.APPROACH) if noise else None
-        if mean >= limits.lost_force_n:
+        if mean >= self._lost_n:
             return None
-        if state is State.SETTLE and self._was_noise(limits.lost_force_n):
+        if state is State.SETTLE and self._was_noise(self._lost_n):
             return Move(None, State.APPROACH)
-        text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
+        text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms, "
+        text += f"limit {1e3 * self._lost_n:g} mN"
         return failed(Cause.CONTACT_LOST, text)
 
     def _was_noise(self, least_n: float) -> bool:
