@@ -172,6 +172,11 @@ class TurningWay:
         """Whether the tip is on its way up, not turned yet."""
         return self._passed < 2
 
+    @property
+    def poses(self) -> tuple[Pose, ...]:
+        """Between which the tip goes straight, or turns where it is, after that in which it begins."""
+        return tuple(stop.goal.touch for stop in self._stops)
+
     def twist(self, arm: ArmSample) -> Six | None:
         """Twist in the base towards the next place on the way; None: the last is reached."""
         while self._passed < len(self._stops):

@@ -30,6 +30,7 @@ from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
+from tactile_resonance.nodes.tip_use import UNCHECKED, TipUseClient
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.goal import (
@@ -51,7 +52,7 @@ from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
-from tactile_resonance.scan.surface import TouchRequest
+from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 from tactile_resonance.simulation.parameters import read_sensor
@@ -117,6 +118,7 @@ class ScanNode(ManagedNode):
         contact, table, table_frame, base_frame = values(self, *names)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
+        self._tip_use = TipUseClient(self) if robot else None
         self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
         self._frames = Frames(table_frame, base_frame, table_in_base)
         self._frames_of: dict[int, Frames] = {}  # as they stood when a goal arrived, by its message
@@ -153,7 +155,10 @@ class ScanNode(ManagedNode):
         progress = getattr(self, "_progress", None)
         if progress is None:
             return {}
-        return {"phase": progress.phase.value, "points": f"{progress.finished} of {progress.points}"}
+        return {
+            "phase": progress.phase.value,
+            "points": f"{progress.finished} of {progress.points}",
+        }
 
     def _act(self, kind: type, name: str, work: Any, check: Any, busy: Any) -> None:
         """Offer an action of which, with the others of this kind, one goal at a time is worked at."""
@@ -320,16 +325,31 @@ class ScanNode(ManagedNode):
         (seed,) = values(self, "seed")
         seed = goal.seed or seed
         found: FoundSurface | None = None
-        if plan is None:
-            assert isinstance(scene.surface, TouchRequest)
+        if isinstance(scene.surface, TouchRequest):
             found = self._find_surface(scene, scene.surface, tell)
-            plan = make_plan(scene, found.surface)
+            plan = self._clear_plan(scene, found.surface)
+        elif not isinstance(
+            scene.surface, Plane
+        ):  # that is what contact_node itself keeps clear of
+            plan = self._clear_plan(scene, scene.surface)
+        assert plan is not None
         facts = self._facts(scene, plan, seed)
         facts["frames"] = {name: pose.vector.tolist() for name, pose in frames.others.items()}
         if found is not None:
             facts["surface"] = found.as_json()
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
+
+    def _clear_plan(self, scene: ScanScene, surface: Surface) -> Plan:
+        """Points at which the sensor is clear of a surface; all of them where nothing is moved."""
+        if self._tip_use is None:
+            return make_plan(scene, surface)
+        use = self._tip_use.ask(scene.sensor.name)
+        plan = make_plan(scene, surface, use=use)
+        if use is None:
+            self.get_logger().warning(UNCHECKED.why)
+            plan = replace(plan, skipped=(*plan.skipped, UNCHECKED))
+        return plan
 
     def _require_same_table(self, run: RunDirectory) -> None:
         """A run goes on where it began; where the table is known better now, that is another place."""

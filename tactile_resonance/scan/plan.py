@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
@@ -63,6 +64,7 @@ def make_plan(
     surface: Surface | None = None,
     measurement: MeasurementDesign | None = None,
     timing: Timing | None = None,
+    use: TipUse | None = None,
 ) -> Plan:
     """Points of a scene on its surface.
 
@@ -74,11 +76,13 @@ def make_plan(
     measurement : MeasurementDesign, optional
         In place of that which `design_measurement` makes.
     timing : Timing, optional
+    use : TipUse, optional
+        The sensor, which must stay clear of the surface: points at which it would not are left out.
 
     Raises
     ------
     ValueError
-        If the surface is not known yet, or no position lies on it.
+        If the surface is not known yet, no position lies on it, or the sensor is clear of it at none.
     """
     timing = Timing() if timing is None else timing
     measurement = design_measurement(scene) if measurement is None else measurement
@@ -122,7 +126,23 @@ def make_plan(
         )
         if left.any()
     ]
+    if use is not None:
+        clear, touching = clear_points(points, surface, use)
+        if not clear:
+            raise ValueError(f"positions: none at which the sensor is clear; {touching[0].why}")
+        skipped += [
+            Skipped(f"the point at {_in_mm(out.point)}", out.why, float(each_s)) for out in touching
+        ]
+        points = tuple(
+            replace(point, index=index, label=f"{scene.name}, point {index + 1}")
+            for index, point in enumerate(clear)
+        )
     return plan_points(scene, points, skipped, measurement, timing)
+
+
+def _in_mm(point: ScanPoint) -> str:
+    x, y, _ = point.position_m
+    return f"x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm"
 
 
 def plan_points(

@@ -17,6 +17,7 @@ from tactile_resonance.fields import known_keys, number, numbers, require, secti
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 FORMS = ("plane", "height_field", "mesh", "touch")
 MOST_SEARCH_M = 0.02
 
@@ -34,6 +35,10 @@ class Surface(Protocol):
 
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) standard deviation of the height [m]; 0 where the surface is given."""
+        ...
+
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) whether the surface is known there, not only continued from beside it."""
         ...
 
 
@@ -62,6 +67,10 @@ class Plane:
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
+
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) everywhere."""
+        return np.ones(np.shape(xy_m)[:-1], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +113,22 @@ class HeightField:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
 
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) inside of the grid."""
+        return self._inside(np.asarray(xy_m, float))
+
     @cached_property
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
         return RectBivariateSpline(self.x_m, self.y_m, self.z_m, kx=orders[0], ky=orders[1])
 
+    def _inside(self, xy: FloatArray) -> BoolArray:
+        x, y = xy[..., 0], xy[..., 1]
+        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
+
     def _evaluate(self, xy: FloatArray, dx: int = 0, dy: int = 0) -> FloatArray:
         x, y = xy[..., 0], xy[..., 1]
-        inside = (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
+        inside = self._inside(xy)
         value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
         return np.where(inside, value, np.nan)
 

@@ -57,7 +57,7 @@ def heights(touch, places, turns):
 
 def stops(way):
     """Places (5, 3) and orientations of the way, from where it is known."""
-    poses = [stop.goal.touch for stop in way._stops]
+    poses = way.poses
     return np.array([p.position_m for p in poses]), Rotation.concatenate(
         [p.rotation for p in poses]
     )
