@@ -25,7 +25,7 @@ from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.turning import TurningWay
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.surface import Surface
 
 FloatArray = npt.NDArray[np.float64]
@@ -44,14 +44,6 @@ class TipUse:
     tip: TipGeometry
     parameters: ContactParameters
     limits: Limits
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A point that is left out, and why."""
-
-    point: ScanPoint
-    why: str
 
 
 def clear_points(

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import Surface, TouchRequest
 
@@ -64,7 +64,6 @@ def make_plan(
     surface: Surface | None = None,
     measurement: MeasurementDesign | None = None,
     timing: Timing | None = None,
-    use: TipUse | None = None,
 ) -> Plan:
     """Points of a scene on its surface.
 
@@ -76,13 +75,11 @@ def make_plan(
     measurement : MeasurementDesign, optional
         In place of that which `design_measurement` makes.
     timing : Timing, optional
-    use : TipUse, optional
-        The sensor, which must stay clear of the surface: points at which it would not are left out.
 
     Raises
     ------
     ValueError
-        If the surface is not known yet, no position lies on it, or the sensor is clear of it at none.
+        If the surface is not known yet, or no position lies on it.
     """
     timing = Timing() if timing is None else timing
     measurement = design_measurement(scene) if measurement is None else measurement
@@ -126,18 +123,41 @@ def make_plan(
         )
         if left.any()
     ]
-    if use is not None:
-        clear, touching = clear_points(points, surface, use)
-        if not clear:
-            raise ValueError(f"positions: none at which the sensor is clear; {touching[0].why}")
-        skipped += [
-            Skipped(f"the point at {_in_mm(out.point)}", out.why, float(each_s)) for out in touching
-        ]
-        points = tuple(
-            replace(point, index=index, label=f"{scene.name}, point {index + 1}")
-            for index, point in enumerate(clear)
-        )
     return plan_points(scene, points, skipped, measurement, timing)
+
+
+def clear_plan(scene: ScanScene, plan: Plan, surface: Surface, use: TipUse | None) -> Plan:
+    """The plan without points at which the sensor would not stay clear of the surface; None: not looked at.
+
+    Raises
+    ------
+    ValueError
+        If that is all of them.
+    """
+    return plan if use is None else plan_with(scene, plan, *clear_points(plan.points, surface, use))
+
+
+def plan_with(
+    scene: ScanScene, plan: Plan, points: Sequence[ScanPoint], left: Sequence[LeftOut]
+) -> Plan:
+    """The plan with these points, numbered anew, and what is left out of it noted.
+
+    Raises
+    ------
+    ValueError
+        If there is no point.
+    """
+    if not points:
+        raise ValueError(f"positions: all {len(left)} are left out; the first: {left[0].why}")
+    each_s = plan.longest_s / len(plan.points)
+    numbered = tuple(
+        replace(point, index=index, label=f"{scene.name}, point {index + 1}")
+        for index, point in enumerate(points)
+    )
+    entries = [Skipped(f"the point at {_in_mm(out.point)}", out.why, each_s) for out in left]
+    # what is saved at each point follows from their number
+    noted = plan.skipped[: len(plan.skipped) - len(plan.measurement.skipped)]
+    return plan_points(scene, numbered, [*noted, *entries], plan.measurement)
 
 
 def _in_mm(point: ScanPoint) -> str:

@@ -168,6 +168,47 @@ class TouchRequest:
     search_m: float = 0.0
 
 
+@dataclass(frozen=True)
+class NormalRequest:
+    """How normals are found by touch.
+
+    Attributes
+    ----------
+    radius_m : float
+        Of the circle about the point [m]. A larger one leaves less of the touches' noise and more of curvature;
+        one much smaller than the ball touches the same tissue again.
+    touches : int
+        On it.
+    force_n : float
+        That ends each touch [N]; 0: that of the scene.
+    most_angle_rad : float
+        From the normal as it is expected [rad].
+    most_std_rad : float
+        Standard deviation of the normal about any axis [rad].
+    tolerance_m : float
+        By which a touch may lie off the plane through all, where there are more than three [m].
+    """
+
+    radius_m: float = 2e-3
+    touches: int = 3
+    force_n: float = 0.0
+    most_angle_rad: float = 0.35
+    most_std_rad: float = 0.03
+    tolerance_m: float = 2e-4
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("radius_m", 5e-4, 0.01),
+            ("touches", 3, 12),
+            ("force_n", 0.0, 1.0),
+            ("most_angle_rad", 0.0, 0.8),
+            ("most_std_rad", 1e-3, 0.1),
+            ("tolerance_m", 1e-5, 2e-3),
+        ):
+            value = getattr(self, name)
+            require(low <= value <= high, name, value, f"{low:g} to {high:g}")
+
+
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:
     """Surface of a scene's section; files are looked for in the scene's folder.
 

@@ -11,7 +11,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.clearance import TipUse, clear_points, lowest_at_depth, lowest_between
-from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.plan import clear_plan, make_plan
 from tactile_resonance.scan.scene import ScanScene, SensorUse
 from tactile_resonance.scan.surface import HeightField, Plane
 from tactile_resonance.scan.touch import fit_surface
@@ -36,7 +36,8 @@ def planned(surface, xy, use=None, heading_rad=0.0):
     positions = np.column_stack([xy, np.full(len(xy), np.nan)])
     sensor = SensorUse(heading_rad=heading_rad)
     scene = ScanScene("test", 0.01, positions, surface=surface, sensor=sensor)
-    return make_plan(scene, use=use)
+    plan = make_plan(scene)
+    return plan if use is None else clear_plan(scene, plan, surface, use)
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.4, -0.3)])
@@ -132,7 +133,7 @@ def test_plan_leaves_out_what_is_not_clear_and_says_by_how_much():
     for entry in out:
         assert "at the depth limit of 4 mm the housing would be -1" in entry.why
         assert "accepted is clearance_m = 0.1 mm or more" in entry.why
-    with pytest.raises(ValueError, match="none at which the sensor is clear; at the depth limit"):
+    with pytest.raises(ValueError, match="all 1 are left out; the first: at the depth limit"):
         planned(bank, xy[:1], USE)
     # towards the other side the housing is over the flat
     assert len(planned(bank, xy[:1], USE, heading_rad=np.pi).points) == 1
