@@ -7,7 +7,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,8 +30,7 @@ from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
-from tactile_resonance.nodes.tip_use import UNCHECKED, TipUseClient
-from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.nodes.tip_use import TipUseClient
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.goal import (
@@ -45,17 +44,16 @@ from tactile_resonance.scan.goal import (
 from tactile_resonance.scan.goal_files import GoalFiles
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
-from tactile_resonance.scan.normal_search import FoundNormal, find_normals
-from tactile_resonance.scan.plan import Plan, clear_plan, make_plan, plan_points, plan_with
+from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.point_result import TOPIC
+from tactile_resonance.scan.preparation import UNCHECKED, Prepared, prepare
 from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
-from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
+from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
-from tactile_resonance.scan.surface import NormalRequest, Plane, TouchRequest
-from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
+from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 from tactile_resonance.simulation.parameters import read_sensor
 
@@ -326,32 +324,11 @@ class ScanNode(ManagedNode):
         scene, plan = self._place(wanted.scene, frames), wanted.plan
         (seed,) = values(self, "seed")
         seed = goal.seed or seed
-        found: FoundSurface | None = None
-        surface = scene.surface
-        if isinstance(surface, TouchRequest):
-            found = self._find_surface(scene, surface, tell)
-            surface, plan = found.surface, make_plan(scene, found.surface)
-        assert plan is not None
-        use: TipUse | None = None
-        if self._tip_use is not None and not isinstance(
-            surface, Plane
-        ):  # that contact_node keeps clear of
-            use = self._tip_use.ask(scene.sensor.name)
-            if use is None:
-                self.get_logger().warning(UNCHECKED.why)
-                plan = replace(plan, skipped=(UNCHECKED, *plan.skipped))
-        plan = clear_plan(scene, plan, surface, use)
-        normals: Sequence[FoundNormal] = ()
-        if scene.normals is not None:
-            normals, left = self._find_normals(scene, scene.normals, plan, tell)
-            plan = plan_with(scene, plan, [normal.point for normal in normals], left)
-            plan = clear_plan(scene, plan, surface, use)
+        made = self._prepared(scene, plan, tell)
+        plan = made.plan
         facts = self._facts(scene, plan, seed)
         facts["frames"] = {name: pose.vector.tolist() for name, pose in frames.others.items()}
-        if found is not None:
-            facts["surface"] = found.as_json()
-        if normals:
-            facts["normals"] = [normal.as_json() for normal in normals]
+        facts.update(made.facts)
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
 
@@ -378,45 +355,23 @@ class ScanNode(ManagedNode):
         RunDirectory.check_new(where, needed)
         return wanted, where, needed
 
-    def _find_surface(
-        self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
-    ) -> FoundSurface:
-        """Touch it; ValueError where it is not found."""
-        touch, radius_m = self._touch_of(scene, asked.force_n, len(asked.xy_m), tell)
-        try:
-            return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
-        except (ValueError, PointFailed, ScanEnded) as error:
-            raise ValueError(f"surface.touch: {error}") from error
-
-    def _find_normals(
-        self, scene: ScanScene, asked: NormalRequest, plan: Plan, tell: Callable[[Progress], None]
-    ) -> tuple[Sequence[FoundNormal], Sequence[LeftOut]]:
-        """Touch around each point; ValueError where that cannot be done."""
-        touch, radius_m = self._touch_of(scene, asked.force_n, len(plan.points), tell)
-        try:
-            return find_normals(plan.points, asked, radius_m, scene.sensor.heading_rad, touch)
-        except (PointFailed, ScanEnded) as error:
-            raise ValueError(f"normals: {error}") from error
-
-    def _touch_of(
-        self,
-        scene: ScanScene,
-        force_n: float | None,
-        count: int,
-        tell: Callable[[Progress], None],
-    ) -> tuple[Callable[[ScanPoint], Touch], float]:
-        """What touches a point with a force, the scene's if none, and the ball's radius; the tip is free."""
-        controls = self._controls
+    def _prepared(
+        self, scene: ScanScene, plan: Plan | None, tell: Callable[[Progress], None]
+    ) -> Prepared:
+        """Find by touch what is to be found so; ValueError where it is not."""
+        controls, tip_use = self._controls, self._tip_use
         assert controls is not None
         radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
 
-        def touch(point: ScanPoint) -> Touch:
+        def find(point: ScanPoint, force_n: float, count: int) -> Touch:
             tell(Progress(point, Phase.SURFACE, point.index, count))
-            return self._hands.find(point, force, radius_m, controls.check_cancelled)
+            return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
 
-        force = force_n or scene.force_n
-        self._hands.retract()
-        return touch, radius_m
+        use_of = None if tip_use is None else lambda: tip_use.ask(scene.sensor.name)
+        made = prepare(scene, plan, radius_m, find, use_of)
+        if UNCHECKED in made.plan.skipped:
+            self.get_logger().warning(UNCHECKED.why)
+        return made
 
     def _facts(self, scene: ScanScene, plan: Plan, seed: int) -> dict[str, Any]:
         """What a reader of the run should know beside its plan."""

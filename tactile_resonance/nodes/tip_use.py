@@ -14,7 +14,6 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.nodes.goals import POLL_S
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.simulation.parameters import read_sensor
 
 SERVICE = "contact_node/get_parameters"
@@ -23,11 +22,6 @@ GEOMETRY = ("beam_tilt_rad", "housing_below_m")
 PARAMETERS = ("standoff_m", "early_m")
 LIMITS = ("depth_m", "near_m", "misalignment_rad", "clearance_m")
 NAMES = (*GEOMETRY, *(f"contact.{n}" for n in PARAMETERS), *(f"limits.{n}" for n in LIMITS))
-UNCHECKED = Skipped(
-    "the check that the housing is clear of the surface",
-    f"{SERVICE} did not answer: the sensor is kept clear of a plane only",
-    0.0,
-)
 
 
 class TipUseClient:
