@@ -96,7 +96,7 @@ class Envelope:
         return None
 
     def judge_motion(self, arm: ArmSample, place: Place) -> Breach | None:
-        """Speed, alignment and depth near the surface and in it."""
+        """Speed, alignment and depth near the surface and in it; the housing anywhere."""
         limits = self.limits
         if place.depth_m is not None and place.depth_m > limits.depth_m:
             text = f"{1e3 * place.depth_m:.2f} mm past the first touch, limit {1e3 * limits.depth_m:g} mm"
@@ -109,9 +109,9 @@ class Envelope:
             if place.misalignment_rad > limits.misalignment_rad:
                 text = f"tip {place.misalignment_rad:.3f} rad off its orientation near the surface"
                 return Breach(Cause.MISALIGNED, f"{text}, limit {limits.misalignment_rad:g} rad")
-            if place.housing_m is not None and place.housing_m < limits.clearance_m:
-                text = f"housing {1e3 * place.housing_m:.2f} mm above the surface"
-                return Breach(Cause.HOUSING, f"{text}, limit {1e3 * limits.clearance_m:g} mm")
+        if place.housing_m is not None and place.housing_m < limits.clearance_m:
+            text = f"housing {1e3 * place.housing_m:.2f} mm above the surface"
+            return Breach(Cause.HOUSING, f"{text}, limit {1e3 * limits.clearance_m:g} mm")
         return None
 
     def judge_force(self, now_ns: int, watch: ForceWatch) -> Breach | None:

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tactile_resonance.contact.envelope import Envelope, Place, inside
+from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.goal import ENDED, TARED, TOUCHING, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits, Workspace
+from tactile_resonance.contact.parameters import ContactParameters, Workspace
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.tip_path import TipPath
+from tactile_resonance.contact.vectors import Vector
 
 BESIDE_M = 0.05
 """So far beside the way of a goal the tip may be [m]."""
@@ -29,7 +30,8 @@ class Judgement:
     parameters : ContactParameters
     start_ns : int
         When the contact was asked for.
-    path : TipPath
+    free : FreeMotion
+        Knows the way of the goal.
     """
 
     def __init__(
@@ -38,10 +40,10 @@ class Judgement:
         observer: Observer,
         parameters: ContactParameters,
         start_ns: int,
-        path: TipPath,
+        free: FreeMotion,
     ) -> None:
         self._envelope, self._observer, self._start_ns = envelope, observer, start_ns
-        self._path, self._parameters = path, parameters
+        self._free = free
         self._way: Workspace | None = None  # known with the first state of the arm
         limits = envelope.limits
         self._lowest_m = -parameters.search_m - limits.depth_m
@@ -103,7 +105,7 @@ class Judgement:
     def _judge_way(self, arm: ArmSample) -> Breach | None:
         """Whether the tip is near the way of this goal, from where it was first seen."""
         if self._way is None:
-            self._way = way_of(self._path, arm, self._parameters, self._envelope.limits)
+            self._way = box_around(self._free.places(arm), BESIDE_M)
         box = self._way
         if inside(arm.position_m, box.low_m, box.high_m):
             return None
@@ -120,15 +122,8 @@ class Judgement:
         return Breach(Cause.TIME, f"{state.value} took longer than {most:g} s")
 
 
-def way_of(
-    path: TipPath, arm: ArmSample, parameters: ContactParameters, limits: Limits
-) -> Workspace:
-    """Box around the way of a goal: where the tip is, lifted, above the touch, and as deep as allowed."""
-    p = parameters
-    lift_m = max(0.0, p.standoff_m - path.height_m(arm))
-    lifted_m = tuple(x + lift_m * n for x, n in zip(arm.position_m, path.normal, strict=True))
-    above_m = path.place_at(path.turning_height_m(p, limits))
-    deepest_m = path.place_at(-p.search_m - limits.depth_m)
-    axes = list(zip(arm.position_m, lifted_m, above_m, deepest_m, strict=True))
-    low_m = tuple(round(min(axis) - BESIDE_M, 4) for axis in axes)
-    return Workspace(low_m, tuple(round(max(axis) + BESIDE_M, 4) for axis in axes))
+def box_around(places: Sequence[Vector], beside_m: float) -> Workspace:
+    """Return the box around places, so much larger on every side."""
+    axes = list(zip(*places, strict=True))
+    low_m = tuple(round(min(axis) - beside_m, 4) for axis in axes)
+    return Workspace(low_m, tuple(round(max(axis) + beside_m, 4) for axis in axes))

@@ -37,8 +37,8 @@ SPEED_STD_M_S = 1e-3
 """Of the speed when a motion is detected."""
 
 LEARN_S, LEAST_LEARN_S, MIDDLE_S = 2.0, 0.8, 0.6
-"""Sizes of a motion and of its speed are means over so long, of use after the second; its middle over the third,
-short enough to leave creep out."""
+"""Sizes of a motion and of its speed are means over so long, of use after the second; its middle is one over
+the third, short enough to leave creep out."""
 
 SLOWEST_RAD_S, FASTEST_RAD_S = 5.0, 20.0
 """To and fro at these rates is foreseen; slower motion is followed well without."""

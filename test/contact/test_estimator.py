@@ -174,7 +174,9 @@ def follow(motion_m, seconds=4.0, seed=0, c=800.0):
         model.predict(DT)
         model.update(height, truth + NOISE_N * rng.standard_normal())
         force_n.append(model.force_at(height) - truth)
-        speed_m_s.append(model.surface_speed_m_s - (motion_m(n * DT + 1e-6) - motion_m(n * DT)) / 1e-6)
+        speed_m_s.append(
+            model.surface_speed_m_s - (motion_m(n * DT + 1e-6) - motion_m(n * DT)) / 1e-6
+        )
     return model, np.array(force_n), np.array(speed_m_s)
 
 
@@ -195,7 +197,7 @@ def test_motion_to_and_fro_is_detected_followed_and_foreseen(rate_hz, monkeypatc
         force_n, speed_m_s, pulls = [], [], []
         for seed in range(6):
             model, of_force, of_speed = follow(
-                lambda t: size_m * math.sin(omega * t + seed), seed=seed
+                lambda t, seed=seed: size_m * math.sin(omega * t + seed), seed=seed
             )
             assert model.moving
             force_n.append(rms(of_force))
