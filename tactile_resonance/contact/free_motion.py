@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states out of contact: travel to the standoff, tare, approach, and the way back."""
+"""The states before contact: travel to the standoff, tare, approach."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
+from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.turning import TurningWay
 from tactile_resonance.contact.vectors import Vector, added, scaled, vector
 
@@ -24,7 +24,7 @@ TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL = 0.01, 8.0
 
 
 class FreeMotion:
-    """Leads the tip to where the tissue should begin, and back; of one contact.
+    """Leads the tip to where the tissue should begin; of one contact.
 
     Parameters
     ----------
@@ -86,7 +86,8 @@ class FreeMotion:
             if twist is not None:
                 return Move(twist)
             self._turning = None
-        near = place.height_m < self._limits.near_m
+        # a cell under the sample feels what the tip does wherever it is, one on the tool how it is moved
+        near = place.height_m < self._limits.near_m or p.carried_kg == 0
         if self._path.must_lift(arm, p.standoff_m):
             # it may still press, where something ended while it did: up before it goes along
             return Move(self._path.lift(arm, p))
@@ -145,11 +146,3 @@ class FreeMotion:
         told = self.told_m is not None
         speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
         return Move(self._path.along_normal(arm, -speed))
-
-    def draw_back(self, since_s: float, arm: ArmSample, place: Place) -> Move:
-        """Up along the normal to the standoff; `since_s` has gone by in this state."""
-        if since_s > self._limits.retract_s:
-            return failed(Cause.TIME, "retraction took too long")
-        if self._parameters.standoff_m - place.height_m < ARRIVED_M:
-            return Move(None, State.IDLE)
-        return Move(self.path.lift(arm, self._parameters))

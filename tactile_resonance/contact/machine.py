@@ -7,6 +7,7 @@ Pure: data in, a command out. What talks to devices is in `loop`; what each stat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from tactile_resonance.contact.admission import check_goal
@@ -26,6 +27,7 @@ from tactile_resonance.contact.result import Breach, Cause, ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import Vector, dot
+from tactile_resonance.contact.withdrawal import Withdrawal
 
 RELIEVING = (*TOUCHING, State.RETRACT)
 """States in which force is taken off as fast as it may be."""
@@ -38,6 +40,9 @@ PRESSING_CAUSES = frozenset({Cause.FORCE_ABORT, Cause.FORCE_HARD, Cause.FORCE_RA
 
 ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_INVALID})
 """After these the tip is not drawn back: the arm moves again only on request."""
+
+STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
+"""And after these: nor does it go on where it is held."""
 
 
 WISH_NS = 1_000_000_000
@@ -93,8 +98,8 @@ class ContactController:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing more happens by itself: idle, or in a fault of the arm."""
-        stays = self.state is State.FAULT and self._arm_was_bad and not self._wish_retract
+        """Whether nothing more happens by itself: idle, or in a fault that the tip stays in."""
+        stays = self.state is State.FAULT and self._stays and not self._wish_retract
         return stays or self.state is State.IDLE
 
     @property
@@ -144,8 +149,9 @@ class ContactController:
         self.goal, self._observer, self._free = goal, observer, free
         self._outcome = Outcome(observer, now_ns)
         self._pressing = Pressing(goal, path, observer, p, limits)
+        self._withdrawal = Withdrawal(free, observer, p, limits)
         self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
-        self._arm_was_bad = self._pressed_too_hard = False
+        self._stays = self._pressed_too_hard = False
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
@@ -196,7 +202,7 @@ class ContactController:
             self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
         )
         if breach is not None and self.state is State.FAULT:
-            self._arm_was_bad = True  # nothing else counts in this state
+            self._stays = True  # nothing else counts in this state
         elif breach is not None:
             self._fail(breach, now_ns)
         if self._wish_retract:
@@ -256,10 +262,10 @@ class ContactController:
             return self._free.tare(now_ns, arm)
         since_s = self._since_s(now_ns)
         if self.state is State.RETRACT:
-            return self._free.draw_back(since_s, arm, place)
+            return self._withdrawal.step(now_ns, since_s, arm, place)
         # in a fault it stands still, and is then drawn back, unless the arm itself was the fault
         after_s = 0.0 if self._pressed_too_hard else RETRACT_AFTER_S
-        return REST if self._arm_was_bad or since_s < after_s else Move(None, State.RETRACT)
+        return REST if self._stays or since_s < after_s else Move(None, State.RETRACT)
 
     def _follow(self, move: Move, now_ns: int) -> None:
         """Go over to the state that follows."""
@@ -270,7 +276,11 @@ class ContactController:
                 told_m = self._free.told_m
                 self._outcome.reached(now_ns, self._pressing.touched_ns, move.estimate, told_m)
             if move.to is State.IDLE:
-                self._outcome.drawn_back()
+                observer = self._observer
+                # the second zero is a mean over as long as a lost contact is
+                count = self.limits.lost_s / self.parameters.period_s
+                std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
+                self._outcome.drawn_back(self._withdrawal.zero_n, std_n)
             self._enter(move.to, now_ns)
 
     # pieces
@@ -289,13 +299,17 @@ class ContactController:
         return Place(path.normal, self._height_m, depth, path.off_rad(arm), housing_m)
 
     def _enter(self, state: State, now_ns: int) -> None:
+        if state is State.RETRACT:
+            result, touched = self.result, self._observer.model is not None
+            aim_n = self.goal.aim.force_n if touched and self.goal is not None else 0.0
+            self._withdrawal.begin(Cause.NONE if result is None else result.cause, aim_n)
         self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None
 
     def _fail(self, breach: Breach, now_ns: int) -> None:
         """Note why, and stop."""
-        self._arm_was_bad = breach.cause in ARM_CAUSES
+        self._stays = breach.cause in STAYING_CAUSES
         self._pressed_too_hard = breach.cause in PRESSING_CAUSES
         self._end(breach, now_ns)
         self._enter(State.FAULT, now_ns)

@@ -38,8 +38,10 @@ class Observer:
     arm_model : ArmModel
     model : ContactFilter or None
         From the touch on.
-    taring : bool
-        Whether forces are collected for a tare.
+    taring, tared : bool
+        Whether forces are collected for a tare; whether there is a zero.
+    sound : bool
+        Whether no force of this contact was bad.
     noise_n, bias_std_n : float
         Of one force and of the bias, from the last tare [N].
     """
@@ -52,6 +54,7 @@ class Observer:
         )
         self.model: ContactFilter | None = None
         self.taring = False
+        self.tared, self.sound = False, True
         self._unloaded: list[WrenchSample] = []
         self.noise_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
@@ -84,6 +87,7 @@ class Observer:
             text = f"tare: noise of {1e3 * noise:.2g} mN rms, the source states"
             return Breach(Cause.TARE, f"{text} {1e3 * p.cell_noise_n:g} mN: does it still measure?")
         self.watch.set_bias(vector(zero.force_n))
+        self.tared = True
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.force_std_n[2])
         # neighbouring forces that are alike make means less certain than white noise would
@@ -123,6 +127,7 @@ class Observer:
                 inertia = -self._carried_kg * _between(self._accelerations, then, 0.0)
             breach = watch.add(sample, inertia)
             if breach is not None:
+                self.sound = False
                 return breach
             if self.taring:
                 self._unloaded.append(sample)

@@ -10,6 +10,9 @@ from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
 
+ZERO_MOVED = 4.0
+"""Deviations by which two zeros of one contact differ, for the zero to have moved."""
+
 
 class Outcome:
     """What has become of a contact so far.
@@ -59,18 +62,41 @@ class Outcome:
         result = self.result(holding)
         if result is None:
             self._result = self._not_reached(breach, now_ns, told_m)
-        elif result.cause is Cause.NONE:
+        elif result.cause is Cause.NONE or (
+            breach.cause is Cause.HELD and result.cause is not Cause.HELD
+        ):
+            before = "" if result.cause is Cause.NONE else f"; before: {result.message}"
             self._result = replace(
                 result,
                 cause=breach.cause,
-                message=breach.message,
+                message=breach.message + before,
                 peak_force_n=self._observer.watch.peak_n,
             )
 
-    def drawn_back(self) -> None:
-        """Note that the tip is back at the standoff."""
-        if self._result is not None:
-            self._result = replace(self._result, retracted=True)
+    def drawn_back(self, zero_n: float | None, zero_std_n: float) -> None:
+        """Note that the tip is back at the standoff, and what the force source shows there.
+
+        Parameters
+        ----------
+        zero_n : float or None
+            None: not known.
+        zero_std_n : float
+            Of the difference of two zeros [N].
+        """
+        result = self._result
+        if result is None:
+            return
+        result = replace(result, retracted=True, zero_change_n=zero_n)
+        if zero_n is not None and abs(zero_n) > ZERO_MOVED * zero_std_n:
+            text = f"the zero of the force moved by {1e3 * zero_n:.1f} mN in this contact"
+            std = result.force_std_n
+            result = replace(
+                result,
+                message=f"{result.message}; {text}" if result.message else text,
+                # anywhere between nothing and all of it
+                force_std_n=None if std is None else math.hypot(std, zero_n / 2),
+            )
+        self._result = result
 
     def _not_reached(self, breach: Breach, now_ns: int, told_m: float | None) -> ContactResult:
         return ContactResult(

@@ -38,6 +38,7 @@ class Cause(str, Enum):
     ARM_INVALID = "arm_invalid"
     TIME = "time"
     HOLD_ENDED = "hold_ended"
+    HELD = "held"
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,9 @@ class ContactResult:
         Largest single measured force along the normal [N]; 0 before the tare.
     retracted : bool
         Whether the tip is back at the standoff.
+    zero_change_n : float or None
+        By how much the zero of the force has moved since the tare, once the tip is back [N]; None where it is
+        not known. Where that is more than noise, it is in the message and in `force_std_n`.
     """
 
     reached: bool
@@ -96,3 +100,4 @@ class ContactResult:
     peak_force_n: float
     retracted: bool
     told_m: float | None = None
+    zero_change_n: float | None = None

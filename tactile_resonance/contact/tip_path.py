@@ -107,12 +107,12 @@ class TipPath:
 
     # twists in the base
 
-    def lift(self, arm: ArmSample, parameters: ContactParameters) -> Six:
-        """Straight up to the standoff, neither along the surface nor turning."""
+    def lift(self, arm: ArmSample, parameters: ContactParameters, share: float = 1.0) -> Six:
+        """Straight up to the standoff, neither along the surface nor turning, at a share of its speed."""
         left = max(0.0, parameters.standoff_m - self.height_m(arm))
         p = parameters
         speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
-        return *scaled(max(speed, 1e-4), self.normal), *ZERO
+        return *scaled(max(share * speed, 1e-4), self.normal), *ZERO
 
     def travel(self, arm: ArmSample, parameters: ContactParameters) -> Six:
         """Straight to the standoff; what little is left is turned meanwhile."""

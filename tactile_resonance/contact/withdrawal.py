@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drawing the tip back: whether it comes free is judged by force, where force can be believed.
+
+What clings to the tip (a film, a fibre, tissue that sticks) pulls the harder the further the tip goes; a zero
+that has moved does not. So the tip goes the slower the more it is pulled, and where the pull is beyond what
+is accepted it feels its way: if the pull grows the tip is held, if not it was the zero. At the standoff what
+is still there is told apart in the same way: tissue that presses is left behind, a zero is not.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import mean, stdev
+
+from tactile_resonance.contact.envelope import Place
+from tactile_resonance.contact.free_motion import FreeMotion
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.move import Move, failed
+from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.tip_path import ARRIVED_M
+
+BLIND_CAUSES = frozenset({Cause.FORCE_STALE, Cause.FORCE_SOURCE})
+"""After these, and after a bad force, the source is not believed: the tip is drawn back by position alone."""
+
+SMOOTH_S = 0.008
+"""Forces are averaged over about so long [s]."""
+
+LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.5
+"""Speed with which the surface is left, until so far above it; less than so much of the force is pressed then."""
+
+FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 5e-4, 0.08, 4e-4, 2e-3
+"""Speed of a tip that is pulled too hard, until its mean force has come to what it is, the way after that, and
+growth of the pull on it that is no zero."""
+
+LEFT_N, NOISES = 2e-3, 5.0
+"""Force at the standoff that is looked into [N], or so many deviations of the mean of 50 ms."""
+
+BEYOND_M_S, STEP_M, BEYOND_M = 5e-3, 1e-3, 0.02
+"""Beyond the standoff: speed, way between two means that are compared, and how far."""
+
+
+class Withdrawal:
+    """Draws the tip back along the normal to the standoff, or until nothing presses; of one contact.
+
+    Parameters
+    ----------
+    free : FreeMotion
+        Knows which surface is left.
+    observer : Observer
+    parameters : ContactParameters
+    limits : Limits
+
+    Attributes
+    ----------
+    zero_n : float or None
+        What the force source shows at its end, less the zero of the tare [N]; None where it is not
+        believed, or no zero was taken.
+    """
+
+    def __init__(
+        self, free: FreeMotion, observer: Observer, parameters: ContactParameters, limits: Limits
+    ) -> None:
+        self._free, self._observer = free, observer
+        self._parameters, self._limits = parameters, limits
+        self.zero_n: float | None = None
+        self._least_n: float | None = None  # force along the normal that is accepted
+        self._surface_m = -math.inf  # where the tissue was touched
+        self._smooth_n = math.nan
+        self._felt_s, self._felt_from = 0.0, (0.0, 0.0)  # height and force
+        self._step: tuple[float, list[float]] | None = None  # where it begins, and its forces
+        self._before_n = math.nan  # mean of the last step
+
+    def begin(self, cause: Cause, touched_n: float) -> None:
+        """Begin, after a cause; with the force that was pressed with, 0 where nothing was touched."""
+        self._believed = cause not in BLIND_CAUSES
+        self._must_leave = cause in (Cause.SURFACE_EARLY, Cause.TARE)
+        self._pressed_n = PRESSED * touched_n
+        now_n = self._observer.watch.force_n[2]
+        self._smooth_n = now_n
+        self._step = None  # what it has felt stays: a tip that was held is not pulled harder on request
+        model = self._observer.model
+        if self._least_n is None and self._observer.tared:
+            self._surface_m = -math.inf if model is None else model.surface_m
+            # the force goes down by what is pressed with, wherever the zero is now
+            self._least_n = min(0.0, now_n - max(touched_n, now_n)) - self._limits.pull_force_n
+
+    def step(self, now_ns: int, since_s: float, arm: ArmSample, place: Place) -> Move:
+        """One cycle; `since_s` has gone by in this state."""
+        if since_s > self._limits.retract_s:
+            return failed(Cause.TIME, "retraction took too long")
+        watch, p = self._observer.watch, self._parameters
+        believed = self._believed and self._observer.sound
+        believed = believed and watch.age_s(now_ns) <= self._limits.force_age_s
+        force_n = watch.force_n[2]
+        self._smooth_n += (force_n - self._smooth_n) * p.period_s / SMOOTH_S
+        if self._step is None and p.standoff_m - place.height_m >= ARRIVED_M:
+            share = self._share(place.height_m) if believed else 1.0
+            if share is None:
+                return failed(
+                    Cause.HELD,
+                    f"{-1e3 * self._smooth_n:.1f} mN pull on the tip {1e3 * place.height_m:.2f} mm above the "
+                    f"surface and grow while it is drawn back, accepted are "
+                    f"{-1e3 * (self._least_n or 0.0):.1f} mN: free it, then ask it to retract",
+                )
+            return Move(self._free.path.lift(arm, p, share))
+        if not believed:
+            return Move(None, State.IDLE)
+        return self._leave(arm, place.height_m, force_n)
+
+    def _share(self, height_m: float) -> float | None:
+        """Of its speed with which the tip goes up; None where it is held."""
+        if self._least_n is None:
+            return 1.0
+        most = 1.0
+        # a beam bends by so much more before what clings to the ball pulls as hard as it may
+        leave_m = LEAVE_M + self._limits.pull_force_n / self._parameters.beam_n_per_m
+        if self._smooth_n < self._pressed_n and height_m < self._surface_m + leave_m:
+            most = min(1.0, LEAVE_M_S / self._parameters.retract_speed_m_s)
+        room = (self._smooth_n - self._least_n) / self._limits.pull_force_n
+        slowest = FEEL_M_S / self._parameters.retract_speed_m_s
+        if room > 0:
+            self._felt_s = 0.0
+            return max(slowest, most * min(1.0, room))
+        self._felt_s += self._parameters.period_s
+        # below the surface what it still presses with goes, too
+        if self._felt_s <= FEEL_NOT_S or height_m < self._surface_m:
+            self._felt_from = height_m, self._smooth_n
+        begun_m, begun_n = self._felt_from
+        if self._smooth_n < begun_n - GROWS_N:
+            return None
+        if height_m - begun_m > FEEL_M:  # the zero has moved
+            self._least_n = self._smooth_n - self._limits.pull_force_n
+            self._felt_s = 0.0
+        return slowest
+
+    def _leave(self, arm: ArmSample, height_m: float, force_n: float) -> Move:
+        """At the standoff: idle where nothing presses or pulls, else on until it no longer changes."""
+        observer = self._observer
+        if self._step is None:
+            mean_n = observer.watch.mean_n
+            samples = max(1.0, self._limits.lost_s / self._parameters.period_s)
+            left_n = max(LEFT_N, NOISES * observer.noise_n / math.sqrt(samples))
+            small = observer.tared and mean_n is not None and abs(mean_n) <= left_n
+            if small or not (observer.tared or self._must_leave):
+                self.zero_n = mean_n if observer.tared else None
+                return Move(None, State.IDLE)
+            self._step, self._before_n = (height_m, []), math.nan
+        begun_m, forces_n = self._step
+        forces_n.append(force_n)
+        if height_m - begun_m >= STEP_M and len(forces_n) > 1:
+            now_n, std_n = mean(forces_n), stdev(forces_n)
+            change_n = abs(now_n - self._before_n)
+            if change_n < max(LEFT_N / 2, NOISES * std_n * math.sqrt(2 / len(forces_n))):
+                self.zero_n = now_n if observer.tared else None
+                return Move(None, State.IDLE)
+            self._step, self._before_n = (height_m, []), now_n
+        if height_m - self._parameters.standoff_m > BEYOND_M:
+            if not observer.tared:  # a source that is not steady enough for a zero says no more
+                return Move(None, State.IDLE)
+            text = f"the force still changes {1e3 * height_m:.0f} mm above the surface"
+            return failed(Cause.HELD, f"{text}: free the tip, then ask it to retract")
+        return Move(self._free.path.along_normal(arm, BEYOND_M_S))

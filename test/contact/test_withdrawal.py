@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tip that is drawn back: by what it is held, what still presses on it, and where its zero went."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.simulation.plant import Plane
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contacts import FORCE_N, QUICK, SOFT, contact, lower, started, stiffer
+
+PULL_N = Limits().pull_force_n
+
+
+class Clinging:
+    """Tissue that, once touched, holds the ball back above its surface.
+
+    `pull` says how hard [N], from how far above the surface the ball is [m] and how fast it goes up [m/s];
+    None: it has let go.
+    """
+
+    def __init__(self, tip, pull):
+        self._tip, self._pull, self._height_m, self._touched = tip, pull, 0.0, False
+        self.indenter = self
+        self.force_n = self.depth_m = 0.0
+
+    def step(self, depth_m, dt_s):
+        self.force_n = self._tip.step(depth_m, dt_s)
+        self._touched |= self.force_n > 0
+        up_m_s, self._height_m = (-depth_m - self._height_m) / dt_s, -depth_m
+        self.depth_m = max(depth_m, 1e-9)
+        if self._touched and depth_m < 0:
+            pull_n = self._pull(-depth_m, up_m_s)
+            self._touched = pull_n is not None
+            self.force_n = -(pull_n or 0.0)
+        return self.force_n
+
+
+def clinging(pull):
+    made = started()
+    assert made.run_until(State.HOLD)
+    plant = made.bench.plant
+    plant._on = Clinging(plant._on, pull)
+    plant._on._touched = True
+    made.controller.retract()
+    made.run_until(State.IDLE, 4.0)
+    return made
+
+
+def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
+    made = clinging(lambda height_m, _: 40.0 * height_m)
+    assert made.controller.state is State.FAULT
+    result = made.controller.result
+    assert result.cause is Cause.HELD
+    assert "grow while it is drawn back" in result.message
+    assert min(made.force_n) > -(PULL_N + 5e-3)
+    assert np.abs(made.speed_m_s[-100:]).max() < 3e-4
+    assert made.controller.settled
+
+
+def test_hook_that_is_asked_for_again_is_pulled_no_harder():
+    made = clinging(lambda height_m, _: 40.0 * height_m)
+    for _ in range(5):
+        made.controller.retract()
+        made.run(1.0)
+    assert made.controller.state is State.FAULT
+    assert min(made.force_n) > -(PULL_N + 5e-3)
+
+
+def test_tip_that_is_freed_is_drawn_back_on_request():
+    made = clinging(lambda height_m, _: 40.0 * height_m)
+    made.bench.plant._on._pull = lambda *_: None
+    made.run(0.1)
+    made.controller.retract()
+    assert made.run_until(State.IDLE, 3.0)
+    assert made.controller.result.retracted
+    assert made.controller.result.cause is Cause.HELD  # what happened stays said
+
+
+def test_film_that_pulls_as_fast_as_it_is_drawn_is_left_slowly():
+    # 1 N s/m: at 20 mm/s it would pull with 20 mN; it tears 2 mm above the surface
+    made = clinging(lambda height_m, up_m_s: 1.0 * max(0.0, up_m_s) if height_m < 2e-3 else None)
+    assert made.controller.state is State.IDLE
+    assert made.controller.result.retracted
+    assert min(made.force_n) > -(PULL_N + 1e-3)
+
+
+@pytest.mark.parametrize("step_n", [0.02, -0.02])
+def test_zero_that_steps_in_the_hold_does_not_keep_the_tip_and_is_reported(step_n):
+    # 20 mN are beyond what is accepted as pull, or beyond what may be left at the standoff
+    made = started(limits=Limits(abort_force_n=0.04))
+    assert made.run_until(State.HOLD)
+    made.run(0.2)
+    made.bench.cell.faults.bias_step_n = step_n
+    made.run_until(State.IDLE, 6.0)
+    made.controller.retract()
+    assert made.run_until(State.IDLE, 6.0)
+    result = made.controller.result
+    # the cell under the sample shows a press as a negative force
+    assert result.zero_change_n == pytest.approx(-step_n, abs=6e-4)
+    assert "zero of the force moved" in result.message
+    assert result.force_std_n > abs(step_n) / 3
+
+
+def test_steady_zero_is_not_reported():
+    made = started()
+    assert made.run_until(State.HOLD)
+    made.run(0.5)
+    std_n = made.controller.result.force_std_n
+    made.controller.retract()
+    assert made.run_until(State.IDLE, 3.0)
+    result = made.controller.result
+    assert abs(result.zero_change_n) < 1e-3
+    assert "zero" not in result.message
+    assert result.force_std_n == pytest.approx(std_n, rel=0.2)
+
+
+def test_surface_above_the_standoff_is_left_before_the_tip_is_idle():
+    made = contact(stiffer(SOFT, 3.0), height_m=2.0e-3, start_m=2.2e-3)
+    made.loop.start(made.goal)
+    assert made.run_until(State.TARE)
+    made.run(0.08)
+    plane = made.bench.plant.surface
+
+    def rise():
+        up_m = min(3e-3, (made.bench.clock.time_ns - began_ns) * 4e-12)  # 4 mm/s
+        made.bench.plant.surface = Plane(plane.point_m + [0, 0, up_m], plane.normal)
+
+    began_ns = made.bench.clock.time_ns
+    made.bench.clock.on_step.insert(0, rise)
+    assert made.run_until(State.IDLE, 6.0), made.controller.result
+    assert made.controller.result.cause in (Cause.SURFACE_EARLY, Cause.TARE)
+    # by position alone it would press with more than 100 mN at the standoff
+    assert made.force_n[-1] < 1e-3
+
+
+def test_broken_source_does_not_keep_the_tip():
+    made = started()
+    assert made.run_until(State.HOLD)
+    made.bench.cell.faults.stuck = True
+    assert made.run_until(State.IDLE, 3.0)
+    result = made.controller.result
+    assert result.cause is Cause.FORCE_STUCK
+    assert result.retracted
+    assert result.zero_change_n is None
