@@ -146,6 +146,11 @@ class ContactFilter:
         """Whether the surface is seen to move."""
         return self._motion.moving
 
+    @property
+    def surprise(self) -> float:
+        """How much more force comes than the model expects, in deviations of a mean of some forces."""
+        return self._motion.surprise
+
     def predict(self, dt_s: float) -> None:
         """Let time pass."""
         motion = self._motion

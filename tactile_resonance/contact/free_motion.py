@@ -22,6 +22,9 @@ STILL_M_S, STILL_NS = 5e-4, 50_000_000
 TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL = 0.01, 8.0
 """Change of the untared force, near the surface, that is a touch [N]; more where so much is noise."""
 
+SLOWING_M = 2e-4
+"""So far above the highest place of the surface the tip becomes as slow as the touch may be."""
+
 
 class FreeMotion:
     """Leads the tip to where the tissue should begin; of one contact.
@@ -32,6 +35,8 @@ class FreeMotion:
     observer : Observer
     parameters : ContactParameters
     limits : Limits
+    touch_speed_m_s : float
+        At which the tissue may be met, at most.
 
     Attributes
     ----------
@@ -42,9 +47,14 @@ class FreeMotion:
     """
 
     def __init__(
-        self, path: TipPath, observer: Observer, parameters: ContactParameters, limits: Limits
+        self,
+        path: TipPath,
+        observer: Observer,
+        parameters: ContactParameters,
+        limits: Limits,
+        touch_speed_m_s: float = math.inf,
     ) -> None:
-        self._path, self._observer = path, observer
+        self._path, self._observer, self._touch_speed_m_s = path, observer, touch_speed_m_s
         self._parameters, self._limits = parameters, limits
         self.begun = False
         self._turning: TurningWay | None = None
@@ -143,6 +153,9 @@ class FreeMotion:
         if place.height_m < -p.search_m:
             text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
             return failed(Cause.SURFACE_MISSING, text)
-        told = self.told_m is not None
-        speed = min(p.approach_speed_m_s, p.told_speed_m_s) if told else p.approach_speed_m_s
+        speed = p.approach_speed_m_s
+        if place.height_m < p.early_m + SLOWING_M:
+            speed = min(speed, self._touch_speed_m_s)
+        if self.told_m is not None:
+            speed = min(speed, p.told_speed_m_s)
         return Move(self._path.along_normal(arm, -speed))

@@ -8,7 +8,9 @@ Pure: data in, a command out. What talks to devices is in `loop`; what each stat
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.envelope import Envelope, Place, is_finite
@@ -26,7 +28,7 @@ from tactile_resonance.contact.pressing import Pressing
 from tactile_resonance.contact.result import Breach, Cause, ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.contact.vectors import Vector, dot
+from tactile_resonance.contact.vectors import Vector, dot, vector
 from tactile_resonance.contact.withdrawal import Withdrawal
 
 RELIEVING = (*TOUCHING, State.RETRACT)
@@ -44,6 +46,9 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
 """And after these: nor does it go on where it is held."""
 
+
+SUCCEEDED = 10_000
+"""So many places of contacts are kept: near them the tissue is known."""
 
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
@@ -80,6 +85,7 @@ class ContactController:
         self._envelope = Envelope(limits)
         self._observer = Observer(parameters, limits)
         self._outcome = Outcome(self._observer, 0)
+        self._succeeded: deque[Vector] = deque(maxlen=SUCCEEDED)  # where contacts were
         self._height_m = 0.0
         self._state_ns = 0
         self._wish_retract = False
@@ -89,6 +95,12 @@ class ContactController:
     def result(self) -> ContactResult | None:
         """Of the last goal, once it was reached or failed; while held its force is the mean so far."""
         return self._outcome.result(self.state is State.HOLD)
+
+    @property
+    def motion(self) -> str:
+        """How tissue that moves does so under the held tip, in a sentence; empty where it is still."""
+        model = self._observer.model
+        return "" if model is None or not model.moving else self._pressing.motion.describe()
 
     @property
     def estimate(self) -> ContactEstimate | None:
@@ -143,12 +155,13 @@ class ContactController:
         check_goal(goal, p, limits, self._tip)
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
-        free = FreeMotion(path, observer, p, limits)
+        speed = math.inf if self._is_known(goal) else p.first_speed_m_s(limits.abort_force_n)
+        free = FreeMotion(path, observer, p, limits, speed)
         if arm is not None and is_finite(arm):
             free.begin(arm)
         self.goal, self._observer, self._free = goal, observer, free
         self._outcome = Outcome(observer, now_ns)
-        self._pressing = Pressing(goal, path, observer, p, limits)
+        self._pressing = Pressing(goal, path, observer, p, limits, speed)
         self._withdrawal = Withdrawal(free, observer, p, limits)
         self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
         self._stays = self._pressed_too_hard = False
@@ -281,7 +294,21 @@ class ContactController:
                 count = self.limits.lost_s / self.parameters.period_s
                 std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
                 self._outcome.drawn_back(self._withdrawal.zero_n, std_n)
+                self._remember()
             self._enter(move.to, now_ns)
+
+    def _is_known(self, goal: ContactGoal) -> bool:
+        """Whether a contact near a goal has succeeded."""
+        place_m = vector(goal.touch.position_m)
+        return any(math.dist(place_m, m) <= self.parameters.known_radius_m for m in self._succeeded)
+
+    def _remember(self) -> None:
+        """Keep where a contact was that was reached and ended as it should."""
+        result = self.result
+        if self.goal is None or result is None or not result.reached:
+            return
+        if result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
+            self._succeeded.append(vector(self.goal.touch.position_m))
 
     # pieces
 
@@ -316,4 +343,7 @@ class ContactController:
 
     def _end(self, breach: Breach, now_ns: int) -> None:
         """Note why the contact was not reached, or ended."""
-        self._outcome.ended(breach, now_ns, self._free.told_m, self.state is State.HOLD)
+        holding = self.state is State.HOLD
+        if holding and self.motion:
+            breach = replace(breach, message=f"{breach.message}; {self.motion}")
+        self._outcome.ended(breach, now_ns, self._free.told_m, holding)

@@ -62,6 +62,11 @@ class MovingSurface:
         self._learnt_s = self._middle_m = self._middle_n = self._way_m2 = self._speed_m2_s2 = 0.0
 
     @property
+    def surprise(self) -> float:
+        """Running mean of the innovations, in the deviations of white ones."""
+        return self._mean * OF_MEAN
+
+    @property
     def intensity_m2_s3(self) -> float:
         """Spectral density of the acceleration [m2/s3]."""
         return math.exp(self._ln_intensity)

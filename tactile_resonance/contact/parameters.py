@@ -17,10 +17,15 @@ from tactile_resonance.fields import (
     section,
 )
 
+REACTION_S = 0.03
+"""From a touch until the arm stands: means of forces, cycles, dead time, lag and braking [s]."""
+
 RANGES: dict[str, tuple[float, float]] = {
     "approach_speed_m_s": (1e-4, 5e-3),
     "press_speed_m_s": (1e-4, 5e-3),
     "told_speed_m_s": (1e-4, 5e-3),
+    "unknown_speed_m_s": (1e-4, 5e-3),
+    "known_radius_m": (0.0, 1.0),
     "travel_speed_m_s": (1e-3, 0.25),
     "retract_speed_m_s": (1e-3, 0.1),
     "acceleration_m_s2": (0.05, 2.0),
@@ -59,6 +64,9 @@ class ContactParameters:
         Towards the surface before and after the touch [m/s].
     told_speed_m_s : float
         Towards it, at most, once another sensor has detected the touch and the force has not yet [m/s].
+    unknown_speed_m_s, known_radius_m : float
+        Towards it and after the touch, at least, where no contact has succeeded so near [m/s], [m]: what is
+        touched may be bone (see `first_speed_m_s`).
     travel_speed_m_s, retract_speed_m_s : float
         To the standoff, and away from the tissue [m/s].
     acceleration_m_s2, relief_acceleration_m_s2 : float
@@ -100,6 +108,8 @@ class ContactParameters:
     approach_speed_m_s: float = 4e-3
     press_speed_m_s: float = 5e-3
     told_speed_m_s: float = 1e-3
+    unknown_speed_m_s: float = 3e-4
+    known_radius_m: float = 0.01
     travel_speed_m_s: float = 0.05
     retract_speed_m_s: float = 0.02
     acceleration_m_s2: float = 0.5
@@ -134,6 +144,15 @@ class ContactParameters:
     def beam_n_per_m(self) -> float:
         """Stiffness of the beam [N/m], infinite where there is none."""
         return self.beam_stiffness_n_per_m or math.inf
+
+    def first_speed_m_s(self, abort_force_n: float) -> float:
+        """Return the speed at which bone may be met where nothing is known of the tissue [m/s].
+
+        While the tip goes on for `REACTION_S` a beam bends and limits the force to half of that at which the
+        contact is given up; a tip without one meets the bone itself, at `unknown_speed_m_s`.
+        """
+        bends_m_s = abort_force_n / 2 / (self.beam_n_per_m * REACTION_S)
+        return max(self.unknown_speed_m_s, bends_m_s)
 
 
 @dataclass(frozen=True)
@@ -264,8 +283,8 @@ class Limits:
     arm_age_s: float = 0.020
     stuck_samples: int = 10
     travel_s: float = 60.0
-    approach_s: float = 10.0
-    press_s: float = 5.0
+    approach_s: float = 20.0
+    press_s: float = 10.0
     hold_s: float = 120.0
     retract_s: float = 10.0
     stop_deceleration_m_s2: float = 1.0
@@ -308,9 +327,11 @@ class Limits:
         ):
             value = getattr(parameters, name)
             require(value <= limit, name, value, f"at most the limit {limit}")
-        way_m, speed = parameters.standoff_m + parameters.search_m, parameters.approach_speed_m_s
-        least = way_m / speed
-        need = f"{least:g} s or more for {1e3 * way_m:g} mm at approach_speed_m_s = {speed:g}"
+        p = parameters
+        slow_m, way_m = p.early_m + p.search_m, p.standoff_m + p.search_m
+        speed = min(p.approach_speed_m_s, p.first_speed_m_s(self.abort_force_n))
+        least = slow_m / speed + (way_m - slow_m) / p.approach_speed_m_s
+        need = f"{least:.3g} s or more for {1e3 * way_m:g} mm, {1e3 * slow_m:g} of them at {speed:.3g} m/s"
         require(self.approach_s >= least, "approach_s", self.approach_s, need)
 
 

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import math
+
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.estimator import ContactFilter
 from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.held_motion import HeldMotion
 from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
 from tactile_resonance.contact.move import Move, failed
 from tactile_resonance.contact.observer import Observer
@@ -16,6 +19,9 @@ from tactile_resonance.contact.tip_path import TipPath
 
 LOST_GRACE_S = 0.02
 """Forces from before the touch do not count for a lost contact, nor those of the first moments."""
+
+STIFFENS = 3.0
+"""Force beyond what the model expects, in deviations, at which tissue that is not known stiffens."""
 
 MOST_TAKEN_BACK = 3
 """So often in one contact a touch may turn out to have been noise."""
@@ -31,11 +37,15 @@ class Pressing:
     observer : Observer
     parameters : ContactParameters
     limits : Limits
+    touch_speed_m_s : float
+        With which the tip goes deeper until the force is reached, at most.
 
     Attributes
     ----------
     touched_ns : int
         When contact was found.
+    motion : HeldMotion
+        Of the tip while it holds.
     """
 
     def __init__(
@@ -45,10 +55,13 @@ class Pressing:
         observer: Observer,
         parameters: ContactParameters,
         limits: Limits,
+        touch_speed_m_s: float = math.inf,
     ) -> None:
+        self._touch_speed_m_s = touch_speed_m_s
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
+        self.motion = HeldMotion()
         self._lost_n = limits.lost_below_n(goal.aim.force_n)
         self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
@@ -75,6 +88,8 @@ class Pressing:
             to = self._nearer(now_ns, state, model, place.height_m, sure)
             if to is State.HOLD:
                 holding, self._hold_height_m = True, place.height_m
+        if holding:
+            self.motion.add(now_ns, place.height_m)
         pending = self._observer.arm_model.pending_m
         if holding and self._aim.hold is HoldMode.INDENTATION:
             speed = place_speed(self._hold_height_m, place.height_m, pending, p)
@@ -82,8 +97,13 @@ class Pressing:
             speed = force_speed(
                 model, place.height_m, pending, self._aim.force_n, p, holding=holding
             )
-        most = p.press_speed_m_s
-        twist = self._path.along_normal(arm, min(most, max(-most, speed)))
+        most = deepest = p.press_speed_m_s
+        if not holding:
+            # what stiffens more than Hertz says is not gone into further
+            deepest = min(most, self._touch_speed_m_s)
+            if model.surprise > STIFFENS and self._touch_speed_m_s < most:
+                deepest = 0.0
+        twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         reached = model.estimate(place.height_m) if to is State.HOLD else None
         return Move(twist, to, estimate=reached)
 

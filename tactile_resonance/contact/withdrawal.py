@@ -29,7 +29,8 @@ SMOOTH_S = 0.008
 """Forces are averaged over about so long [s]."""
 
 LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.5
-"""Speed with which the surface is left, until so far above it; less than so much of the force is pressed then."""
+"""Speed with which the surface is left, until so far above it, once less than this share of the
+force is pressed with."""
 
 FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 5e-4, 0.08, 4e-4, 2e-3
 """Speed of a tip that is pulled too hard, until its mean force has come to what it is, the way after that, and

@@ -80,6 +80,8 @@ class ContactTopics:
             self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
         state = state_message(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
+        if cycle.state is State.HOLD:
+            state.message = controller.motion
         state.cycles, state.overruns = loop.cycles, loop.overruns
         self._say(state)
 

@@ -18,7 +18,8 @@ from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, FORCE_N = 2.5e-3, 0.01
 SOFT = Tissue("soft", 4.5e3, (1.0,), (0.95,))  # 8.8 kPa at once, 4.5 after 1 s
-QUICK = ContactParameters(tare_s=0.1, standoff_m=2.1e-3, early_m=2e-3)
+# as where a contact near by has succeeded
+QUICK = ContactParameters(tare_s=0.1, standoff_m=2.1e-3, early_m=2e-3, unknown_speed_m_s=5e-3)
 
 
 @dataclass

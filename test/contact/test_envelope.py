@@ -241,7 +241,7 @@ def test_configuration_is_read_and_checked(tmp_path):
     for text, message in [
         ("contact: {approach_speed_m_s: 0.01}\nlimits: {}", "approach_speed_m_s: got 0.01"),
         # 5 mm from the standoff to the end of the search
-        ("contact: {approach_speed_m_s: 2.5e-4}\nlimits: {}", "approach_s: got 10.* 20 s or more"),
+        ("contact: {approach_speed_m_s: 1.25e-4}\nlimits: {}", "approach_s: got 20.* 40 s or more"),
         ("contact: {}\nlimits: {near_speed_m_s: 0.003}", "at most the limit 0.003"),
         ("contact: {}\nlimits: {hard_force_n: 0.02}", "above 0.03"),
         ("contact: {}\nlimits: {nearness: 1.0}", "nearness"),

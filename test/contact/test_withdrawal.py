@@ -2,7 +2,6 @@
 """A tip that is drawn back: by what it is held, what still presses on it, and where its zero went."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.plant import Plane
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import FORCE_N, QUICK, SOFT, contact, lower, started, stiffer
+from contacts import SOFT, contact, started, stiffer
 
 PULL_N = Limits().pull_force_n
 
