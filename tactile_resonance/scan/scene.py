@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan's scene: what is on the table and what is wanted from it.
 
-The same file may hold ``regions`` and what is ``buried``, which the simulated bench reads
-(`tactile_resonance.simulation.scene`) and a scan does not need.
+The same file may hold ``regions``, what is ``buried`` and the ``motion`` of the surface, which the simulated
+bench reads (`tactile_resonance.simulation.scene`) and a scan does not need.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from tactile_resonance.tissue.references import (
 
 E = TypeVar("E", bound=Enum)
 
-# Of the simulated bench: what lies on its table.
-BENCH_KEYS = {"regions", "buried"}
+# Of the simulated bench: what lies on its table, and how it moves.
+BENCH_KEYS = {"regions", "buried", "motion"}
 _KEYS = {
     *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
     *("outputs", "precision", "blocks", "tissue_classes", "nominal_contact", "on_failure"),
