@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes.conversions import (
     contact_from_message,
@@ -82,6 +84,9 @@ class TruthTopic:
             frame_id=self._frame_id,
             label=tip.tissue.name if tip.tissue else "air",
             simulated=True,
-            contact=contact_from_message(pose, float(np.mean(forces_n)), 0.0),
+            contact=replace(
+                contact_from_message(pose, float(np.mean(forces_n)), 0.0),
+                spread=ForceSpread(float(np.std(forces_n)), min(forces_n), max(forces_n)),
+            ),
         )
         self._publisher.publish(poles_to_message(truth, origin))

@@ -58,6 +58,9 @@ class PointResult:
     normal_z: float = NAN
     force_n: float = NAN
     force_std_n: float = NAN
+    force_rms_n: float = NAN
+    force_min_n: float = NAN
+    force_max_n: float = NAN
     contact_age_s: float = NAN
     f0_hz: float = NAN
     f0_std_hz: float = NAN
