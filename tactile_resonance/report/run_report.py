@@ -285,6 +285,6 @@ def _tissue(result: PointResult) -> str:
 
 
 def _outcome(result: PointResult) -> str:
-    parts = [result.outcome.name.lower(), result.verdict, result.reason, result.tissue_reason]
-    parts.append(result.notes)
+    parts = [result.outcome.name.lower(), result.verdict, result.gate]
+    parts += [result.reason, result.tissue_reason, result.notes]
     return "; ".join(part for part in parts if part)

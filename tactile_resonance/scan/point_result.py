@@ -93,6 +93,7 @@ class PointResult:
     blocks: int = 0
     blocks_saved: int = 0
     verdict: str = ""
+    gate: str = ""
     saved_s: float = NAN
     duration_s: float = NAN
     measurement_id: int = 0
