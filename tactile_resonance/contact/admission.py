@@ -9,9 +9,7 @@ import numpy as np
 
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.housing_path import lowest_on_the_way
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import rotated
 
 FORCE_SHARE = 2 / 3
@@ -23,7 +21,6 @@ def check_goal(
     parameters: ContactParameters,
     limits: Limits,
     tip: TipGeometry | None = None,
-    start: ArmSample | None = None,
 ) -> None:
     """Raise ``ValueError`` where a goal lies beyond the limits.
 
@@ -35,8 +32,6 @@ def check_goal(
     tip : TipGeometry, optional
         Its housing must stay clear of the surface as deep as the limits allow, the tip as far off its
         orientation as they allow.
-    start : ArmSample, optional
-        From where it begins: then the housing must stay clear on the way to the standoff too.
     """
     if not np.isfinite(goal.touch.vector).all():
         raise ValueError(f"touch: got {goal.touch.vector}; accepted are finite numbers")
@@ -64,13 +59,3 @@ def check_goal(
                 f"accepted is clearance_m = {1e3 * limits.clearance_m:g} mm or more: less depth, or a "
                 "larger beam_tilt_rad"
             )
-    if tip is None or start is None:
-        return
-    lowest = lowest_on_the_way(tip, goal, start, parameters, limits)
-    if lowest is not None and lowest.housing_m < limits.clearance_m:
-        raise ValueError(
-            f"touch: on the way to its standoff the housing would be at {1e3 * lowest.housing_m:.1f} mm above "
-            f"the plane of the surface, the tip {1e3 * lowest.tip_m:.1f} mm above its touch and "
-            f"{lowest.off_rad:.2f} rad off; accepted is clearance_m = {1e3 * limits.clearance_m:g} mm or more: "
-            "begin from higher above the surface, or from an orientation nearer to the goal's"
-        )

@@ -78,7 +78,7 @@ class Envelope:
         if not is_finite(arm):
             return Breach(Cause.ARM_INVALID, "pose or velocity of the arm is not finite")
         box = limits.workspace
-        if not _inside(arm.position_m, box.low_m, box.high_m):
+        if not inside(arm.position_m, box.low_m, box.high_m):
             x, y, z = arm.position_m
             text = f"tip at {x:.4f}, {y:.4f}, {z:.4f} m, workspace {box.low_m} to {box.high_m} m"
             return Breach(Cause.WORKSPACE, text)
@@ -96,7 +96,7 @@ class Envelope:
         return None
 
     def judge_motion(self, arm: ArmSample, place: Place) -> Breach | None:
-        """Speed, alignment and depth near the surface and in it."""
+        """Speed, alignment and depth near the surface and in it; the housing anywhere."""
         limits = self.limits
         if place.depth_m is not None and place.depth_m > limits.depth_m:
             text = f"{1e3 * place.depth_m:.2f} mm past the first touch, limit {1e3 * limits.depth_m:g} mm"
@@ -109,9 +109,9 @@ class Envelope:
             if place.misalignment_rad > limits.misalignment_rad:
                 text = f"tip {place.misalignment_rad:.3f} rad off its orientation near the surface"
                 return Breach(Cause.MISALIGNED, f"{text}, limit {limits.misalignment_rad:g} rad")
-            if place.housing_m is not None and place.housing_m < limits.clearance_m:
-                text = f"housing {1e3 * place.housing_m:.2f} mm above the surface"
-                return Breach(Cause.HOUSING, f"{text}, limit {1e3 * limits.clearance_m:g} mm")
+        if place.housing_m is not None and place.housing_m < limits.clearance_m:
+            text = f"housing {1e3 * place.housing_m:.2f} mm above the surface"
+            return Breach(Cause.HOUSING, f"{text}, limit {1e3 * limits.clearance_m:g} mm")
         return None
 
     def judge_force(self, now_ns: int, watch: ForceWatch) -> Breach | None:
@@ -176,7 +176,7 @@ class Envelope:
             most = min(most, math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room))
         share = _shrink(speed, most)
         x, y, z = share * x, share * y, share * z
-        if not _inside(position_m, self._amid_low_m, self._amid_high_m):
+        if not inside(position_m, self._amid_low_m, self._amid_high_m):
             x, y, z = self._before_walls((x, y, z), position_m)
         share = _shrink(math.hypot(turn_x, turn_y, turn_z), limits.angular_speed_rad_s)
         return x, y, z, share * turn_x, share * turn_y, share * turn_z
@@ -202,7 +202,7 @@ def _age(age_s: float) -> str:
     return f"{1e3 * age_s:.0f} ms old" if age_s > 0 else f"{-1e3 * age_s:.0f} ms ahead of the clock"
 
 
-def _inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
+def inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
     """Whether a place is in a box, its walls included."""
     x, y, z = place_m
     return low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force, stiffness and place of the surface from force and height: an extended Kalman filter.
 
-The state is (height of the first touch, ln C, d ln C / dt) of a ball by Hertz (`hertz`): C falls as
-the tissue relaxes. What the model lacks (layers, friction, the beam's swing) goes into the random
-walks of C and of its rate, so that the estimated force follows the measured one.
+The state is (height of the first touch, its speed, ln C, d ln C / dt) of a ball by Hertz (`hertz`): C
+falls as the tissue relaxes, and the surface moves as `moving_surface` says. What the model lacks (layers,
+friction, the beam's swing) goes into the random walks of C and of its rate, so that the estimated force
+follows the measured one.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact import hertz
+from tactile_resonance.contact.moving_surface import SPEED_STD_M_S, MovingSurface
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +28,9 @@ RATE_MEAN_PER_S, RATE_STD_PER_S = -0.4, 0.5
 LN_C_MEAN, LN_C_STD = math.log(800.0), 1.5
 """ln of C [N/m^1.5] before the touch: 2 to 40 kPa under balls of 1.5 to 3 mm give 140 to 3800."""
 
+
+SPEED_LASTS_S = 1.0
+"""Time constant in which an unseen speed of the surface dies away [s]."""
 
 SURFACES, STIFFNESSES = 28, 21
 """Grid of the first estimate, over the height of the touch and ln C."""
@@ -103,8 +108,8 @@ class ContactFilter:
 
     Attributes
     ----------
-    surface_m : float
-        Height of the tip at first touch [m].
+    surface_m, surface_speed_m_s : float
+        Height of the tip at first touch [m], and its rate [m/s].
     c_rate_per_s : float
         Relative change of C [1/s].
     """
@@ -125,65 +130,92 @@ class ContactFilter:
             np.asarray(heights_m, float), np.asarray(forces_n, float), noise_n, beam_n_per_m
         )
         self.surface_m, self._ln_c = float(mean[0]), float(mean[1])
-        self.c_rate_per_s = RATE_MEAN_PER_S
-        # covariance of (surface, ln C, rate): its upper triangle, row by row
-        (p00, p01), (_, p11) = covariance.tolist()
-        self._p = (p00, p01, 0.0, p11, 0.0, RATE_STD_PER_S**2)
+        self.surface_speed_m_s, self.c_rate_per_s = 0.0, RATE_MEAN_PER_S
+        self._motion, self._passed_s = MovingSurface(), 0.0
+        # covariance of (surface, speed, ln C, rate): its upper triangle, row by row
+        (p00, p02), (_, p22) = covariance.tolist()
+        self._p = (p00, 0.0, p02, 0.0, 0.0, 0.0, 0.0, p22, 0.0, RATE_STD_PER_S**2)
 
     @property
     def c(self) -> float:
         """C [N/m^1.5]."""
         return math.exp(self._ln_c)
 
+    @property
+    def moving(self) -> bool:
+        """Whether the surface is seen to move."""
+        return self._motion.moving
+
     def predict(self, dt_s: float) -> None:
         """Let time pass."""
-        # the rate dies out as relaxation does; what it adds is bounded, however long nothing came
+        motion = self._motion
+        self._passed_s = dt_s
+        # rate and speed die out, as relaxation does; what they add is bounded, however long nothing came
         adds_s = -math.expm1(-dt_s)
         keep = 1.0 - adds_s
+        way_s = -SPEED_LASTS_S * math.expm1(-dt_s / SPEED_LASTS_S)
+        stay = 1.0 - way_s / SPEED_LASTS_S
         self._ln_c += self.c_rate_per_s * adds_s
         self.c_rate_per_s *= keep
-        # F P F' + Q with F = [[1, 0, 0], [0, 1, adds], [0, 0, keep]]
-        p00, p01, p02, p11, p12, p22 = self._p
-        walk = self._walk**2 * dt_s
-        mixed = p12 + adds_s * p22
+        self.surface_m += self.surface_speed_m_s * way_s
+        self.surface_speed_m_s = stay * self.surface_speed_m_s + motion.acceleration_m_s2 * way_s
+        # F P F' + Q, F = [[1, way, 0, 0], [0, stay, 0, 0], [0, 0, 1, adds], [0, 0, 0, keep]]
+        p00, p01, p02, p03, p11, p12, p13, p22, p23, p33 = self._p
+        walk, drive = self._walk**2 * dt_s, motion.intensity_m2_s3 * dt_s
+        across, slow, mixed = p01 + way_s * p11, p03 + way_s * p13, p23 + adds_s * p33
         self._p = (
-            p00,
-            p01 + adds_s * p02,
-            keep * p02,
-            p11 + adds_s * (p12 + mixed) + walk,
+            p00 + way_s * (p01 + across) + drive * dt_s * dt_s / 3,
+            stay * across + drive * dt_s / 2,
+            p02 + way_s * p12 + adds_s * slow,
+            keep * slow,
+            stay * stay * p11 + drive,
+            stay * (p12 + adds_s * p13),
+            stay * keep * p13,
+            p22 + adds_s * (p23 + mixed) + walk,
             keep * mixed,
-            keep * keep * p22 + 25 * walk,
+            keep * keep * p33 + 25 * walk,
         )
 
     def update(self, height_m: float, force_n: float) -> float:
         """Take one force measured at a height of the tip; return its innovation in deviations."""
         depth = self.surface_m - height_m
         expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
-        p00, p01, p02, p11, p12, p22 = self._p
-        # P h with h = (slope, per_ln_c, 0)
-        ph0 = p00 * slope + p01 * per_ln_c
-        ph1 = p01 * slope + p11 * per_ln_c
-        ph2 = p02 * slope + p12 * per_ln_c
+        p00, p01, p02, p03, p11, p12, p13, p22, p23, p33 = self._p
+        # P h with h = (slope, 0, per_ln_c, 0)
+        ph0 = p00 * slope + p02 * per_ln_c
+        ph1 = p01 * slope + p12 * per_ln_c
+        ph2 = p02 * slope + p22 * per_ln_c
+        ph3 = p03 * slope + p23 * per_ln_c
         noise = self._noise_n**2 + (slope * self._vibration_m) ** 2
-        spread = slope * ph0 + per_ln_c * ph1 + noise
+        spread = slope * ph0 + per_ln_c * ph2 + noise
         error = force_n - expected
         step = error / spread
         # a step of ln C beyond 1 is beyond what the linearisation stands for
-        if abs(ph1 * step) > 1.0:
-            step /= abs(ph1 * step)
+        if abs(ph2 * step) > 1.0:
+            step /= abs(ph2 * step)
         self.surface_m += ph0 * step
-        self._ln_c += ph1 * step
-        self.c_rate_per_s += ph2 * step
-        gain0, gain1, gain2 = ph0 / spread, ph1 / spread, ph2 / spread
+        self.surface_speed_m_s += ph1 * step
+        self._ln_c += ph2 * step
+        self.c_rate_per_s += ph3 * step
+        gain0, gain1, gain2, gain3 = ph0 / spread, ph1 / spread, ph2 / spread, ph3 / spread
+        innovation, motion = error / math.sqrt(spread), self._motion
+        # the speed is not known when a motion is detected
+        unknown = SPEED_STD_M_S**2 if motion.judge(innovation, self._passed_s) else 0.0
         self._p = (
             p00 - gain0 * ph0,
             p01 - gain0 * ph1,
             p02 - gain0 * ph2,
-            p11 - gain1 * ph1,
+            p03 - gain0 * ph3,
+            p11 - gain1 * ph1 + unknown,
             p12 - gain1 * ph2,
+            p13 - gain1 * ph3,
             p22 - gain2 * ph2,
+            p23 - gain2 * ph3,
+            p33 - gain3 * ph3,
         )
-        return error / math.sqrt(spread)
+        if motion.moving:
+            motion.learn(height_m, force_n, slope, self.surface_speed_m_s, self._passed_s)
+        return innovation
 
     def force_at(self, height_m: float) -> float:
         """Return the force at a height of the tip [N]."""
@@ -213,8 +245,8 @@ class ContactFilter:
 
     def _force_std(self, slope: float, per_ln_c: float) -> float:
         """Return the standard deviation of a force with these slopes [N]."""
-        p00, p01, _, p11, _, _ = self._p
-        variance = slope**2 * p00 + per_ln_c**2 * p11 + 2 * slope * per_ln_c * p01
+        p00, p02, p22 = self._p[0], self._p[2], self._p[7]
+        variance = slope**2 * p00 + per_ln_c**2 * p22 + 2 * slope * per_ln_c * p02
         return math.sqrt(max(0.0, variance))
 
 

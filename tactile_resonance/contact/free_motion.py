@@ -13,7 +13,8 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M, TipPath
-from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.contact.turning import TurningWay
+from tactile_resonance.contact.vectors import Vector, added, scaled, vector
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
@@ -34,6 +35,8 @@ class FreeMotion:
 
     Attributes
     ----------
+    begun : bool
+        Whether its way is known.
     told_m : float or None
         Height at which another sensor detected the touch [m].
     """
@@ -43,14 +46,46 @@ class FreeMotion:
     ) -> None:
         self._path, self._observer = path, observer
         self._parameters, self._limits = parameters, limits
+        self.begun = False
+        self._turning: TurningWay | None = None
         self._travel_force_n: Vector | None = None
         self._still_ns = -1
         self._tare_ns = 0
         self.told_m: float | None = None
 
+    @property
+    def path(self) -> TipPath:
+        """With respect to the surface that counts: the goal's, or that which the tip is leaving to turn."""
+        turning = self._turning
+        return self._path if turning is None or not turning.leaving else turning.departure
+
+    def begin(self, arm: ArmSample) -> None:
+        """Find the way from where the tip is; ``ValueError`` where there is none."""
+        if self._path.off_rad(arm) > self._limits.misalignment_rad / 2:
+            self._turning = TurningWay(self._path, arm, self._parameters, self._limits)
+        self.begun = True
+
+    def places(self, arm: ArmSample) -> list[Vector]:
+        """Corners of its way, from where the tip is to the deepest place that the limits allow."""
+        p, path = self._parameters, self._path
+        lift_m = max(0.0, p.standoff_m - path.height_m(arm))
+        lifted_m = added(arm.position_m, scaled(lift_m, path.normal))
+        turns_m = (
+            []
+            if self._turning is None
+            else [vector(pose.position_m) for pose in self._turning.poses]
+        )
+        deepest_m = path.place_at(-p.search_m - self._limits.depth_m)
+        return [arm.position_m, lifted_m, *turns_m, path.place_at(p.standoff_m), deepest_m]
+
     def travel(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
-        """To the standoff; up first where the tip may still press on something."""
+        """To the standoff; up first where much is to be turned, or the tip may still press on something."""
         p = self._parameters
+        if self._turning is not None:
+            twist = self._turning.twist(arm)
+            if twist is not None:
+                return Move(twist)
+            self._turning = None
         near = place.height_m < self._limits.near_m
         if self._path.must_lift(arm, p.standoff_m):
             # it may still press, where something ended while it did: up before it goes along
@@ -62,7 +97,7 @@ class FreeMotion:
         if self._path.arrived(arm, p.standoff_m):
             self._still_ns = -1
             return Move(None, State.TARE)
-        return Move(self._path.travel(arm, p, self._limits))
+        return Move(self._path.travel(arm, p))
 
     def tare(self, now_ns: int, arm: ArmSample) -> Move:
         """At rest for the zero of the force."""
@@ -117,4 +152,4 @@ class FreeMotion:
             return failed(Cause.TIME, "retraction took too long")
         if self._parameters.standoff_m - place.height_m < ARRIVED_M:
             return Move(None, State.IDLE)
-        return Move(self._path.lift(arm, self._parameters))
+        return Move(self.path.lift(arm, self._parameters))

@@ -4,7 +4,8 @@
 The estimated model says at which height the force asked for is reached; the rest of the way, less
 what the arm will still do of earlier commands, is gone in a time constant. So the tip slows down
 early on stiff tissue and late on soft, and the dead time does not make it oscillate. While the
-stiffness is uncertain the aim stays below the force by that uncertainty.
+stiffness is uncertain the aim stays below the force by that uncertainty. The speed of tissue that moves
+is added to its own.
 """
 
 from __future__ import annotations
@@ -61,21 +62,22 @@ def force_speed(
     aim_n : float
     parameters : ContactParameters
     holding : bool
-        Whether the force has been reached: then slower, and without caution.
+        Whether the force has been reached: then without caution, and slower where the tissue is still.
     """
     depth = model.depth_for(aim_n)
     target = model.surface_m - depth
     if holding:
-        time = parameters.hold_time_constant_s
+        time = parameters.time_constant_s if model.moving else parameters.hold_time_constant_s
     else:
         time = parameters.time_constant_s
         slope, std = model.slope_at(depth)
         target += parameters.caution * max(0.0, std - SURE_SHARE * aim_n) / slope
     # relaxation takes the force away: at constant force u goes as C^(-2/3)
     creep = 2 / 3 * model.c_rate_per_s * hertz.depth(aim_n, model.c)
+    follow = creep + model.surface_speed_m_s
     # what is under way will be gone by then, and the target will have moved on
-    target += creep * (parameters.arm_dead_time_s + parameters.arm_lag_s)
-    return (target - height_m - pending_m) / time + creep
+    target += follow * (parameters.arm_dead_time_s + parameters.arm_lag_s)
+    return (target - height_m - pending_m) / time + follow
 
 
 def place_speed(

@@ -19,6 +19,11 @@ from tactile_resonance.contact.vectors import Vector
 STOP_AGAIN_NS = 50_000_000
 """A stop that holds is sent again after so long, at least once, and until the arm is seen to rest."""
 
+MOST_STOPS = 20
+"""So often a loop that ends sends a stop before it gives up: 1 s."""
+
+GONE = (ArmFault.LINK_LOST, ArmFault.CLIENT_DIED)
+"""With these no stop reaches the arm any more."""
 
 IDLE_PERIODS = 10
 """While no contact is under way, only one of so many periods is run."""
@@ -158,6 +163,28 @@ class ContactLoop:
         if self._listener is not None:
             zero = self.controller.bias_n, self.controller.bias_std_n
             self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, *zero, fault))
+
+    def bring_to_rest(self) -> str:
+        """Stop the arm until it is seen to stand, at most `MOST_STOPS` times; why it was not, else empty.
+
+        For a loop that ends, whatever is wrong with it: nothing is raised.
+        """
+        reason = ""
+        for _ in range(MOST_STOPS):
+            reason = "it still moves"
+            try:
+                self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
+            except Exception as error:
+                reason = str(error) or repr(error)
+                if isinstance(error, ArmError) and error.fault in GONE:
+                    break
+            try:
+                self._clock.wait_until(self._clock.now_ns() + STOP_AGAIN_NS)
+                if _rests(self._arm.state()):
+                    return ""
+            except Exception as error:
+                reason = str(error) or repr(error)
+        return reason
 
     def _tell(self, command: Command | None, now: int) -> None:
         """Pass a command on; a stop that goes on is not sent in every period."""

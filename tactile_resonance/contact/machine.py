@@ -134,17 +134,17 @@ class ContactController:
         """
         if self.state is not State.IDLE:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
-        start = arm if arm is not None and is_finite(arm) else None
-        check_goal(goal, self.parameters, self.limits, self._tip, start)
-        self._way_judged = start is not None
         p, limits = self.parameters, self.limits
-        self.goal = goal
-        self._observer = Observer(p, limits)
-        self._outcome = Outcome(self._observer, now_ns)
-        self._path = TipPath(goal, self._tip)
-        self._free = FreeMotion(self._path, self._observer, p, limits)
-        self._pressing = Pressing(goal, self._path, self._observer, p, limits)
-        self._judgement = Judgement(self._envelope, self._observer, p, now_ns)
+        check_goal(goal, p, limits, self._tip)
+        observer = Observer(p, limits)
+        path = TipPath(goal, self._tip)
+        free = FreeMotion(path, observer, p, limits)
+        if arm is not None and is_finite(arm):
+            free.begin(arm)
+        self.goal, self._observer, self._free = goal, observer, free
+        self._outcome = Outcome(observer, now_ns)
+        self._pressing = Pressing(goal, path, observer, p, limits)
+        self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
         self._arm_was_bad = self._pressed_too_hard = False
         self._enter(State.TRAVEL, now_ns)
 
@@ -187,8 +187,11 @@ class ContactController:
         """
         if self.state is State.IDLE or self.goal is None:
             return None
-        # of an arm whose place is not finite nothing else is known
-        place = None if arm is None or not is_finite(arm) else self._place(arm)
+        place = None
+        if arm is not None and is_finite(arm):  # of one whose place is not finite nothing else is known
+            if self.state is State.TRAVEL and not self._free.begun:
+                self._begin_way(now_ns, arm)
+            place = self._place(arm)
         breach = self._judgement.breach(
             self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
         )
@@ -200,8 +203,6 @@ class ContactController:
             self._heed_wish(now_ns, breach)
         if arm is None or place is None:
             return self._stop()
-        if self.state is State.TRAVEL and not self._way_judged:
-            self._judge_way(now_ns, arm)
         move = self._act(now_ns, arm, place)
         self._follow(move, now_ns)
         if move.twist is None:
@@ -219,12 +220,10 @@ class ContactController:
         self._observer.arm_model.step(0.0, limit)
         return Command(None, limit)
 
-    def _judge_way(self, now_ns: int, arm: ArmSample) -> None:
-        """Judge the way to the standoff of a contact that was begun while no arm was seen."""
-        assert self.goal is not None
-        self._way_judged = True
+    def _begin_way(self, now_ns: int, arm: ArmSample) -> None:
+        """Find the way to the standoff of a contact that was begun while no arm was seen."""
         try:
-            check_goal(self.goal, self.parameters, self.limits, self._tip, arm)
+            self._free.begin(arm)
         except ValueError as error:
             self._fail(Breach(Cause.HOUSING, str(error)), now_ns)
 
@@ -281,7 +280,7 @@ class ContactController:
         return (now_ns - self._state_ns) * 1e-9
 
     def _place(self, arm: ArmSample) -> Place:
-        path, model, depth = self._path, self._observer.model, None
+        path, model, depth = self._free.path, self._observer.model, None
         self._height_m = above = path.height_m(arm)
         if model is not None and self.state in TOUCHING:
             depth = model.surface_m - above

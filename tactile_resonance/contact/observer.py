@@ -74,7 +74,7 @@ class Observer:
         """Take the bias and look for the touch from now on; what is wrong with it is returned."""
         self.taring = False
         p = self._parameters
-        limits = TareLimits(p.cell_noise_n, std_n=p.tare_std_n, drift_n_per_s=p.tare_drift_n_per_s)
+        limits = TareLimits(p.cell_noise_n, p.tare_std_n, p.tare_drift_n_per_s, p.tare_offset_n)
         try:
             zero = tare(self._unloaded, limits)
         except TareError as error:

@@ -31,6 +31,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "tare_s": (0.05, 5.0),
     "tare_std_n": (1e-6, 1.0),
     "tare_drift_n_per_s": (1e-6, 10.0),
+    "tare_offset_n": (1e-3, 1000.0),
     "cell_noise_n": (1e-5, 1.0),
     "tolerance": (0.005, 0.5),
     "settle_s": (0.0, 2.0),
@@ -69,6 +70,9 @@ class ContactParameters:
         How far below or above its place the surface may be found [m].
     tare_s, tare_std_n, tare_drift_n_per_s : float
         Length of the tare [s]; uncertainty [N] and drift [N/s] of the zero with which it is refused.
+    tare_offset_n : float
+        Largest zero of each axis [N]: bias of the cell, and weight on one under the sample; on the tool
+        what is left once the payload is taken off. More is refused.
     cell_noise_n : float
         Of one force as the source states it, the shaking of a tool on it included [N rms]; with
         half as much again the tare is refused.
@@ -106,6 +110,7 @@ class ContactParameters:
     tare_s: float = 0.4
     tare_std_n: float = 3e-4
     tare_drift_n_per_s: float = 2e-3
+    tare_offset_n: float = 2.5
     cell_noise_n: float = 1e-3
     tolerance: float = 0.05
     settle_s: float = 0.05
@@ -133,7 +138,13 @@ class ContactParameters:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Box for the tip in the base [m], its opposite corners (3,)."""
+    """Box for the tip in the base.
+
+    Attributes
+    ----------
+    low_m, high_m : tuple of 3 floats
+        Opposite corners of the box in which the tip may be, in the base [m].
+    """
 
     low_m: tuple[float, ...] = (-1.0, -1.0, -0.2)
     high_m: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -143,6 +154,9 @@ class Workspace:
         good = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
         require(good, "high_m", high, f"three coordinates above low_m = {low}")
 
+
+LOST_SHARE = 0.2
+"""Of the force asked for, below which a contact is lost: 2 mN at 1 cN."""
 
 LIMIT_RANGES: dict[str, tuple[float, float]] = {
     "abort_force_n": (1e-3, 10.0),
@@ -174,6 +188,18 @@ LIMIT_RANGES: dict[str, tuple[float, float]] = {
 }
 """Accepted range of each number of `Limits`, ends included."""
 
+STRICTER_BELOW = frozenset(
+    {
+        *("abort_force_n", "hard_force_n", "pull_force_n", "lateral_force_n", "force_rate_n_per_s"),
+        *("depth_m", "near_speed_m_s", "contact_speed_m_s", "lateral_speed_m_s", "free_speed_m_s"),
+        *("angular_speed_rad_s", "tilt_rad", "misalignment_rad", "force_age_s", "arm_age_s"),
+        *("stuck_samples", "search_m", "early_m"),
+        *("tare_std_n", "tare_drift_n_per_s", "tare_offset_n"),
+    }
+)
+STRICTER_ABOVE = frozenset({"near_m", "clearance_m"})
+"""What protects the tissue, of either class: each admits more above its value, these two below it."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -193,7 +219,7 @@ class Limits:
     depth_m : float
         Past the first touch [m].
     lost_force_n, lost_s : float
-        Contact is lost where the mean force of that time is below that force.
+        Contact is lost where the mean force of that time is below that force; see `lost_below_n`.
     near_m : float
         Height above the expected surface below which the tip is near it [m].
     near_speed_m_s, contact_speed_m_s, lateral_speed_m_s, free_speed_m_s : float
@@ -267,6 +293,10 @@ class Limits:
             abort_force_n=self.abort_force_n if abort_force_n is None else abort_force_n,
             depth_m=self.depth_m if depth_m is None else depth_m,
         )
+
+    def lost_below_n(self, force_n: float) -> float:
+        """Mean force [N] below which a contact that is to press with `force_n` is lost."""
+        return min(self.lost_force_n, LOST_SHARE * force_n)
 
     def check(self, parameters: ContactParameters) -> None:
         """Raise ``ValueError`` where parameters ask for more than the limits allow."""

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from tactile_resonance.contact.envelope import Place
+from tactile_resonance.contact.estimator import ContactFilter
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import HoldMode, force_speed, place_speed
+from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
 from tactile_resonance.contact.move import Move, failed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -48,6 +49,7 @@ class Pressing:
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
+        self._lost_n = limits.lost_below_n(goal.aim.force_n)
         self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
         self._hold_height_m = 0.0
@@ -70,7 +72,7 @@ class Pressing:
             sure = now_ns - self.touched_ns > self._sure_ns
             if sure and model.surface_m > p.early_m:
                 return self._early(arm, model.surface_m)
-            to = self._nearer(now_ns, state, model.force_at(place.height_m), sure)
+            to = self._nearer(now_ns, state, model, place.height_m, sure)
             if to is State.HOLD:
                 holding, self._hold_height_m = True, place.height_m
         pending = self._observer.arm_model.pending_m
@@ -85,10 +87,14 @@ class Pressing:
         reached = model.estimate(place.height_m) if to is State.HOLD else None
         return Move(twist, to, estimate=reached)
 
-    def _nearer(self, now_ns: int, state: State, force_n: float, sure: bool) -> State | None:
+    def _nearer(
+        self, now_ns: int, state: State, model: ContactFilter, height_m: float, sure: bool
+    ) -> State | None:
         """The state that follows while the force comes nearer to what is asked for."""
-        p = self._parameters
-        off = abs(force_n - self._aim.force_n) / self._aim.force_n
+        p, aim_n = self._parameters, self._aim.force_n
+        off = abs(model.force_at(height_m) - aim_n) / aim_n
+        if model.moving:  # what is followed so closely is known less well
+            off -= max(0.0, model.estimate(height_m).force_std_n / aim_n - SURE_SHARE)
         to: State | None = None
         if state is State.CONTACT:
             if off >= 4 * p.tolerance:
@@ -104,7 +110,7 @@ class Pressing:
 
     def _early(self, arm: ArmSample, surface_m: float) -> Move:
         """The surface seems to lie higher than accepted: noise, a first guess, or so it is."""
-        if self._was_noise(self._limits.lost_force_n):
+        if self._was_noise(self._lost_n):
             return Move(None, State.APPROACH)
         if not self._looked_again:
             self._looked_again = True
@@ -123,11 +129,12 @@ class Pressing:
         if state is State.CONTACT:
             noise = self._was_noise(observer.noise_n / 4)
             return Move(None, State.APPROACH) if noise else None
-        if mean >= limits.lost_force_n:
+        if mean >= self._lost_n:
             return None
-        if state is State.SETTLE and self._was_noise(limits.lost_force_n):
+        if state is State.SETTLE and self._was_noise(self._lost_n):
             return Move(None, State.APPROACH)
-        text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms"
+        text = f"mean force {1e3 * mean:.1f} mN over {1e3 * limits.lost_s:g} ms, "
+        text += f"limit {1e3 * self._lost_n:g} mN"
         return failed(Cause.CONTACT_LOST, text)
 
     def _was_noise(self, least_n: float) -> bool:

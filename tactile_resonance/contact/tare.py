@@ -34,13 +34,13 @@ class TareLimits:
     drift_n_per_s : float
         Largest drift beyond what noise explains.
     offset_n : float
-        Largest zero: more means a bias step, a wrong sign, or something that touches.
+        Largest zero: more means a bias step, a wrong sign, or something that presses or pulls.
     """
 
     noise_rms_n: float
-    std_n: float = 2e-4
-    drift_n_per_s: float = 2e-3
-    offset_n: float = math.inf
+    std_n: float
+    drift_n_per_s: float
+    offset_n: float
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,6 @@ def _check(result: Tare, limits: TareLimits) -> None:
             )
         if abs(zero) > limits.offset_n:
             raise TareError(
-                f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are "
-                f"{limits.offset_n * 1e3:.4g} mN"
+                f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are up to "
+                f"{limits.offset_n * 1e3:.4g} mN (tare_offset_n): does something press or pull?"
             )

@@ -7,7 +7,7 @@ import math
 
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import (
     ZERO,
@@ -33,9 +33,6 @@ ARRIVED_M, ARRIVED_RAD = 5e-5, 2e-3
 LIFTED_M = 5e-4
 """A tip that begins lower than this below the standoff is lifted first [m]."""
 
-TURNING_M = 2e-3
-"""So far above where the surface is near the tip is turned [m]."""
-
 
 class TipPath:
     """Geometry of one goal.
@@ -48,12 +45,14 @@ class TipPath:
 
     Attributes
     ----------
+    goal, tip
+        As given.
     normal : tuple of 3 floats
         Out of the tissue, in the base.
     """
 
     def __init__(self, goal: ContactGoal, tip: TipGeometry | None = None) -> None:
-        self._tip = tip
+        self.goal, self.tip = goal, tip
         self._touch_m = vector(goal.touch.position_m)
         self._seen_rad = vector(goal.touch.rotation_rad)
         self._goal = turn_from_vector(self._seen_rad)
@@ -85,10 +84,10 @@ class TipPath:
 
     def housing_m(self, arm: ArmSample, height_m: float) -> float | None:
         """Height of the housing above the surface, the tip at a height above its first touch."""
-        if self._tip is None:
+        if self.tip is None:
             return None
         self._see(arm.rotation_rad)
-        return self._tip.housing_height(self._seen, self.normal, height_m)
+        return self.tip.housing_height(self._seen, self.normal, height_m)
 
     def _see(self, rotation_rad: Vector) -> None:
         if rotation_rad != self._seen_rad:
@@ -106,10 +105,6 @@ class TipPath:
         """Whether the tip is so low that it may press on something, at the touch or beside it."""
         return self.height_m(arm) < standoff_m - LIFTED_M
 
-    def turning_height_m(self, parameters: ContactParameters, limits: Limits) -> float:
-        """Height of the tip to which it goes while much is to be turned."""
-        return max(parameters.standoff_m, limits.near_m + TURNING_M)
-
     # twists in the base
 
     def lift(self, arm: ArmSample, parameters: ContactParameters) -> Six:
@@ -119,18 +114,10 @@ class TipPath:
         speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
         return *scaled(max(speed, 1e-4), self.normal), *ZERO
 
-    def travel(self, arm: ArmSample, parameters: ContactParameters, limits: Limits) -> Six:
-        """To the standoff; turned first, out of reach of the surface, where much is to be turned."""
-        p, height = parameters, parameters.standoff_m
-        if self.off_rad(arm) > limits.misalignment_rad / 2:
-            height = self.turning_height_m(p, limits)
-        way = difference(self.place_at(height), arm.position_m)
-        distance = math.hypot(*way)
-        braking = math.sqrt(p.acceleration_m_s2 * distance)  # half the limit: the arm lags
-        speed = min(p.travel_speed_m_s, braking, distance / RIGHTING_S)
-        return *scaled(speed / max(distance, 1e-9), way), *scaled(
-            1 / RIGHTING_S, self.turn_rad(arm)
-        )
+    def travel(self, arm: ArmSample, parameters: ContactParameters) -> Six:
+        """Straight to the standoff; what little is left is turned meanwhile."""
+        way = difference(self.place_at(parameters.standoff_m), arm.position_m)
+        return towards(way, self.turn_rad(arm), parameters.travel_speed_m_s, parameters)
 
     def along_normal(self, arm: ArmSample, speed_m_s: float) -> Six:
         """Along the normal, away from the surface positive; keeps place along it and orientation."""
@@ -144,3 +131,13 @@ class TipPath:
             z / RIGHTING_S + speed * nz,
             *scaled(1 / RIGHTING_S, self.turn_rad(arm)),
         )
+
+
+def towards(
+    way_m: Vector, turn_rad: Vector, speed_m_s: float, parameters: ContactParameters
+) -> Six:
+    """Twist along the rest of a way and of a turn, at up to a speed, which falls off before the end."""
+    distance = math.hypot(*way_m)
+    braking = math.sqrt(parameters.acceleration_m_s2 * distance)  # half the limit: the arm lags
+    speed = min(speed_m_s, braking, distance / RIGHTING_S)
+    return *scaled(speed / max(distance, 1e-9), way_m), *scaled(1 / RIGHTING_S, turn_rad)

@@ -46,6 +46,11 @@ def cross(a: Vector, b: Vector) -> Vector:
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
+def added(a: Vector, b: Vector) -> Vector:
+    """Return the sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
 def difference(a: Vector, b: Vector) -> Vector:
     """Return `a` less `b`."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]

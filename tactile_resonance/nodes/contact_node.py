@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action.server import ServerGoalHandle
@@ -23,11 +24,17 @@ from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
-from tactile_resonance.nodes.contact_parameters import contact_parameters, read_parameters
+from tactile_resonance.nodes.contact_parameters import (
+    contact_parameters,
+    limits_of_launch,
+    read_parameters,
+    require_stricter,
+)
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
+from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
@@ -65,7 +72,9 @@ PARAMETERS = (
     ),
     Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
     Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
-    Parameter("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True),
+    Parameter(
+        "sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True
+    ),
     Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
     BROADCAST_TF,
     *contact_parameters(),
@@ -88,6 +97,7 @@ class ContactNode(ManagedNode):
         self._thread: ContactThread | None = None
         self._arm: NodeArm | None = None
         self._stop = StopInput(self, self._draw_back)
+        self._launched = limits_of_launch(self)
         self.add_on_set_parameters_callback(self._on_parameters)
 
     def configure(self) -> None:
@@ -158,11 +168,16 @@ class ContactNode(ManagedNode):
         self._teller.reset()
 
     def deactivate(self) -> None:
-        """Draw the tip back and end the loop."""
-        if self._thread is not None:
-            self._thread.close()
-            self._finish(self._thread.controller.result)
-            self._thread = None
+        """Draw the tip back and end the loop; a node whose loop does not end is made anew."""
+        thread = self._thread
+        if thread is None:
+            return
+        if not thread.close():
+            self.fail(
+                "the control loop hangs and was given up; the arm's link is closed, its watchdog stops it"
+            )
+        self._finish(thread.controller.result)
+        self._thread = None
 
     def working(self) -> bool:
         """The loop moves on, where there is one."""
@@ -188,11 +203,12 @@ class ContactNode(ManagedNode):
     # requests, in the executor's thread
 
     def _on_parameters(self, changes: Sequence) -> SetParametersResult:
-        """Take what is in range while nothing moves; in contact nothing is changed."""
+        """Take what is in range, and of limits what is stricter than the launch's; in contact nothing."""
         changed = {c.name: c.value for c in changes if c.name.startswith(("contact.", "limits."))}
-        if not changed or not self.has_parameter("contact.period_s"):
+        if not changed:
             return SetParametersResult(successful=True)
         try:
+            require_stricter(changed, self._launched)
             parameters, limits = self._read_parameters(**changed)
             if self._thread is not None:
                 self._thread.configure(parameters, limits)
@@ -201,7 +217,7 @@ class ContactNode(ManagedNode):
         self._settings, self._limits = parameters, limits
         return SetParametersResult(successful=True)
 
-    def _read_parameters(self, **changed: float) -> tuple[ContactParameters, Limits]:
+    def _read_parameters(self, **changed: Any) -> tuple[ContactParameters, Limits]:
         """Of the controller, as the arm allows them; ``ValueError`` where one is not accepted."""
         parameters, limits = read_parameters(self, **changed)
         (stalls_s,) = values(self, "simulated_stalls_s")
@@ -258,16 +274,18 @@ class ContactNode(ManagedNode):
         if self._thread is not None:
             self._thread.retract()
 
-    def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._thread is None:
-            response.message = f"contact_node is {self.state_name()}"
-            return response
+    async def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        thread = self._thread
         try:
-            self._thread.make_ready()
+            if thread is not None and thread.controller.state is State.FAULT:
+                await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
         except ArmError as error:
             response.message = str(error)
             return response
-        self._thread.retract()
+        if thread is None or thread is not self._thread:
+            response.message = f"contact_node is {self.state_name()}"
+            return response
+        thread.retract()
         response.success = True
         response.message = "asked; contact_state reports when it is idle"
         return response
@@ -300,7 +318,10 @@ class ContactNode(ManagedNode):
             return
         if thread.error is not None:
             self._finish(None)
-            self.fail(f"control loop ended: {thread.error!r}")
+            text = "the arm was stopped and stands"
+            if thread.moves:
+                text = f"the arm was NOT seen to stand ({thread.moves}), its link is closed"
+            self.fail(f"control loop ended: {thread.error!r}; {text}")
             return
         if self._dead:
             self._finish(thread.controller.result)

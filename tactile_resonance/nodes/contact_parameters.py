@@ -5,27 +5,42 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 
 from tactile_resonance.contact.parameters import (
     LIMIT_RANGES,
     RANGES,
+    STRICTER_ABOVE,
+    STRICTER_BELOW,
     ContactParameters,
     Limits,
+    Workspace,
     read_contact,
 )
+from tactile_resonance.fields import numbers, require
 from tactile_resonance.nodes.parameters import Parameter
 
 _GROUPS = {"contact": (ContactParameters, RANGES), "limits": (Limits, LIMIT_RANGES)}
 # The control loop's period is that of the running loop.
 _READ_ONLY = frozenset({"contact.period_s"})
+_LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
+_AT_MOST = frozenset(
+    {
+        *(f"{g}.{n}" for g, (_, ranges) in _GROUPS.items() for n in ranges if n in STRICTER_BELOW),
+        _HIGH,
+    }
+)
+_AT_LEAST = frozenset({*(f"limits.{name}" for name in STRICTER_ABOVE), _LOW})
 
 
 def contact_parameters() -> tuple[Parameter, ...]:
-    """One parameter for each number, the defaults from ``config/contact.yaml``."""
+    """One parameter for each number and corner, the defaults from ``config/contact.yaml``."""
     made = []
     for (group, (kind, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
         descriptions = _descriptions(kind)
@@ -41,10 +56,34 @@ def contact_parameters() -> tuple[Parameter, ...]:
                     read_only=full in _READ_ONLY,
                 )
             )
+    box, descriptions = _defaults()[1].workspace, _descriptions(Workspace)
+    for full, corner in ((_LOW, "low_m"), (_HIGH, "high_m")):
+        made.append(Parameter(full, list(getattr(box, corner)), descriptions[corner]))
     return tuple(made)
 
 
-def read_parameters(node: Node, **changed: float) -> tuple[ContactParameters, Limits]:
+def limits_of_launch(node: Node) -> dict[str, Any]:
+    """What may be made only stricter, by parameter, with the values of a node just made."""
+    return {name: node.get_parameter(name).value for name in (*_AT_MOST, *_AT_LEAST)}
+
+
+def require_stricter(changed: Mapping[str, Any], launched: Mapping[str, Any]) -> None:
+    """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
+    for name in changed.keys() & launched.keys():
+        value, limit = np.array(changed[name]), np.array(launched[name])
+        at_most = name in _AT_MOST
+        good = value.shape == limit.shape and bool(
+            np.all(value <= limit if at_most else value >= limit)
+        )
+        accepted = (
+            f"at {'most' if at_most else 'least'} {limit.tolist()}, as launched: it may be made "
+        )
+        require(
+            good, name, value.tolist(), accepted + "stricter here, and laxer by a new launch only"
+        )
+
+
+def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limits]:
     """Parameters and limits of a node, some with values about to be set (``**{"contact.x": 1}``).
 
     Raises
@@ -52,14 +91,16 @@ def read_parameters(node: Node, **changed: float) -> tuple[ContactParameters, Li
     ValueError
         If a value is out of range or beyond the limits.
     """
+
+    def value(full: str) -> Any:
+        return changed.get(full, node.get_parameter(full).value)
+
     read = []
     for (group, (_, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        names = {name: f"{group}.{name}" for name in ranges}
-        given = {
-            name: changed.get(full, node.get_parameter(full).value) for name, full in names.items()
-        }
-        read.append(replace(defaults, **given))
+        read.append(replace(defaults, **{name: value(f"{group}.{name}") for name in ranges}))
     parameters, limits = read
+    corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
+    limits = replace(limits, workspace=Workspace(*corners))
     limits.check(parameters)
     return parameters, limits
 

@@ -22,6 +22,8 @@ RETRACT_WITHIN_S = 12.0
 POLL_S = 0.01
 # A loop without a cycle for so long hangs.
 HUNG_S = 1.0
+# A loop that has not ended so long after it should is given up.
+END_WITHIN_S = 3.0
 # Between two attempts to start a force source that has failed.
 SOURCE_AGAIN_S = 0.25
 
@@ -48,6 +50,10 @@ class ContactThread:
     ----------
     clock : Clock
         On which it dates what it sees.
+    error : Exception or None
+        With which the loop has ended.
+    moves : str
+        Why the arm was not seen to stand after that, and its link was closed; empty: it stands.
     """
 
     def __init__(
@@ -62,9 +68,11 @@ class ContactThread:
     ) -> None:
         self.controller = ContactController(parameters, limits, tip)
         self.error: Exception | None = None
+        self.moves = ""
         self._arm, self._force, self._failed = arm, force, failed
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self._running = True
+        self._connecting = False  # meanwhile the arm is another thread's, and the loop stands
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
         self._source_tried_s = 0.0
         self._alive_s = time.monotonic()
@@ -77,7 +85,7 @@ class ContactThread:
     @property
     def alive(self) -> bool:
         """Whether the loop moves on, or waits for simulated time that stands."""
-        return time.monotonic() - self._alive_s < HUNG_S
+        return self._connecting or time.monotonic() - self._alive_s < HUNG_S
 
     @property
     def waits_for(self) -> str:
@@ -108,22 +116,43 @@ class ContactThread:
             return self.controller.tell_touch()
 
     def make_ready(self) -> None:
-        """Start the program of an arm again that was stopped; ``ArmError`` where it is not released."""
-        with self._lock:
-            if self.controller.state is State.FAULT:
-                self._time_passed = True
-                self._arm.connect()
+        """Start the program of an arm again that was stopped; ``ArmError`` where it is not released.
 
-    def close(self) -> None:
-        """Draw the tip back where the link allows it, and end the loop."""
-        self.retract()
+        That takes seconds. Meanwhile the loop leaves the arm alone, and requests are taken.
+        """
+        with self._lock:
+            self._lock.wait_for(lambda: not self._connecting)
+            if self.controller.state is not State.FAULT:
+                return
+            self._connecting = True
+        try:
+            self._arm.connect()
+        finally:
+            with self._lock:
+                self._connecting, self._time_passed = False, True
+                self._alive_s = time.monotonic()
+                self._lock.notify_all()
+
+    def close(self) -> bool:
+        """Draw the tip back where the link allows it, and end the loop; whether it has ended.
+
+        The arm of a loop that hangs is closed: nobody moves it any more, and its own watchdog stops it.
+        """
         deadline = time.monotonic() + RETRACT_WITHIN_S
+        if self._lock.acquire(timeout=RETRACT_WITHIN_S):  # a loop that hangs may hold it
+            self._lock.wait_for(lambda: not self._connecting, RETRACT_WITHIN_S)
+            self.controller.retract()
+            self._lock.release()
+            self._hurry()
         while self._thread.is_alive() and time.monotonic() < deadline:
             if self.controller.settled:
                 break
             time.sleep(POLL_S)
         self._running = False
-        self._thread.join()
+        self._thread.join(END_WITHIN_S)
+        if self._thread.is_alive():
+            self._arm.close()
+        return not self._thread.is_alive()
 
     def _hurry(self) -> None:
         if self._led is not None:
@@ -148,6 +177,9 @@ class ContactThread:
             while self._running:
                 self.loop.wait()
                 with self._lock:
+                    self._lock.wait_for(lambda: not self._connecting)
+                    if not self._running:
+                        break
                     if self._led is not None and self._time_passed:
                         # the data of that time were not waited for, and would seem old
                         self._time_passed = False
@@ -158,12 +190,15 @@ class ContactThread:
                 self._alive_s = time.monotonic()
                 if isinstance(self.loop.fault, ForceError):
                     self._start_source_again()
+            if not self.controller.settled:
+                self.loop.bring_to_rest()
         except _EndedError:
             pass
         except Exception as error:
             # nothing supervises the arm any more: first of all it stops
-            with contextlib.suppress(Exception):
-                self._arm.stop(self.controller.limits.stop_deceleration_m_s2)
+            self.moves = self.loop.bring_to_rest()
+            if self.moves:
+                self._arm.close()
             self.error = error
             self._failed()
         finally:

@@ -230,10 +230,13 @@ class ManagedNode(LifecycleNode):
         return float(values(self, HUNG_AFTER.name)[0])
 
     def fail(self, reason: str) -> None:
-        """Give up for a reason: back to unconfigured, from where the manager starts it anew."""
+        """Give up for a reason: back to unconfigured, from where the manager starts it anew.
+
+        Also from within `deactivate`, where the node cannot go on as it is.
+        """
         self.health.error(reason)
+        self._failing = True
         if self.active:
-            self._failing = True
             self.trigger_deactivate()
 
     # Its life
@@ -278,6 +281,7 @@ class ManagedNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
         result = super().on_activate(state)
+        self._failing = False
         self.activate()
         self.active = True
         return result

@@ -26,7 +26,7 @@ class Parameter:
     ----------
     name : str
         With its unit.
-    default : bool, int, float, str or list of str
+    default : bool, int, float, str or list of str or float
     description : str
     low, high : float or None
         Range of a number, ends included.
@@ -37,7 +37,7 @@ class Parameter:
     """
 
     name: str
-    default: bool | int | float | str | list[str]
+    default: bool | int | float | str | list[str] | list[float]
     description: str
     low: float | None = None
     high: float | None = None

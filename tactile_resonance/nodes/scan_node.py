@@ -30,6 +30,7 @@ from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
+from tactile_resonance.nodes.tip_use import TipUseClient
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.goal import (
@@ -43,16 +44,16 @@ from tactile_resonance.scan.goal import (
 from tactile_resonance.scan.goal_files import GoalFiles
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.measurement import design_measurement
-from tactile_resonance.scan.plan import Plan, make_plan, plan_points
+from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.point_result import TOPIC
+from tactile_resonance.scan.preparation import UNCHECKED, Prepared, prepare
 from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
-from tactile_resonance.scan.surface import TouchRequest
-from tactile_resonance.scan.surface_search import FoundSurface, Touch, find_surface
+from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 from tactile_resonance.simulation.parameters import read_sensor
 
@@ -117,6 +118,7 @@ class ScanNode(ManagedNode):
         contact, table, table_frame, base_frame = values(self, *names)
         self._time = ScanTime(self.time_server, self.hung_after_s)
         table_in_base, robot = pose_of(table, "table_in_base"), contact == "robot"
+        self._tip_use = TipUseClient(self) if robot else None
         self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
         self._frames = Frames(table_frame, base_frame, table_in_base)
         self._frames_of: dict[int, Frames] = {}  # as they stood when a goal arrived, by its message
@@ -323,15 +325,11 @@ class ScanNode(ManagedNode):
         scene, plan = self._place(wanted.scene, frames), wanted.plan
         (seed,) = values(self, "seed")
         seed = goal.seed or seed
-        found: FoundSurface | None = None
-        if plan is None:
-            assert isinstance(scene.surface, TouchRequest)
-            found = self._find_surface(scene, scene.surface, tell)
-            plan = make_plan(scene, found.surface)
+        made = self._prepared(scene, plan, tell)
+        plan = made.plan
         facts = self._facts(scene, plan, seed)
         facts["frames"] = {name: pose.vector.tolist() for name, pose in frames.others.items()}
-        if found is not None:
-            facts["surface"] = found.as_json()
+        facts.update(made.facts)
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
 
@@ -364,24 +362,23 @@ class ScanNode(ManagedNode):
         RunDirectory.check_new(where, needed)
         return wanted, where, needed
 
-    def _find_surface(
-        self, scene: ScanScene, asked: TouchRequest, tell: Callable[[Progress], None]
-    ) -> FoundSurface:
-        """Touch it; ValueError where it is not found."""
-        controls = self._controls
+    def _prepared(
+        self, scene: ScanScene, plan: Plan | None, tell: Callable[[Progress], None]
+    ) -> Prepared:
+        """Find by touch what is to be found so; ValueError where it is not."""
+        controls, tip_use = self._controls, self._tip_use
         assert controls is not None
         radius_m = read_sensor(share_path(f"config/sensors/{scene.sensor.name}.yaml")).tip.radius_m
 
-        def touch(point: ScanPoint) -> Touch:
-            tell(Progress(point, Phase.SURFACE, point.index, len(asked.xy_m)))
+        def find(point: ScanPoint, force_n: float, count: int) -> Touch:
+            tell(Progress(point, Phase.SURFACE, point.index, count))
             return self._hands.find(point, force_n, radius_m, controls.check_cancelled)
 
-        force_n = asked.force_n or scene.force_n
-        self._hands.retract()
-        try:
-            return find_surface(asked, radius_m, scene.sensor.heading_rad, touch)
-        except (ValueError, PointFailed, ScanEnded) as error:
-            raise ValueError(f"surface.touch: {error}") from error
+        use_of = None if tip_use is None else lambda: tip_use.ask(scene.sensor.name)
+        made = prepare(scene, plan, radius_m, find, use_of)
+        if UNCHECKED in made.plan.skipped:
+            self.get_logger().warning(UNCHECKED.why)
+        return made
 
     def _facts(self, scene: ScanScene, plan: Plan, seed: int) -> dict[str, Any]:
         """What a reader of the run should know beside its plan."""

@@ -85,6 +85,10 @@ class TriangleMesh:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
 
+    def known(self, xy_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """(...) over the mesh."""
+        return ~np.isnan(self.height_m(xy_m))
+
     def _over(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Height (...) and normal (..., 3)."""
         xy = np.asarray(xy_m, float)

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import Surface, TouchRequest
 
@@ -123,6 +124,45 @@ def make_plan(
         if left.any()
     ]
     return plan_points(scene, points, skipped, measurement, timing)
+
+
+def clear_plan(scene: ScanScene, plan: Plan, surface: Surface, use: TipUse | None) -> Plan:
+    """The plan without points at which the sensor would not stay clear of the surface; None: not looked at.
+
+    Raises
+    ------
+    ValueError
+        If that is all of them.
+    """
+    return plan if use is None else plan_with(scene, plan, *clear_points(plan.points, surface, use))
+
+
+def plan_with(
+    scene: ScanScene, plan: Plan, points: Sequence[ScanPoint], left: Sequence[LeftOut]
+) -> Plan:
+    """The plan with these points, numbered anew, and what is left out of it noted.
+
+    Raises
+    ------
+    ValueError
+        If there is no point.
+    """
+    if not points:
+        raise ValueError(f"positions: all {len(left)} are left out; the first: {left[0].why}")
+    each_s = plan.longest_s / len(plan.points)
+    numbered = tuple(
+        replace(point, index=index, label=f"{scene.name}, point {index + 1}")
+        for index, point in enumerate(points)
+    )
+    entries = [Skipped(f"the point at {_in_mm(out.point)}", out.why, each_s) for out in left]
+    # what is saved at each point follows from their number
+    noted = plan.skipped[: len(plan.skipped) - len(plan.measurement.skipped)]
+    return plan_points(scene, numbered, [*noted, *entries], plan.measurement)
+
+
+def _in_mm(point: ScanPoint) -> str:
+    x, y, _ = point.position_m
+    return f"x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm"
 
 
 def plan_points(

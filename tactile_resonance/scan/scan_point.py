@@ -63,3 +63,11 @@ class ScanPoint:
             str(content.get("label", "")),
             number(content.get("height_std_m", 0.0), f"{where}.height_std_m"),
         )
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A point that is left out of a plan, and why."""
+
+    point: ScanPoint
+    why: str

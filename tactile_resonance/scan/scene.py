@@ -29,7 +29,13 @@ from tactile_resonance.fields import (
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes, read_notes
 from tactile_resonance.scan.patterns import read_positions
-from tactile_resonance.scan.surface import Plane, Surface, TouchRequest, read_surface
+from tactile_resonance.scan.surface import (
+    NormalRequest,
+    Plane,
+    Surface,
+    TouchRequest,
+    read_surface,
+)
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import (
@@ -45,7 +51,7 @@ BENCH_KEYS = {"regions", "buried", "motion"}
 _KEYS = {
     *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
     *("outputs", "precision", "blocks", "tissue_classes", "nominal_contact", "on_failure"),
-    *("gate", "time_limits", "drift_limits", "notes"),
+    *("gate", "time_limits", "drift_limits", "notes", "normals"),
     *BENCH_KEYS,
 }
 
@@ -191,6 +197,8 @@ class ScanScene:
     time_limits : TimeLimits
     drift_limits : DriftLimits
         Of the poles in air, before the sensor counts as drifted.
+    normals : NormalRequest or None
+        How the normal of each point is found by touch; None: it is the surface's.
     notes : Notes
         What people know of the session and no instrument tells.
     """
@@ -211,6 +219,7 @@ class ScanScene:
     on_failure: OnFailure = OnFailure.CONTINUE
     time_limits: TimeLimits = field(default_factory=TimeLimits)
     drift_limits: DriftLimits = field(default_factory=DriftLimits)
+    normals: NormalRequest | None = None
     notes: Notes = field(default_factory=Notes)
 
 
@@ -274,6 +283,7 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
         on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),
         time_limits=_part(TimeLimits, content, "time_limits", where),
         drift_limits=_part(DriftLimits, content, "drift_limits", where),
+        normals=_part(NormalRequest, content, "normals", where) if "normals" in content else None,
         notes=read_notes(section({"notes": {}, **content}, "notes", where), f"{where}: notes"),
     )
 

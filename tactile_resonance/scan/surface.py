@@ -17,6 +17,7 @@ from tactile_resonance.fields import known_keys, number, numbers, require, secti
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 FORMS = ("plane", "height_field", "mesh", "touch")
 MOST_SEARCH_M = 0.02
 
@@ -34,6 +35,10 @@ class Surface(Protocol):
 
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) standard deviation of the height [m]; 0 where the surface is given."""
+        ...
+
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) whether the surface is known there, not only continued from beside it."""
         ...
 
 
@@ -62,6 +67,10 @@ class Plane:
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
+
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) everywhere."""
+        return np.ones(np.shape(xy_m)[:-1], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +113,22 @@ class HeightField:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
 
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) inside of the grid."""
+        return self._inside(np.asarray(xy_m, float))
+
     @cached_property
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
         return RectBivariateSpline(self.x_m, self.y_m, self.z_m, kx=orders[0], ky=orders[1])
 
+    def _inside(self, xy: FloatArray) -> BoolArray:
+        x, y = xy[..., 0], xy[..., 1]
+        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
+
     def _evaluate(self, xy: FloatArray, dx: int = 0, dy: int = 0) -> FloatArray:
         x, y = xy[..., 0], xy[..., 1]
-        inside = (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
+        inside = self._inside(xy)
         value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
         return np.where(inside, value, np.nan)
 
@@ -149,6 +166,47 @@ class TouchRequest:
     force_n: float | None = None
     tolerance_m: float = 2e-4
     search_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class NormalRequest:
+    """How normals are found by touch.
+
+    Attributes
+    ----------
+    radius_m : float
+        Of the circle about the point [m]. A larger one leaves less of the touches' noise and more of curvature;
+        one much smaller than the ball touches the same tissue again.
+    touches : int
+        On it.
+    force_n : float
+        That ends each touch [N]; 0: that of the scene.
+    most_angle_rad : float
+        From the normal as it is expected [rad].
+    most_std_rad : float
+        Standard deviation of the normal about any axis [rad].
+    tolerance_m : float
+        By which a touch may lie off the plane through all, where there are more than three [m].
+    """
+
+    radius_m: float = 2e-3
+    touches: int = 3
+    force_n: float = 0.0
+    most_angle_rad: float = 0.35
+    most_std_rad: float = 0.03
+    tolerance_m: float = 2e-4
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("radius_m", 5e-4, 0.01),
+            ("touches", 3, 12),
+            ("force_n", 0.0, 1.0),
+            ("most_angle_rad", 0.0, 0.8),
+            ("most_std_rad", 1e-3, 0.1),
+            ("tolerance_m", 1e-5, 2e-3),
+        ):
+            value = getattr(self, name)
+            require(low <= value <= high, name, value, f"{low:g} to {high:g}")
 
 
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:

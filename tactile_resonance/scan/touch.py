@@ -64,6 +64,10 @@ class TouchedSurface:
         basis, _, _ = self._basis(xy_m)
         return np.sqrt(np.einsum("...i,ij,...j->...", basis, self.covariance_m2, basis))
 
+    def known(self, xy_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """(...) in the square about the contacts: a form fitted to them need not go on beside them."""
+        return np.all(np.abs(np.asarray(xy_m, float) - self.center_m) <= self.scale_m, axis=-1)
+
     def _basis(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Terms (..., k) and their derivatives by x and y [1/m]."""
         x, y = np.moveaxis((np.asarray(xy_m, float) - self.center_m) / self.scale_m, -1, 0)

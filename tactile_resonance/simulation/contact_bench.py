@@ -15,7 +15,14 @@ from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, Surface, TipOnTissue
+from tactile_resonance.simulation.plant import (
+    CellMounting,
+    Plant,
+    RigidTip,
+    Surface,
+    TipOnTissue,
+    contact_radius_m,
+)
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
@@ -43,9 +50,10 @@ class Tip:
     beam: BeamModes | None = None
     poisson_ratio: float = 0.49
 
-    def on(self, tissue: Tissue) -> TipOnTissue:
-        """Return the tip at rest over a tissue."""
-        ball = Indenter(tissue, tip_radius_m=self.radius_m, poisson_ratio=self.poisson_ratio)
+    def on(self, tissue: Tissue, surface: Surface) -> TipOnTissue:
+        """Return the tip at rest over a tissue with that surface."""
+        radius_m = contact_radius_m(self.radius_m, surface)
+        ball = Indenter(tissue, tip_radius_m=radius_m, poisson_ratio=self.poisson_ratio)
         return RigidTip(ball) if self.beam is None else SprungIndenter.on_beam(ball, self.beam)
 
 
@@ -57,6 +65,7 @@ class ContactBench:
     tissue : Tissue
         Everywhere under the surface.
     surface : Surface
+        What takes its place later must be curved alike.
     start : Pose
         Of the tip.
     tip : Tip
@@ -96,7 +105,11 @@ class ContactBench:
         centre = np.array([-0.03, 0.0, 0.01] if on_tool else [0.0, 0.0, -0.01])
         mounting = CellMounting(mount, carried_kg=tool_kg if on_tool else DISH_KG, centre_m=centre)
         self.plant = Plant(
-            surface, lambda _: tissue, tip.on, tip_radius_m=tip.radius_m, mounting=mounting
+            surface,
+            lambda _: tissue,
+            lambda found: tip.on(found, surface),
+            tip_radius_m=tip.radius_m,
+            mounting=mounting,
         )
         self.clock = VirtualBench(self.plant, start, tracking=tracking, seed=seed)
         self.arm = VirtualArm(self.clock)

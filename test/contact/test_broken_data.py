@@ -162,6 +162,7 @@ def test_estimate_that_errs_does_not_lead_deeper_than_search_and_depth_allow():
 
     def sink():
         model.surface_m, model._ln_c = rig.heights_m[-1] + 1e-4, math.log(800.0)
+        model.surface_speed_m_s = 0.0
 
     rig.bench.clock.on_step.append(sink)
     rig.run_until(State.FAULT, 7.0)

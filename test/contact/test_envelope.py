@@ -162,6 +162,8 @@ def test_upright_arm_passes(rotation):
         ([0, 0, -0.008], (0.004, None, 0.0), Cause.SPEED),
         ([0, 0, 0], (0.004, None, 0.06), Cause.MISALIGNED),
         ([0, 0, -0.008], (0.006, None, 0.5), None),
+        ([0, 0, 0], (0.05, None, 0.5, 0.9e-4), Cause.HOUSING),
+        ([0, 0, 0], (0.05, None, 0.5, 1.1e-4), None),
         ([0, 0, 0.05], (0.001, 1e-3, 0.0), None),
     ],
 )

@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tactile_resonance.contact import hertz
+from tactile_resonance.contact import hertz, moving_surface
 from tactile_resonance.contact.arm_model import ArmModel
-from tactile_resonance.contact.estimator import ContactFilter, TouchDetector, touch_posterior
+from tactile_resonance.contact.estimator import (
+    SPEED_LASTS_S,
+    ContactFilter,
+    TouchDetector,
+    touch_posterior,
+)
 from tactile_resonance.contact.law import force_speed
+from tactile_resonance.contact.moving_surface import SPEED_STD_M_S
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
@@ -111,32 +117,108 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
     heights, forces = press(rng, 800.0, beam)
     model = ContactFilter(heights, forces, noise_n=NOISE_N, beam_n_per_m=beam, vibration_m=5e-6)
     mean, covariance = touch_posterior(heights, forces, NOISE_N, beam)
-    x, p = np.array([*mean, model.c_rate_per_s]), np.zeros((3, 3))
-    p[:2, :2], p[2, 2] = covariance, 0.25
-    height = heights[-1]
-    for n in range(300):
+    # surface, its speed, ln C, its rate
+    x, p = np.array([mean[0], 0.0, mean[1], model.c_rate_per_s]), np.zeros((4, 4))
+    p[np.ix_([0, 2], [0, 2])], p[3, 3] = covariance, 0.25
+    height, surface, moved, pulled = heights[-1], 0.0, 0, 0
+    for n in range(900):
         height -= 4e-6 if n < 150 else 0.0
-        measured = hertz.force(-height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
+        surface = 2e-4 * math.sin(8.0 * DT * (n - 300)) if n > 300 else 0.0
+        measured = hertz.force(surface - height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
         measured += 2.0 if n == 5 else 0.0  # by which ln C would change by more than 1
-        gone = 1 - math.exp(-DT)
-        f = np.array([[1, 0, 0], [0, 1, gone], [0, 0, 1 - gone]])
-        x, p = f @ x, f @ p @ f.T + 0.05**2 * DT * np.diag([0, 1, 25])
-        expected, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[1]), beam)
-        h = np.array([slope, per_ln_c, 0])
+        motion = model._motion
+        gone, left = 1 - math.exp(-DT), math.exp(-DT / SPEED_LASTS_S)
+        way = SPEED_LASTS_S * (1 - left)
+        f = np.array([[1, way, 0, 0], [0, left, 0, 0], [0, 0, 1, gone], [0, 0, 0, 1 - gone]])
+        walk, drive = 0.05**2 * DT, motion.intensity_m2_s3 * DT
+        q = np.diag([drive * DT**2 / 3, drive, walk, 25 * walk])
+        q[0, 1] = q[1, 0] = drive * DT / 2
+        pull = motion.acceleration_m_s2
+        x, p = f @ x, f @ p @ f.T + q
+        x[1] += pull * way
+        expected, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[2]), beam)
+        h = np.array([slope, 0, per_ln_c, 0])
         spread = h @ p @ h + NOISE_N**2 + (slope * 5e-6) ** 2
         step = p @ h / spread * (measured - expected)
-        assert (abs(step[1]) > 1.0) == (n == 5)
-        x, p = x + step / max(1.0, abs(step[1])), p - np.outer(p @ h, p @ h) / spread
+        assert (abs(step[2]) > 1.0) == (n == 5)
+        x, p = x + step / max(1.0, abs(step[2])), p - np.outer(p @ h, p @ h) / spread
+        before = model.moving
         model.predict(DT)
         off = model.update(height, measured)
-        assert off == pytest.approx((measured - expected) / math.sqrt(spread), rel=1e-9, abs=1e-12)
+        assert off == pytest.approx((measured - expected) / math.sqrt(spread), rel=1e-6, abs=1e-9)
+        if model.moving and not before:
+            p[1, 1] += SPEED_STD_M_S**2
+        moved, pulled = moved + model.moving, pulled + (pull != 0)
+    assert moved > 300
+    assert pulled > 50  # the motion to and fro was foreseen
     estimate = model.estimate(height)
-    got = model.surface_m, math.log(model.c), model.c_rate_per_s, estimate.depth_std_m
-    np.testing.assert_allclose(got, [*x, math.sqrt(p[0, 0])], rtol=1e-9)
-    force, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[1]), beam)
-    h = np.array([slope, per_ln_c, 0])
-    assert estimate.force_n == model.force_at(height) == pytest.approx(force, rel=1e-9)
-    assert estimate.force_std_n == pytest.approx(math.sqrt(h @ p @ h), rel=1e-9)
+    got = model.surface_m, model.surface_speed_m_s, math.log(model.c), model.c_rate_per_s
+    np.testing.assert_allclose(got, x, rtol=1e-6)
+    assert estimate.depth_std_m == pytest.approx(math.sqrt(p[0, 0]), rel=1e-6)
+    force, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[2]), beam)
+    h = np.array([slope, 0, per_ln_c, 0])
+    assert estimate.force_n == model.force_at(height) == pytest.approx(force, rel=1e-6)
+    assert estimate.force_std_n == pytest.approx(math.sqrt(h @ p @ h), rel=1e-6)
+
+
+def follow(motion_m, seconds=4.0, seed=0, c=800.0):
+    """Filter of a tip that keeps to 1 cN on a surface that moves; its errors of force and speed."""
+    rng = np.random.default_rng(seed)
+    heights, forces = press(rng, c)
+    model, height = ContactFilter(heights, forces, noise_n=NOISE_N), heights[-1]
+    force_n, speed_m_s = [], []
+    for n in range(round(seconds / DT)):
+        target = model.surface_m - model.depth_for(0.01)
+        height += (target - height) * DT / 0.03 + model.surface_speed_m_s * DT
+        truth = hertz.force(motion_m(n * DT) - height, c)[0]
+        model.predict(DT)
+        model.update(height, truth + NOISE_N * rng.standard_normal())
+        force_n.append(model.force_at(height) - truth)
+        speed_m_s.append(
+            model.surface_speed_m_s - (motion_m(n * DT + 1e-6) - motion_m(n * DT)) / 1e-6
+        )
+    return model, np.array(force_n), np.array(speed_m_s)
+
+
+def test_still_tissue_is_not_taken_to_move():
+    # 60 contacts of 4 s: at 4 deviations of a mean that is independent about 170 times a contact, 1 in 100
+    moved = [follow(lambda t: 0.0, seed=seed)[0].moving for seed in range(60)]
+    assert sum(moved) <= 3
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 2.0])
+def test_motion_to_and_fro_is_detected_followed_and_foreseen(rate_hz, monkeypatch):
+    omega, size_m = 2 * math.pi * rate_hz, 1e-4
+
+    def rms(values):
+        return np.sqrt(np.mean(values[len(values) // 2 :] ** 2))
+
+    def errors():
+        force_n, speed_m_s, pulls = [], [], []
+        for seed in range(6):
+            model, of_force, of_speed = follow(
+                lambda t, seed=seed: size_m * math.sin(omega * t + seed), seed=seed
+            )
+            assert model.moving
+            force_n.append(rms(of_force))
+            speed_m_s.append(rms(of_speed))
+            motion = model._motion
+            pulls.append(motion._speed_m2_s2 / motion._way_m2)
+        return np.mean(force_n), np.mean(speed_m_s), np.median(pulls)
+
+    of_force, of_speed, pull = errors()
+    assert pull == pytest.approx(omega**2, rel=0.4)
+    assert of_force < 0.5 * NOISE_N
+    assert of_speed < 0.5 * size_m * omega / math.sqrt(2)
+    monkeypatch.setattr(moving_surface, "FASTEST_RAD_S", 0.0)  # what is not foreseen is followed
+    assert errors()[1] > 1.1 * of_speed
+
+
+def test_one_bad_force_is_no_motion():
+    model, *_ = follow(lambda t: 0.0, seconds=0.2)
+    model.predict(DT)
+    model.update(-1e-3, 2.0)
+    assert not model.moving
 
 
 def test_touch_is_told_by_the_mean_of_a_window():

@@ -10,14 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.housing_path import lowest_on_the_way
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import vector
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -84,7 +81,7 @@ def test_tip_that_dips_its_housing_in_the_approach_is_stopped():
     made = with_tip(replace(FLAT, housing_below_m=0.0, beam_tilt_rad=0.3), limits=limits)
     made.loop.start(made.goal)
     assert made.run_until(made.controller.state.APPROACH)
-    made.controller._path._tip = FLAT
+    made.controller._free._path.tip = FLAT
     reported = made.bench.clock.motion.reported
     dipped = Rotation.from_rotvec([0.0, -0.1, 0.0]) * reported.rotation
     made.bench.clock.motion.reported = Pose(reported.position_m, dipped.as_rotvec())
@@ -92,79 +89,3 @@ def test_tip_that_dips_its_housing_in_the_approach_is_stopped():
     assert made.controller.result.cause is Cause.HOUSING
     assert "mm above the surface" in made.controller.result.message
     assert max(made.force_n) == 0
-
-
-def turned_start(made, height_m, turn_rad, aside_m=(0.0, 0.0)):
-    """Put the tip somewhere else, before anything has moved."""
-    touch = made.goal.touch
-    turned = Rotation.from_rotvec(turn_rad) * touch.rotation
-    pose = Pose(touch.position_m + [*aside_m, height_m], turned.as_rotvec())
-    made.bench.clock.motion.reported = made.bench.clock.motion.pose = pose
-    return made.bench.arm.state()
-
-
-def test_housing_is_nowhere_lower_on_the_way_than_told():
-    tip, rng, spare = TipGeometry(), np.random.default_rng(5), []
-    for _ in range(4):
-        made = with_tip(None, height_m=-0.3)  # nothing to be touched
-        turn = rng.standard_normal(3)
-        turn *= rng.uniform(0.06, 0.6) / np.linalg.norm(turn)
-        start = turned_start(
-            made, rng.uniform(8e-3, 5e-2), turn, aside_m=tuple(rng.uniform(-0.04, 0.04, 2))
-        )
-        limits = made.controller.limits
-        told = lowest_on_the_way(tip, made.goal, start, QUICK, limits)
-        path, heights = TipPath(made.goal, tip), []
-
-        def record(made=made, path=path, heights=heights, start=start):
-            tip = made.bench.clock.motion.reported
-            arm = start._replace(
-                position_m=vector(tip.position_m), rotation_rad=vector(tip.rotation_rad)
-            )
-            if path.off_rad(arm) > made.controller.limits.misalignment_rad / 2:
-                heights.append(path.housing_m(arm, path.height_m(arm)))
-
-        made.bench.clock.on_step.append(record)
-        made.loop.start(made.goal)
-        assert made.run_until(State.TARE, 10.0)
-        spare.append(min(heights) - told.housing_m)
-    assert min(spare) > -1e-6
-    # told on the safe side by what a way down is faster and a turn is earlier than is said
-    assert max(spare) < 15e-3
-    assert np.median(spare) < 8e-3
-
-
-TURNED_DOWN = [(0.0, -0.35, 0.0), (0.25, -0.2, 0.6)]
-
-
-@pytest.mark.parametrize("turn_rad", TURNED_DOWN)
-def test_goal_on_whose_way_the_housing_would_touch_is_refused(turn_rad):
-    tip = TipGeometry()
-    made = with_tip(tip)
-    turned_start(made, 0.012, turn_rad)  # the clamp is turned down by so much
-    made.loop.cycle()
-    with pytest.raises(ValueError, match="housing would be at -.* mm above the plane") as told:
-        made.loop.start(made.goal)
-    assert "begin from higher" in str(told.value)
-    assert made.controller.state is State.IDLE
-    # the same from higher, and from as low with the clamp turned up
-    for height_m, turn in ((0.05, np.array(turn_rad)), (0.012, -np.array(turn_rad) * [1, 1, 0])):
-        made = with_tip(tip)
-        turned_start(made, height_m, turn)
-        made.loop.cycle()
-        made.loop.start(made.goal)
-        made.loop.cycle()
-        assert made.controller.state is State.TRAVEL
-
-
-@pytest.mark.parametrize("turn_rad", TURNED_DOWN)
-def test_goal_begun_before_the_arm_was_seen_ends_before_it_turns(turn_rad):
-    made = with_tip(TipGeometry())
-    turned_start(made, 0.012, turn_rad)
-    turns, motion = [], made.bench.clock.motion
-    made.bench.clock.on_step.append(lambda: turns.append(np.abs(motion.twist[3:]).max()))
-    result = made.loop.make(made.goal)
-    assert result.cause is Cause.HOUSING
-    assert "begin from higher" in result.message
-    assert made.run_until(State.IDLE, 3.0)
-    assert max(turns) < 1e-6

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The life of a contact: reached and held, given up, refused; parameters never move the robot."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
@@ -16,12 +18,15 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.contact_bench import DISH_KG
 from tactile_resonance.simulation.tracking import TrackingParameters
+from tactile_resonance.simulation.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, started, stiffer
+from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, lower, started, stiffer
 
 EARLY = replace(QUICK, early_m=1.55e-3)
 
@@ -163,6 +168,40 @@ def test_unsteady_zero_is_refused():
     assert max(made.force_n) == 0
 
 
+def test_a_zero_that_nothing_explains_is_refused_and_a_dish_with_its_sample_is_not():
+    dish_n = DISH_KG * 9.80665
+    made = contact()
+    assert made.loop.make(made.goal).reached
+    assert abs(made.controller.bias_n[2]) == pytest.approx(dish_n, abs=0.1)
+    pressed = contact()
+    pressed.bench.cell.faults.bias_step_n = -1.0  # as a hand on the dish, or a step
+    result = pressed.loop.make(pressed.goal)
+    assert result.cause is Cause.TARE
+    read_mn, accepted_mn = (float(mn) for mn in re.findall(r"(\d+) mN", result.message))
+    assert (read_mn, accepted_mn) == (pytest.approx(1e3 * (dish_n + 1.0), abs=100), 2500)
+    assert max(pressed.force_n) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fifth_of_the_usual_force_is_held_and_its_loss_is_told(seed):
+    # a source that serves 2 mN by contact.requirements: a tenth of it as noise
+    cell = replace(CellParameters.from_yaml(), force_noise_rms_n=2e-4, force_divisor=20000.0)
+    cell = replace(cell, force_bias_n=(0.0, 0.0, 0.5))  # most of the dish: within its counts
+    parameters = replace(QUICK, cell_noise_n=2e-4)
+    made = contact(parameters=parameters, cell_parameters=cell, aim=Aim(2e-3), seed=seed)
+    require_fit(made.bench.force.info, 2e-3)
+    result = made.loop.make(made.goal)
+    assert result.reached, result.message
+    begun = len(made.force_n)
+    made.run(3.0)
+    assert made.controller.state is State.HOLD, made.controller.result.message
+    assert np.mean(made.force_n[begun:]) == pytest.approx(2e-3, rel=0.1)
+    lower(made.bench, 5e-3)
+    assert made.run_until(State.IDLE, 3.0)
+    assert made.controller.result.cause is Cause.CONTACT_LOST
+    assert "limit 0.4 mN" in made.controller.result.message
+
+
 def test_same_seed_same_contact_to_the_last_bit():
     forces = []
     for _ in range(2):
@@ -218,6 +257,38 @@ def test_housing_stays_clear_of_the_tissue():
     )
     with pytest.raises(ValueError, match="beam_tilt_rad: got 2"):
         TipGeometry(beam_tilt_rad=2)
+
+
+@pytest.mark.parametrize("state", [State.TRAVEL, State.TARE])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_tip_that_leaves_the_way_of_its_goal_is_stopped(state, axis):
+    made = started(start_m=0.1 if state is State.TRAVEL else 2.5e-3)
+    assert made.run_until(state)
+    made.run(0.05)
+    start = np.array(made.bench.clock.motion.reported.position_m)
+    away = np.zeros(6)
+    away[axis] = 0.1  # [m/s]: somebody else commands the arm
+    obeys = made.bench.arm.speed
+    made.bench.arm.speed = lambda twist, limit: obeys(away, limit)
+    made.bench.arm.stop, stops = lambda limit: obeys(away, limit), made.bench.arm.stop
+    made.loop.run_while(lambda: made.controller.result is None, 3.0)
+    result = made.controller.result
+    assert result.cause is Cause.WORKSPACE, result.message
+    assert "off the way of its goal" in result.message
+    gone = made.bench.clock.motion.reported.position_m[axis] - start[axis]
+    assert 0.045 < gone < 0.055
+    made.bench.arm.speed, made.bench.arm.stop = obeys, stops
+    assert made.run_until(State.IDLE, 3.0), "beside its way the tip is drawn back"
+
+
+@pytest.mark.parametrize(("start_m", "turned_rad"), [(0.3, 0.0), (1e-4, 0.0), (0.02, 0.5)])
+def test_a_way_from_afar_from_below_or_with_a_turn_is_within_its_box(start_m, turned_rad):
+    made = contact(start_m=start_m)
+    place_m, turn = made.goal.touch.position_m, made.goal.touch.rotation
+    turned = Rotation.from_rotvec([0.0, 0.0, turned_rad]) * turn
+    goal = ContactGoal(Pose(place_m, turned.as_rotvec()), made.goal.aim)
+    result = made.loop.make(goal)
+    assert result.reached, result.message
 
 
 def test_touch_pose_puts_the_ball_on_the_point():

@@ -67,6 +67,7 @@ def test_a_held_contact_takes_no_goal_and_no_parameters_and_is_drawn_back_when_t
     assert client.state.cause == "cancelled"
     # at rest they are taken, but none that the arm's driver would not pass on
     assert "max_acceleration_m_s2" in client.set(limits__stop_deceleration_m_s2=5.0)
+    assert "at most 0.03, as launched" in client.set(limits__abort_force_n=0.04)
     assert client.set(contact__approach_speed_m_s=3e-3) == ""
     assert client.set(contact__approach_speed_m_s=PARAMETERS.approach_speed_m_s) == ""
 

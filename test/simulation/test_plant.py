@@ -7,8 +7,17 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import CellMounting, Friction, Plane, Plant, RigidTip
+from tactile_resonance.simulation.plant import (
+    CellMounting,
+    Friction,
+    Plane,
+    Plant,
+    RigidTip,
+    Sphere,
+    contact_radius_m,
+)
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
@@ -61,6 +70,40 @@ def test_tilted_surface_pushes_along_its_normal_and_slides_with_friction():
         p.step(at(*(normal * RADIUS_M - [0, 0, depth])), 0.002)
     want = hertz(4e-4 * np.cos(tilt)) * normal
     np.testing.assert_allclose(p.force_n, want, rtol=1e-3)
+
+
+CENTRE_M, CURVED_M = np.array([0.01, -0.02, 0.05]), 10e-3
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+@pytest.mark.parametrize("polar_rad", [0.0, 0.5])
+def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(hollow, polar_rad):
+    surface = Sphere(CENTRE_M, CURVED_M, hollow)
+    tip = Tip(RADIUS_M, poisson_ratio=NU)
+    p = plant(surface=surface, tip=lambda t: tip.on(t, surface), friction=Friction(coefficient=0.0))
+    # from the centre to the contact; the tissue is inside of the sphere, or outside of the hollow
+    out = np.array([np.sin(polar_rad), 0, np.cos(polar_rad)]) * (-1 if hollow else 1)
+    normal = -out if hollow else out
+    for depth in np.linspace(-1e-4, 4e-4, 26):
+        p.step(at(*(CENTRE_M + CURVED_M * out + (RADIUS_M - depth) * normal)), 0.002)
+    assert p.depth_m == pytest.approx(4e-4, rel=1e-9)
+    # Hertz: 1/R = 1/r + 1/R of a sphere, less 1/R in a hollow
+    radius = 1 / (1 / 2.5e-3 - 1 / 10e-3) if hollow else 1 / (1 / 2.5e-3 + 1 / 10e-3)
+    want = 4 / 3 * 10e3 / (1 - NU**2) * np.sqrt(radius) * 4e-4**1.5
+    np.testing.assert_allclose(p.force_n, want * normal, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(p.torque_nm, 0, atol=1e-12)
+
+
+def test_sphere_without_bounds_is_a_plane_and_a_ball_must_fit_into_its_hollow():
+    assert contact_radius_m(RADIUS_M, Plane.tilted(0.1)) == RADIUS_M
+    for hollow in (False, True):
+        far = Sphere(np.array([0, 0, 1e6 if hollow else -1e6]), 1e6, hollow)
+        height, normal = far.height_of((0.01, 0.02, 3e-3))
+        assert height == pytest.approx(3e-3, abs=1e-9)
+        np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-7)
+        assert contact_radius_m(RADIUS_M, far) == pytest.approx(RADIUS_M, rel=1e-8)
+    with pytest.raises(ValueError, match="below the radius of the hollow, 0.002 m"):
+        contact_radius_m(RADIUS_M, Sphere(CENTRE_M, 2e-3, hollow=True))
 
 
 def test_friction_sticks_below_its_limit_and_slides_at_it():

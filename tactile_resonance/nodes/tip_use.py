@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How contact_node uses the sensor, as its parameters tell: a scan checks the way by the same figures."""
+
+from __future__ import annotations
+
+import time
+
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.nodes.goals import POLL_S
+from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.simulation.parameters import read_sensor
+
+SERVICE = "contact_node/get_parameters"
+ANSWERED_WITHIN_S = 5.0
+GEOMETRY = ("beam_tilt_rad", "housing_below_m")
+PARAMETERS = ("standoff_m", "early_m")
+LIMITS = ("depth_m", "near_m", "misalignment_rad", "clearance_m")
+NAMES = (*GEOMETRY, *(f"contact.{n}" for n in PARAMETERS), *(f"limits.{n}" for n in LIMITS))
+
+
+class TipUseClient:
+    """Asks contact_node, from a thread beside the one that spins the node."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._client = node.create_client(GetParameters, SERVICE)
+        node.resources.callback(node.destroy_client, self._client)
+
+    def ask(self, sensor: str) -> TipUse | None:
+        """The use of a sensor of ``config/sensors``; None where no node of ours answers in time."""
+        deadline = time.monotonic() + ANSWERED_WITHIN_S
+        while not self._client.service_is_ready():
+            if time.monotonic() > deadline:
+                return None
+            time.sleep(POLL_S)
+        answer = self._client.call_async(GetParameters.Request(names=NAMES))
+        while not answer.done():
+            if time.monotonic() > deadline:
+                self._client.remove_pending_request(answer)
+                return None
+            time.sleep(POLL_S)
+        told = [parameter_value_to_python(value) for value in answer.result().values]
+        if len(told) != len(NAMES) or None in told:
+            return None
+        values = dict(zip((name.rpartition(".")[2] for name in NAMES), told, strict=True))
+        described = read_sensor(share_path(f"config/sensors/{sensor}.yaml"))
+        ball, beam = described.tip.radius_m, described.beam.free_length_m
+        return TipUse(
+            TipGeometry(ball, beam, **{name: values[name] for name in GEOMETRY}),
+            ContactParameters(**{name: values[name] for name in PARAMETERS}),
+            Limits(**{name: values[name] for name in LIMITS}),
+        )

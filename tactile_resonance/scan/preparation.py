@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scan does before its first point: surface and normals found by touch, what is not clear left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.hands import PointFailed, ScanEnded
+from tactile_resonance.scan.measurement import Skipped
+from tactile_resonance.scan.normal_search import find_normals
+from tactile_resonance.scan.plan import Plan, clear_plan, make_plan, plan_with
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.surface import Plane, TouchRequest
+from tactile_resonance.scan.surface_search import Touch, find_surface
+
+UNCHECKED = Skipped(
+    "the check that the housing is clear of the surface",
+    "how the sensor is used is not known: it is kept clear of a plane only",
+    0.0,
+)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A plan to go by.
+
+    Attributes
+    ----------
+    plan : Plan
+    facts : dict
+        What the run keeps of surface and normals that were found.
+    """
+
+    plan: Plan
+    facts: dict[str, Any]
+
+
+def prepare(
+    scene: ScanScene,
+    plan: Plan | None,
+    ball_radius_m: float,
+    find: Callable[[ScanPoint, float, int], Touch],
+    tip_use: Callable[[], TipUse | None] | None,
+) -> Prepared:
+    """Touch what the scene asks for, and leave out what is not clear, before and after normals are known.
+
+    Parameters
+    ----------
+    scene : ScanScene
+    plan : Plan or None
+        None: the surface is to be found by touch.
+    ball_radius_m : float
+    find : callable
+        Touches a point with a force, one of so many.
+    tip_use : callable or None
+        How the sensor is used; it returns None where that is not to be had. None: nothing is moved.
+
+    Raises
+    ------
+    ValueError
+        Where a surface is not found, touches cannot be made, or no point is left.
+    """
+    facts: dict[str, Any] = {}
+    heading_rad, surface = scene.sensor.heading_rad, scene.surface
+    if isinstance(surface, TouchRequest):
+        force_n, count = surface.force_n or scene.force_n, len(surface.xy_m)
+        try:
+            found = find_surface(
+                surface, ball_radius_m, heading_rad, lambda point: find(point, force_n, count)
+            )
+        except (ValueError, PointFailed, ScanEnded) as error:
+            raise ValueError(f"surface.touch: {error}") from error
+        facts["surface"] = found.as_json()
+        surface = found.surface
+        plan = make_plan(scene, surface)
+    assert plan is not None
+    use: TipUse | None = None
+    # of a plane contact control keeps the sensor clear itself
+    if tip_use is not None and not isinstance(surface, Plane):
+        use = tip_use()
+        if use is None:
+            plan = replace(plan, skipped=(UNCHECKED, *plan.skipped))
+    plan = clear_plan(scene, plan, surface, use)
+    asked = scene.normals
+    if asked is None:
+        return Prepared(plan, facts)
+    force_n, count = asked.force_n or scene.force_n, len(plan.points)
+    try:
+        normals, left = find_normals(
+            *(plan.points, asked, ball_radius_m, heading_rad),
+            lambda point: find(point, force_n, count),
+        )
+    except (PointFailed, ScanEnded) as error:
+        raise ValueError(f"normals: {error}") from error
+    facts["normals"] = [normal.as_json() for normal in normals]
+    plan = plan_with(scene, plan, [normal.point for normal in normals], left)
+    return Prepared(clear_plan(scene, plan, surface, use), facts)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is touched before the first point of a scan, in which order, and what is left out."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.hands import PointFailed, ScanEnded
+from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.preparation import UNCHECKED, prepare
+from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.surface import HeightField, NormalRequest, Plane, TouchRequest
+from tactile_resonance.scan.surface_search import Touch
+
+RADIUS_M = 2.5e-3
+USE = TipUse(TipGeometry(), ContactParameters(), Limits(depth_m=4e-3))
+AXIS = np.arange(-0.1, 0.1001, 1e-3)
+BANK = HeightField(
+    AXIS, AXIS, (0.02 / (1 + np.exp((AXIS + 0.05) / 2e-3)))[:, None] + np.zeros(AXIS.size)
+)
+
+
+def scene_of(surface, xy=((0.0, 0.0), (0.05, 0.0), (0.06, 0.0)), **fields):
+    positions = np.column_stack([np.array(xy), np.full(len(xy), np.nan)])
+    return ScanScene("test", 0.01, positions, surface=surface, **fields)
+
+
+def finding(slope=(0.0, 0.0), touched=None, bad=()):
+    """Balls that lie on a plane through the origin; what was asked for is noted."""
+
+    def find(point, force_n, count):
+        if touched is not None:
+            touched.append((point.index, force_n, count))
+        if point.index in bad and "surface" not in point.label:
+            raise PointFailed("adhesion")
+        x, y, _ = point.position_m
+        lift = RADIUS_M * np.sqrt(1 + np.square(slope).sum())
+        return Touch((x, y, slope[0] * x + slope[1] * y + lift), 2e-5, force_n)
+
+    return find
+
+
+def use():
+    return USE
+
+
+def test_points_that_are_not_clear_are_not_even_touched():
+    scene, touched = scene_of(BANK, normals=NormalRequest(force_n=5e-3)), []
+    made = prepare(scene, make_plan(scene), RADIUS_M, finding(touched=touched), use)
+    assert [point.position_m[0] for point in made.plan.points] == pytest.approx([0.05, 0.06])
+    assert touched == [(n, 5e-3, 2) for n in (0, 0, 0, 1, 1, 1)]
+    assert len(made.facts["normals"]) == 2
+    assert made.plan.skipped[0].what == "the point at x = 0.00, y = 0.00 mm"
+
+
+def test_normals_that_are_found_are_looked_at_again():
+    # the clamp is turned down by 0.17 rad towards what is level there
+    level = HeightField(AXIS, AXIS, np.zeros((AXIS.size,) * 2))
+    scene = scene_of(level, xy=((0.0, 0.0),), normals=NormalRequest())
+    with pytest.raises(ValueError, match="all 1 are left out; the first: at the depth limit"):
+        prepare(scene, make_plan(scene), RADIUS_M, finding((0.17, 0.0)), use)
+    made = prepare(scene, make_plan(scene), RADIUS_M, finding((-0.17, 0.0)), use)
+    assert len(made.plan.points) == 1
+    np.testing.assert_allclose(made.plan.points[0].normal[0], 0.17 / np.hypot(1, 0.17))
+
+
+def test_surface_is_found_first_and_points_are_on_it():
+    corners = ((-0.02, -0.02), (0.08, -0.02), (0.08, 0.02), (-0.02, 0.02))
+    touched = []
+    scene = scene_of(TouchRequest(corners, "plane"), normals=NormalRequest(touches=4))
+    made = prepare(scene, None, RADIUS_M, finding((0.1, 0.05), touched, bad=[1]), use)
+    assert len(touched) == 4 + 4 + 1 + 4  # the second point is given up at its first touch
+    assert [round(point.position_m[0], 6) for point in made.plan.points] == [0.0, 0.06]
+    assert len(made.facts["surface"]["touches"]) == 4
+    assert made.plan.skipped[0].why == "normals: adhesion"
+
+
+@pytest.mark.parametrize("surface", [Plane(), BANK])
+def test_what_is_not_looked_at_is_noted(surface):
+    scene = scene_of(surface)
+    plan = make_plan(scene)
+    assert prepare(scene, plan, RADIUS_M, finding(), None).plan == plan  # nothing is moved
+    made = prepare(scene, plan, RADIUS_M, finding(), lambda: None)
+    assert (UNCHECKED in made.plan.skipped) is (surface is BANK)
+    assert made.plan.points == plan.points
+
+
+def test_touches_that_cannot_be_made_refuse_the_scan():
+    def find(point, force_n, count):
+        raise ScanEnded("the tip is not moved")
+
+    scene = scene_of(Plane(), normals=NormalRequest())
+    with pytest.raises(ValueError, match="normals: the tip is not moved"):
+        prepare(scene, make_plan(scene), RADIUS_M, find, use)
+    scene = scene_of(TouchRequest(((0, 0), (1, 0), (0, 1)), "plane"))
+    with pytest.raises(ValueError, match=r"surface\.touch: the tip is not moved"):
+        prepare(scene, None, RADIUS_M, find, use)
