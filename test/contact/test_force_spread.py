@@ -21,19 +21,24 @@ def told(motion, length_s=4.0, rate_hz=1000.0, noise_n=0.0, seed=1):
     return spread_of(t, 0.01 + motion(t) + noise, length_s)
 
 
+def share_seen(motion_hz):
+    """Of the rms of a sinusoid."""
+    steps = np.sinc(0.01 * motion_hz) ** 2 * (1 - math.cos(2 * np.pi * 0.01 * motion_hz))
+    return math.sqrt(np.sinc(0.02 * motion_hz) ** 2 - steps / 2)
+
+
 @pytest.mark.parametrize("rate_hz", [500.0, 1000.0])
-@pytest.mark.parametrize("motion_hz", [0.25, 1.2, 2.0, 5.0])
+@pytest.mark.parametrize("motion_hz", [0.25, 1.2, 2.0, 5.0, 10.0])
 def test_rms_and_extremes_of_a_sinusoid(motion_hz, rate_hz):
-    """Amplitude over sqrt(2), less what its steps of 20 ms share with noise, and the mean over 20 ms."""
+    """Amplitude over sqrt(2), less the mean over 20 ms and what its steps of 10 ms share with noise."""
     amplitude_n = 5e-4
     found = told(lambda t: amplitude_n * np.sin(2 * np.pi * motion_hz * t), rate_hz=rate_hz)
-    turn = 2 * np.pi * motion_hz * 0.02
-    smoothed = np.sinc(motion_hz * 0.02)
-    expected = amplitude_n / math.sqrt(2) * smoothed * math.sqrt(math.cos(turn))
-    assert found.rms_n == pytest.approx(expected, rel=5e-3)
-    assert found.rms_n > (0.99 if motion_hz < 2 else 0.97 if motion_hz < 5 else 0.88) * (
-        amplitude_n / math.sqrt(2)
+    assert found.rms_n == pytest.approx(
+        share_seen(motion_hz) * amplitude_n / math.sqrt(2), rel=5e-3
     )
+    least = {0.25: 0.998, 1.2: 0.998, 2.0: 0.99, 5.0: 0.965, 10.0: 0.87}[motion_hz]
+    assert found.rms_n > least * amplitude_n / math.sqrt(2)
+    turn, smoothed = 2 * np.pi * motion_hz * 0.02, np.sinc(motion_hz * 0.02)
     # the largest mean is at most half a part off the crest
     crest = smoothed * amplitude_n
     for force_n, sign in ((found.min_n, -1), (found.max_n, 1)):
@@ -52,7 +57,7 @@ def test_noise_of_the_sensor_is_no_motion():
         for seed in range(200)
     ]
     mean_square = np.mean(np.square(moving))
-    expected = (amplitude_n * np.sinc(0.025)) ** 2 / 2 * math.cos(2 * np.pi * 0.025)
+    expected = (share_seen(1.25) * amplitude_n) ** 2 / 2
     # 200 records; the spread of one is what they show
     assert mean_square == pytest.approx(
         expected, abs=4 * np.std(np.square(moving)) / math.sqrt(200)
@@ -72,9 +77,9 @@ def test_gaps_are_left_out():
     force = 0.01 + 1e-3 * (t > 0.2)
     force[100:140] = math.nan
     found = spread_of(t, force, 0.4)
-    # 8 parts of the low force, 10 of the high one; one step of nineteen counts as noise
+    # 8 parts of the low force, 10 of the high one; one step of 34 over 10 ms counts as noise
     low = 8 / 18
-    expected = low * (1 - low) - (1 - 1 / 18) / 16 / 2
+    expected = low * (1 - low) - (1 - 1 / 18) / 34 / 4
     assert found.rms_n == pytest.approx(1e-3 * math.sqrt(expected), rel=1e-6)
     assert (found.min_n, found.max_n) == pytest.approx((0.01, 0.011))
 

