@@ -10,6 +10,8 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.contact.force_spread import ForceSpread
+
 
 class InputKind(Enum):
     """How the actuator channel was obtained."""
@@ -77,6 +79,8 @@ class Contact:
         Fraction of that time in which forces were measured; NaN where unknown.
     reason : str
         Why the force is unknown; empty where it is known.
+    spread : ForceSpread
+        How the force moved over that time.
     """
 
     force_n: float = float("nan")
@@ -87,6 +91,7 @@ class Contact:
     time_ns: int = 0
     coverage: float = float("nan")
     reason: str = ""
+    spread: ForceSpread = field(default_factory=ForceSpread)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.force_spread import ForceSpread, spread_of
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.fields import require
@@ -54,6 +55,8 @@ class ForceOver:
         Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
         correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
         Modeling and Analysis*, section 9.5.3). NaN for fewer than 32 wrenches.
+    spread : ForceSpread
+        How the force moved meanwhile.
     coverage : float
         Share of the interval over which valid wrenches came without a gap.
     position_m : tuple of 3 floats
@@ -66,6 +69,7 @@ class ForceOver:
 
     force_n: float
     force_std_n: float
+    spread: ForceSpread
     coverage: float
     position_m: Vector
     rotation_rad: Vector
@@ -162,15 +166,18 @@ class ForceRecord:
             rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
         reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, spans.coverage)
         if reason:
+            nan = math.nan
             return ForceOver(
-                math.nan, math.nan, spans.coverage, position_m, rotation_rad, reason
+                nan, nan, ForceSpread(), spans.coverage, position_m, rotation_rad, reason
             )
-        heard = np.count_nonzero((times >= t0_ns) & (times <= t1_ns) & np.isfinite(rows[:, 0]))
-        std_n = math.nan
-        if heard >= LEAST_WRENCHES:
+        inside = (times >= t0_ns) & (times <= t1_ns)
+        std_n, spread = math.nan, ForceSpread()
+        if np.count_nonzero(inside & np.isfinite(rows[:, 0])) >= LEAST_WRENCHES:
             std_n = math.hypot(spans.std_of_mean(), zero_std_n)
+            time_s = (times[inside] - t0_ns) * 1e-9
+            spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
         force_n = float(spans.mean()[0])
-        return ForceOver(force_n, std_n, spans.coverage, position_m, rotation_rad, "")
+        return ForceOver(force_n, std_n, spread, spans.coverage, position_m, rotation_rad, "")
 
     def _missing(
         self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: int | None, coverage: float

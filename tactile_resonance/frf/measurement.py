@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, stacked_bins
 from tactile_resonance.frf.band_bins_stream import MOST_BINS, BandBinsStream
 from tactile_resonance.frf.fault_types import Fault, FaultKind, FaultReport
@@ -17,7 +18,7 @@ from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.streaming import FrfStream
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import Origin, Record
+from tactile_resonance.record import Contact, Origin, Record
 
 LEAST_COVERAGE = 0.8
 """Of the time of a measurement its force must be known."""
@@ -60,9 +61,7 @@ class MeasurementFrf:
         self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._first: Record | None = None
         self._last: Record | None = None
-        self._forces: list[
-            tuple[float, float, float]
-        ] = []  # mean, deviation [N], length [s] of each block
+        self._contacts: list[tuple[Contact, float]] = []  # of each block, with its length [s]
         self.saturated = False
 
     def add(self, record: Record, excitation: Excitation) -> FRF:
@@ -149,11 +148,14 @@ class MeasurementFrf:
             raise ValueError("records: none so far, expected at least 1")
         last = self._last.origin
         end_ns = last.time_ns + round(self._last.duration_s * 1e9)
-        force_n, force_std_n = mean_force(self._forces)
+        force_n, force_std_n = mean_force(
+            [(of.force_n, of.force_std_n, seconds) for of, seconds in self._contacts]
+        )
+        spread = joined_spread([(of.force_n, of.spread, seconds) for of, seconds in self._contacts])
         return replace(
             last,
             time_ns=(self._first.origin.time_ns + end_ns) // 2,
-            contact=replace(last.contact, force_n=force_n, force_std_n=force_std_n),
+            contact=replace(last.contact, force_n=force_n, force_std_n=force_std_n, spread=spread),
         )
 
     def _take(self, stream: FrfStream, realisation: int, u: np.ndarray, y: np.ndarray) -> None:
@@ -212,8 +214,7 @@ class MeasurementFrf:
         if self._first is None:
             self._first = record
         self._last = record
-        contact = record.origin.contact
-        self._forces.append((contact.force_n, contact.force_std_n, record.duration_s))
+        self._contacts.append((record.origin.contact, record.duration_s))
         for channel, name in ((record.actuator, "actuator"), (record.sensor, "sensor")):
             if channel.saturated:
                 self.saturated = True

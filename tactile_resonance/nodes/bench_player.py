@@ -11,7 +11,6 @@ from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.simulation.acquisition import Block, ChannelSamples
-from tactile_resonance.simulation.bench_run import BenchRun
 
 
 class BenchPlayer:
@@ -31,21 +30,19 @@ class BenchPlayer:
 
     def play(
         self,
-        run: BenchRun,
         excitation: Excitation,
         start_ns: int,
-        hand_out: Callable[[Block, int], None],
+        hand_out: Callable[[int], None],
     ) -> None:
         """Begin to play; what was played before must have been silenced.
 
         Parameters
         ----------
-        run : BenchRun
         excitation : Excitation
         start_ns : int
             ROS time of the first sample [ns].
         hand_out : callable
-            Called in the thread with each block and the ROS time of its end [ns], at that time.
+            Called in the thread with the ROS time of the end of each block [ns], at that time.
 
         Raises
         ------
@@ -57,11 +54,11 @@ class BenchPlayer:
         self._stop.clear()
 
         def play() -> None:
-            for block in run.play(excitation, excitation.periods):
-                end_ns = start_ns + round((block.index + 1) * excitation.period_s * 1e9)
+            for count in range(1, excitation.periods + 1):
+                end_ns = start_ns + round(count * excitation.period_s * 1e9)
                 if not self._wait_until(end_ns):
                     return
-                hand_out(block, end_ns)
+                hand_out(end_ns)
 
         self._thread = threading.Thread(target=play, name="bench", daemon=True)
         self._thread.start()

@@ -14,6 +14,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.record import Contact
+from tactile_resonance.recording.from_messages import spread_from_message
 from tactile_resonance.srv import ForceOver
 
 PARAMETER = Parameter(
@@ -73,7 +74,8 @@ class MeasuredContact:
             time.sleep(POLL_S)
         over: ForceOver.Response = future.result()
         contact = contact_from_message(over.tip_pose, over.force_n, over.force_std_n)
-        return replace(contact, coverage=over.coverage, reason=over.reason)
+        spread = spread_from_message(over, "force_")
+        return replace(contact, coverage=over.coverage, reason=over.reason, spread=spread)
 
 
 class PublishedPlace:

@@ -27,6 +27,7 @@ from tactile_resonance.recording.from_messages import (
     GRIDS,
     INPUT_KINDS,
     POLES_STATUS,
+    SPREAD,
     array_of,
     contact_from_message,  # noqa: F401 - for those who convert both ways
     excitation_from_message,  # noqa: F401 - for those who convert both ways
@@ -288,6 +289,8 @@ def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> 
     message.tip_pose = pose_to_message(origin.contact)
     message.contact_force_n = float(origin.contact.force_n)
     message.contact_force_std_n = float(origin.contact.force_std_n)
+    for name in SPREAD:
+        setattr(message, f"contact_force_{name}", float(getattr(origin.contact.spread, name)))
 
 
 def _fill(target: array.array, values: npt.NDArray, dtype: npt.DTypeLike) -> None:

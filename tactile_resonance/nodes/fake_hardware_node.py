@@ -34,15 +34,17 @@ from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, run_node
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import TruthTopic
 from tactile_resonance.record import Contact
-from tactile_resonance.simulation.acquisition import BenchEffects, Block
+from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bench_tip import BenchTip
+from tactile_resonance.simulation.contact_so_far import ContactSoFar, ContactState, parts_of
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.truth import truth_of
+from tactile_resonance.simulation.varying import INTERVAL_S
 from tactile_resonance.srv import ForceOver, Play, Truth
 
 PARAMETERS = (
@@ -83,20 +85,21 @@ PARAMETERS = (
 
 
 EFFECTS = ("noise", "quantisation", "nonlinearity")
+HERTZ = {"contact_radius_m": math.nan, "depth_m": math.nan}  # of a tip: not that of the plant
 PLANT_CHECK_S = 0.5
 CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its first goal
-LEAST_HOLD_S = 0.1  # creep is given from here on; a contact that young is not measured
 
 
 class FakeHardwareNode(ManagedNode):
     """Serves `bench/play`, `bench/stop` and `bench/get_truth`, hands out `bench/block`.
 
-    With a robot the tip is where the robot holds it, and the contact that of the plant as an excitation
-    begins: its force held from then on, the tissue creeping. Without one contact is ideal, at the scene's
-    force or the one asked for: where `tcp_pose` states, or where the action `make_contact` puts the tip,
-    which this node serves then; the force comes back on `wrench` and from the service `force_over`. What the
+    With a robot the tip is where the robot holds it, and the contact that of the plant, whatever becomes of it
+    while an excitation is played; one that begins in air stays in air. Without one contact is ideal, at the
+    scene's force or the one asked for, also on tissue that moves: where `tcp_pose` states, or where the action
+    `make_contact` puts the tip, which this node serves then; the force comes back on `wrench` and from the
+    service `force_over`. What the
     simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it is put
-    somewhere or an excitation begins; of a contact that creeps also with each block. In simulated time it
+    somewhere or an excitation begins; of a contact of the plant also with each block. In simulated time it
     publishes `/clock`.
     """
 
@@ -234,8 +237,12 @@ class FakeHardwareNode(ManagedNode):
             raise ValueError(f"the simulated robot does not answer: {error}") from error
         self._stalls = true.stalls
         touching = true.force_n > 0
-        tissue = self._laid.tissue_at(true.tip_m) if touching else None
-        self._tip = BenchTip(tissue, true.force_n, max(true.since_s, LEAST_HOLD_S), creeping=True)
+        tissue = self._laid.tissue_at(true.site_m) if touching else None
+        self._tip = BenchTip(tissue, true.force_n, true.since_s or 1.0)
+        if touching:
+            self._tip = replace(
+                self._tip, contact_radius_m=true.contact_radius_m, depth_m=true.depth_m
+            )
         x, y, z = true.tip_m.tolist()
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
         self._plant_ahead_s = true.time_s - place.time_ns * 1e-9
@@ -256,16 +263,15 @@ class FakeHardwareNode(ManagedNode):
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
             self._take_up_contact()
-            run = self._tip.start(
-                self._bench,
-                excitation.periods * excitation.period_s,
-                int(entropy.generate_state(1, np.uint64)[0]),
-                effects,
-            )
+            tip, so_far = self._tip, None
+            if self._plant is not None and tip.tissue is not None:
+                so_far = ContactSoFar(self._bench, tip)
+            run = self._start(tip, so_far, int(entropy.generate_state(1, np.uint64)[0]), effects)
             self._silence()
             start_ns = self._now_ns()
-            hand_out = self._hand_out(excitation, start_ns, self._stays.newest.pose, self._tip)
-            self._player.play(run, excitation, start_ns, hand_out)
+            self._player.play(
+                excitation, start_ns, self._hand_out(run, excitation, start_ns, so_far)
+            )
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
@@ -296,6 +302,7 @@ class FakeHardwareNode(ManagedNode):
                 tip,
                 force_n=request.force_n or tip.force_n,
                 since_s=request.hold_time_s or tip.since_s,
+                **(HERTZ if request.force_n or request.hold_time_s else {}),
             ).coupled(self._bench)
             truth_to_response(truth_of(coupled, request.frequency_hz), response)
         except (ValueError, ClockLostError) as error:
@@ -307,34 +314,58 @@ class FakeHardwareNode(ManagedNode):
         response.success = True
         return response
 
+    def _start(
+        self, tip: BenchTip, so_far: ContactSoFar | None, seed: int, effects: BenchEffects
+    ) -> BenchRun:
+        """A run from rest; the nonlinearity takes the contact as fixed."""
+        if so_far is not None and not effects.nonlinearity:
+            return self._bench.start_following(so_far.coupled_at, seed=seed, effects=effects)
+        return self._bench.start(
+            tip.tissue,
+            force_n=tip.force_n or None,
+            hold_time_s=tip.since_s,
+            seed=seed,
+            effects=effects,
+        )
+
     def _hand_out(
-        self, excitation: Excitation, start_ns: int, pose: PoseStamped, tip: BenchTip
-    ) -> Callable[[Block, int], None]:
-        """What publishes a block at its end.
+        self,
+        run: BenchRun,
+        excitation: Excitation,
+        start_ns: int,
+        so_far: ContactSoFar | None,
+    ) -> Callable[[int], None]:
+        """What makes and publishes a block at its end: only then is it known what became of the contact.
 
-        A contact that creeps has its truth with every block: the mean over all blocks so far, with the stamp
-        that their poles will have, and the plant's mean force over them.
+        A contact of the plant has its truth with every block: the mean over all blocks so far, with the stamp
+        that their poles will have.
         """
+        blocks, pose, tip = (
+            run.play(excitation, excitation.periods),
+            self._stays.newest.pose,
+            self._tip,
+        )
+        block_ns = round(excitation.period_s * 1e9)
 
-        def hand_out(block: Block, end_ns: int) -> None:
-            if tip.creeping:
-                over_s = (block.index + 1) * excitation.period_s
-                pose.header.stamp = time_message(start_ns + round(over_s / 2 * 1e9))
-                force_n = self._plant_force_n(start_ns, end_ns)
-                self._truth.publish(pose, tip, excitation.measurement_id, force_n, over_s)
-            record = bench_record(block, excitation, start_ns, self._frame_id)
+        def hand_out(end_ns: int) -> None:
+            if so_far is not None:
+                so_far.extend(excitation.period_s, self._contact_over(end_ns - block_ns, end_ns))
+                pose.header.stamp = time_message((start_ns + end_ns) // 2)
+                self._truth.publish(pose, tip, excitation.measurement_id, so_far.parts)
+            record = bench_record(next(blocks), excitation, start_ns, self._frame_id)
             self._blocks.publish(record_to_message(record))
 
         return hand_out
 
-    def _plant_force_n(self, from_ns: int, to_ns: int) -> float:
-        """Mean force of the plant over an interval; NaN where the plant has ended."""
+    def _contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
+        """The contact over an interval, as fine as the sensor follows it; unchanged where the plant ended."""
         assert self._plant is not None
         from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
+        parts = parts_of(to_s - from_s, INTERVAL_S)
         try:
-            return self._plant.mean_force_n(from_s, to_s)
+            return self._plant.contact_over(from_s, to_s, parts)
         except OSError:
-            return math.nan
+            return [None] * parts
 
 
 def main() -> None:

@@ -81,6 +81,7 @@ class ForceService:
         self, request: ForceOver.Request, response: ForceOver.Response
     ) -> ForceOver.Response:
         response.force_n = response.force_std_n = math.nan
+        response.force_rms_n = response.force_min_n = response.force_max_n = math.nan
         clock = self._clock()
         if clock is None:
             response.reason = "contact_node is not active"
@@ -99,6 +100,8 @@ class ForceService:
             await future
         over = self._record.over(start_ns, end_ns)
         response.force_n, response.force_std_n = over.force_n, over.force_std_n
+        response.force_rms_n = over.spread.rms_n
+        response.force_min_n, response.force_max_n = over.spread.min_n, over.spread.max_n
         response.coverage, response.reason = over.coverage, over.reason
         if self._state is State.IDLE and over.reason:
             response.reason = "no contact was under way"

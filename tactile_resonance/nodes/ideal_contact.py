@@ -74,22 +74,28 @@ class Stays:
         """The force over an interval, as the service `force_over` answers."""
         start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
         response.force_n = response.force_std_n = math.nan
+        response.force_rms_n = response.force_min_n = response.force_max_n = math.nan
         if not start_ns < end_ns:
             response.reason = "the interval is empty"
             return response
-        total = seen_ns = 0.0
+        spans: list[tuple[float, float]] = []  # length [ns], force
         until_ns = end_ns
         for stay in reversed(self._stays):
             span_ns = max(0, until_ns - max(start_ns, stay.since_ns))
-            total, seen_ns = total + span_ns * stay.force_n, seen_ns + span_ns
             if span_ns:
+                spans.append((span_ns, stay.force_n))
                 response.tip_pose = stay.pose
             until_ns = min(until_ns, stay.since_ns)
+        seen_ns = sum(span_ns for span_ns, _ in spans)
         response.coverage = seen_ns / (end_ns - start_ns)
         if until_ns > start_ns:
             response.reason = f"the block begins before what is kept, {MOST_STAYS} places"
             return response
-        response.force_n, response.force_std_n = total / seen_ns, 0.0
+        mean_n = sum(span_ns * force_n for span_ns, force_n in spans) / seen_ns
+        square = sum(span_ns * (force_n - mean_n) ** 2 for span_ns, force_n in spans) / seen_ns
+        response.force_n, response.force_std_n, response.force_rms_n = mean_n, 0.0, square**0.5
+        forces_n = [force_n for _, force_n in spans]
+        response.force_min_n, response.force_max_n = min(forces_n), max(forces_n)
         return response
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import select
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.processes import end_with_parent, may_take_priority
+from tactile_resonance.simulation.contact_so_far import ContactState
 from tactile_resonance.simulation.plant_defaults import PRIORITY, READY
 from tactile_resonance.simulation.robot.control_port import order
 
@@ -32,8 +32,12 @@ class TrueContact:
     ----------
     tip_m : (3,) array
         In the robot's base.
+    site_m : (3,) array
+        Where the tissue under the tip was looked up; `tip_m` where none was yet.
     force_n : float
         Along the normal; 0 out of contact.
+    contact_radius_m, depth_m : float
+        0 out of contact.
     since_s : float
         How long the contact has lasted.
     time_s : float
@@ -43,7 +47,10 @@ class TrueContact:
     """
 
     tip_m: NDArray[np.float64]
+    site_m: NDArray[np.float64]
     force_n: float
+    contact_radius_m: float
+    depth_m: float
     since_s: float
     time_s: float
     stalls: int
@@ -125,31 +132,34 @@ class PlantChild:
         answer = order(self._host, "truth", timeout_s=ANSWER_WITHIN_S)
         return TrueContact(
             np.array(answer["tip_m"]),
+            np.array(answer["site_m"] or answer["tip_m"]),
             float(answer["normal_force_n"]),
+            float(answer["contact_radius_m"]),
+            float(answer["depth_m"]),
             float(answer["contact_s"]),
             float(answer["time_s"]),
             int(answer["stalls"]),
         )
 
-    def mean_force_n(self, after_s: float, until_s: float) -> float:
-        """Mean force along the normal between two times of the plant [N]; NaN where it is not known.
+    def contact_over(self, after_s: float, until_s: float, parts: int) -> list[ContactState | None]:
+        """The contact between two times of the plant, in equal parts; None where the plant stood still.
 
         Raises
         ------
         OSError
             If the plant does not answer.
         """
-        try:
-            answer = order(
-                self._host,
-                "mean_force",
-                timeout_s=ANSWER_WITHIN_S,
-                after_s=after_s,
-                until_s=until_s,
-            )
-        except ValueError:
-            return math.nan
-        return float(answer["normal_force_n"])
+        answer = order(
+            self._host,
+            "contact_over",
+            timeout_s=ANSWER_WITHIN_S,
+            after_s=after_s,
+            until_s=until_s,
+            parts=parts,
+        )
+        names = ("normal_force_n", "contact_radius_m", "depth_m")
+        rows = zip(*(answer[name] for name in names), strict=True)
+        return [None if row[0] is None else ContactState(*row) for row in rows]
 
     def close(self) -> None:
         """End the process."""

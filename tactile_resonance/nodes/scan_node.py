@@ -313,6 +313,7 @@ class ScanNode(ManagedNode):
             try:
                 self._require_same_table(run)
                 scene = read_scan_scene(run.path / "scene.yaml")
+                self._require_force(scene)
                 others = _frames_of_run(run, scene, frames)
                 scene = self._place(scene, replace(frames, others=others))
                 plan = plan_points(scene, run.content.points)
@@ -332,6 +333,11 @@ class ScanNode(ManagedNode):
         run = RunDirectory.create(where, wanted.text, plan.points, facts, needed)
         return scene, plan, run, seed
 
+    def _require_force(self, scene: ScanScene) -> None:
+        """A gate judges a force that is measured."""
+        accepted = "none where scan_node's parameter contact is none: no force is measured then"
+        require(scene.gate is None or self._hands.free_air, "gate", scene.gate, accepted)
+
     def _require_same_table(self, run: RunDirectory) -> None:
         """A run goes on where it began; where the table is known better now, that is another place."""
         noted = run.content.facts.get("scan_node", {}).get("table_in_base")
@@ -348,6 +354,7 @@ class ScanNode(ManagedNode):
     def _new_run(self, goal: ScanGoal, frames: Frames) -> tuple[WantedScan, Path, int]:
         """What a goal asks for, the folder of its run, and the room that needs [bytes]; ValueError if wrong."""
         wanted = read_goal(goal, frames)
+        self._require_force(wanted.scene)
         where = Path(goal.run_directory) if goal.run_directory else self._files.unused()
         design = design_measurement(wanted.scene)
         blocks, samples = design.periods * design.realisations, round(50e3 * design.block_s)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes.conversions import (
     contact_from_message,
@@ -21,10 +23,7 @@ from tactile_resonance.nodes.running import TRUTHS
 from tactile_resonance.record import Origin
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.truth import truth_of
-
-_AT, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-_PARTS = (_AT + 1) / 2
+from tactile_resonance.simulation.bimorph import CoupledBimorph
 
 
 class TruthTopic:
@@ -48,8 +47,7 @@ class TruthTopic:
         pose: PoseStamped,
         tip: BenchTip,
         measurement_id: int = 0,
-        force_n: float | None = None,
-        over_s: float = 0.0,
+        parts: Sequence[CoupledBimorph] = (),
     ) -> None:
         """Publish the modes of a tip at a pose and its time.
 
@@ -59,17 +57,16 @@ class TruthTopic:
         tip : BenchTip
         measurement_id : int
             Of the measurement whose poles they are; 0: of none.
-        force_n : float, optional
-            Force to be stated with them [N], where it is not that of the tip.
-        over_s : float
-            Of a contact that creeps the means over so long, as an estimate has them [s]; 0: as it is.
+        parts : sequence of CoupledBimorph
+            Of a contact that changes, in equal parts: modes and force are means over them, as an estimate has
+            them; empty: the tip as it is.
         """
-        tips = [replace(tip, since_s=tip.since_s + over_s * part) for part in _PARTS]
-        modes = [truth_of(each.coupled(self._bench), ()).modes for each in (tips if over_s else [tip])]
+        coupled = parts or [tip.coupled(self._bench)]
+        modes = [each.modes for each in coupled]
+        forces_n = [each.contact.force_n if each.contact else 0.0 for each in coupled]
 
         def mean(name: str) -> npt.NDArray:
-            values = np.array([[getattr(mode, name) for mode in at] for at in modes])
-            return np.asarray(np.average(values, axis=0, weights=_WEIGHTS if over_s else None))
+            return np.mean([[getattr(mode, name) for mode in at] for at in modes], axis=0)
 
         truth = Poles(
             poles_rad_s=mean("pole_rad_s"),
@@ -87,6 +84,9 @@ class TruthTopic:
             frame_id=self._frame_id,
             label=tip.tissue.name if tip.tissue else "air",
             simulated=True,
-            contact=contact_from_message(pose, tip.force_n if force_n is None else force_n, 0.0),
+            contact=replace(
+                contact_from_message(pose, float(np.mean(forces_n)), 0.0),
+                spread=ForceSpread(float(np.std(forces_n)), min(forces_n), max(forces_n)),
+            ),
         )
         self._publisher.publish(poles_to_message(truth, origin))

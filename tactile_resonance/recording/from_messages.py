@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import Excitation, Grid
@@ -38,6 +39,7 @@ POLES_STATUS = {
     PolesStatus.FAILED: 8,
     PolesStatus.TRUTH: 100,
 }
+SPREAD = ("rms_n", "min_n", "max_n")  # of a contact's force
 
 E = TypeVar("E", bound=Enum)
 
@@ -162,6 +164,11 @@ def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Co
     )
 
 
+def spread_from_message(message: Any, prefix: str) -> ForceSpread:
+    """How a force moved, of a message whose fields begin with `prefix`."""
+    return ForceSpread(*(getattr(message, prefix + name) for name in SPREAD))
+
+
 def origin_from_message(message: Any) -> Origin:
     """What a record, FRF or poles belong to."""
     return Origin(
@@ -176,6 +183,7 @@ def origin_from_message(message: Any) -> Origin:
             contact_from_message(
                 message.tip_pose, message.contact_force_n, message.contact_force_std_n
             ),
+            spread=spread_from_message(message, "contact_force_"),
             # of records alone
             coverage=getattr(message, "contact_coverage", float("nan")),
             reason=getattr(message, "contact_reason", ""),

@@ -39,6 +39,7 @@ _COLUMNS = (
     ("y [mm]", lambda r: _number(1e3 * r.y_m, 2)),
     ("z [mm]", lambda r: _number(1e3 * r.z_m, 2)),
     ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
+    ("rms of the force, smallest to largest [mN]", lambda r: _spread(r)),
     ("age of contact [s]", lambda r: _number(r.contact_age_s, 2)),
     ("measured f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
     ("measured damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
@@ -269,6 +270,14 @@ def _with_std(value: float, std: float, digits: int) -> str:
     return f"{text} ± {std:.2g}" if np.isfinite(value) and np.isfinite(std) else text
 
 
+def _spread(result: PointResult) -> str:
+    """How the force moved while it was measured."""
+    if not np.isfinite(result.force_rms_n):
+        return "-"
+    low, high = (_number(1e3 * force, 2) for force in (result.force_min_n, result.force_max_n))
+    return f"{_number(1e3 * result.force_rms_n, 2)}, {low} to {high}"
+
+
 def _tissue(result: PointResult) -> str:
     if not result.tissue_class or np.isnan(result.tissue_probability):
         return result.tissue_class or "-"
@@ -276,6 +285,6 @@ def _tissue(result: PointResult) -> str:
 
 
 def _outcome(result: PointResult) -> str:
-    parts = [result.outcome.name.lower(), result.verdict, result.reason, result.tissue_reason]
-    parts.append(result.notes)
+    parts = [result.outcome.name.lower(), result.verdict, result.gate]
+    parts += [result.reason, result.tissue_reason, result.notes]
     return "; ".join(part for part in parts if part)

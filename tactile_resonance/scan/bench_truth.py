@@ -30,12 +30,14 @@ class PointTruth:
         f0 [Hz] and damping ratio.
     tissue : str
         Under the tip.
-    force_n : float
+    force_n, force_rms_n : float
+        Mean, and root mean square of its motion over parts of 40 ms [N].
     """
 
     estimate: FloatArray
     tissue: str
     force_n: float
+    force_rms_n: float
 
 
 def truths_of(run: RunContent) -> dict[int, PointTruth]:
@@ -84,4 +86,5 @@ def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
     poles, origin = near[0]
     k = int(np.argmin(np.abs(poles.f0_hz - result.f0_hz)))
     estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
-    return PointTruth(estimate, origin.label, origin.contact.force_n)
+    contact = origin.contact
+    return PointTruth(estimate, origin.label, contact.force_n, contact.spread.rms_n)

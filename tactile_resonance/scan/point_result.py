@@ -58,6 +58,9 @@ class PointResult:
     normal_z: float = NAN
     force_n: float = NAN
     force_std_n: float = NAN
+    force_rms_n: float = NAN
+    force_min_n: float = NAN
+    force_max_n: float = NAN
     contact_age_s: float = NAN
     f0_hz: float = NAN
     f0_std_hz: float = NAN
@@ -90,6 +93,7 @@ class PointResult:
     blocks: int = 0
     blocks_saved: int = 0
     verdict: str = ""
+    gate: str = ""
     saved_s: float = NAN
     duration_s: float = NAN
     measurement_id: int = 0

@@ -17,6 +17,7 @@ from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide
 from tactile_resonance.scan.disturbances import Disturbances
+from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Hands,
@@ -48,6 +49,8 @@ from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nomin
 POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
 """Between the seeds of two attempts at a point: beyond the points of a scan."""
+GATE_SEEDS = 10_000_019
+"""Between the seeds of two measurements in one contact."""
 SKIPPED = "skipped on request"
 LEFT = "left on request"
 NOTHING_PLAYED = "silent record: nothing was played"
@@ -152,11 +155,12 @@ class ScanRunner:
         """One attempt at a point, finished with a result whatever happens, unless it shall be repeated."""
         scene, begun_s = self._scene, self._hands.now_s()
         decisions: list[Decision] = []
+        keeper = GateKeeper(scene.gate, scene.force_n)
 
         def enough(measured: Measured, blocks: int) -> bool:
             decisions.append(self._decide(measured, blocks))
             self._say(point, Phase.MEASURE, blocks, measured.poles)
-            return decisions[-1].stop
+            return keeper.shuts(measured) or decisions[-1].stop
 
         def check() -> None:
             self._controls.check()
@@ -172,14 +176,17 @@ class ScanRunner:
                 self._say(point, Phase.CONTACT)
                 self._hands.touch(point, scene.force_n, scene.hold, check)
                 self._say(point, Phase.MEASURE)
-                measured = self._hands.measure(
-                    self._plan.measurement,
-                    point.label,
-                    seed,
-                    enough,
-                    recording,
-                    check,
-                )
+                while measured is None:
+                    made = self._hands.measure(
+                        self._plan.measurement,
+                        point.label,
+                        seed + len(keeper.left_out) * GATE_SEEDS,
+                        enough,
+                        recording,
+                        check,
+                    )
+                    if keeper.counts(made):
+                        measured = made
             except PointDisturbed as error:
                 reason = str(error)
                 if self._disturbed[point.index].again(error):
@@ -214,7 +221,12 @@ class ScanRunner:
                     air=self._air,
                 )
             disturbed = self._disturbed.pop(point.index, Disturbances())
-            result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
+            result = replace(
+                result,
+                repeats=disturbed.total,
+                disturbances=str(disturbed),
+                gate="" if measured is None else str(keeper),
+            )
             self._publish(recording.finish(result))
         self._durations_s.append(duration_s)
         if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:

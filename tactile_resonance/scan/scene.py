@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan's scene: what is on the table and what is wanted from it.
 
-The same file may hold ``regions`` and what is ``buried``, which the simulated bench reads
-(`tactile_resonance.simulation.scene`) and a scan does not need.
+The same file may hold ``regions``, what is ``buried`` and the ``motion`` of the surface, which the simulated
+bench reads (`tactile_resonance.simulation.scene`) and a scan does not need.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -45,12 +46,12 @@ from tactile_resonance.tissue.references import (
 
 E = TypeVar("E", bound=Enum)
 
-# Of the simulated bench: what lies on its table.
-BENCH_KEYS = {"regions", "buried"}
+# Of the simulated bench: what lies on its table, and how it moves.
+BENCH_KEYS = {"regions", "buried", "motion"}
 _KEYS = {
     *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
     *("outputs", "precision", "blocks", "tissue_classes", "nominal_contact", "on_failure"),
-    *("time_limits", "drift_limits", "notes", "normals"),
+    *("gate", "time_limits", "drift_limits", "notes", "normals"),
     *BENCH_KEYS,
 }
 
@@ -141,6 +142,31 @@ class DriftLimits:
             require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
 
 
+@dataclass(frozen=True)
+class Gate:
+    """How quiet the force must be while a point is measured.
+
+    Attributes
+    ----------
+    force_rms_n : float
+        Most that it may move by over the whole of a measurement: `ForceSpread.rms_n` [N].
+    force_error_n : float
+        Most that its mean may differ from the scene's force [N].
+    measurements : int
+        Most that are begun in one contact.
+    """
+
+    force_rms_n: float
+    force_error_n: float = math.inf
+    measurements: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("force_rms_n", "force_error_n"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        most = self.measurements
+        require(1 <= most <= 100, "measurements", most, "1 to 100")
+
+
 @dataclass(frozen=True, eq=False)
 class ScanScene:
     """What a scan is to do.
@@ -161,6 +187,8 @@ class ScanScene:
     precision : Precise, Separate or None
         When a point's blocks are enough; None: after the most blocks.
     blocks : BlockLimits
+    gate : Gate or None
+        A measurement during which the force moved more is begun again; None: none is.
     tissue_classes : tuple of TissueClass
         Tissues that a point may be called; empty: none is called.
     nominal_contact : NominalContact or None
@@ -185,6 +213,7 @@ class ScanScene:
     outputs: tuple[Output, ...] = (Output.POLES, Output.MAP)
     precision: Precise | Separate | None = None
     blocks: BlockLimits = field(default_factory=BlockLimits)
+    gate: Gate | None = None
     tissue_classes: tuple[TissueClass, ...] = ()
     nominal_contact: NominalContact | None = None
     on_failure: OnFailure = OnFailure.CONTINUE
@@ -248,6 +277,7 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
         outputs=outputs,
         precision=_read_precision(content, classes, where),
         blocks=_part(BlockLimits, content, "blocks", where),
+        gate=_part(Gate, content, "gate", where) if "gate" in content else None,
         tissue_classes=classes,
         nominal_contact=nominal,
         on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),

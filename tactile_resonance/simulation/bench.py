@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from tactile_resonance.fields import require
@@ -98,6 +99,28 @@ class SimulatedBench:
         ValueError
             If the nonlinearity is asked for: it is not modelled on a changing contact.
         """
+
+        def coupled_at(time_s: float) -> CoupledBimorph:
+            return history.coupled_at(self.sensor, time_s)
+
+        return self.start_following(coupled_at, seed=seed, effects=effects, keep_parts=keep_parts)
+
+    def start_following(
+        self,
+        coupled_at: Callable[[float], CoupledBimorph],
+        *,
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
+    ) -> BenchRun:
+        """Return a run whose linear sensor at each time [s] since its start is that of `coupled_at`.
+
+        It is asked for no time beyond the block that is made.
+
+        Raises
+        ------
+        ValueError
+            As `start_varying`.
+        """
         require(not effects.nonlinearity, "nonlinearity", True, "off while the contact changes")
-        coupled = history.coupled_at(self.sensor, 0.0)
-        return BenchRun(self.sensor, coupled, seed, effects, keep_parts, history)
+        return BenchRun(self.sensor, coupled_at(0.0), seed, effects, keep_parts, coupled_at)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,6 @@ from tactile_resonance.simulation.acquisition import (
     join,
 )
 from tactile_resonance.simulation.bimorph import CoupledBimorph
-from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.lines import Lines, PeriodicExcitation
 from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
 from tactile_resonance.simulation.nonlinear import NonlinearStream
@@ -80,15 +79,14 @@ class BenchRun:
         seed: int,
         effects: BenchEffects,
         keep_parts: bool,
-        history: ContactHistory | None = None,
+        coupled_at: Callable[[float], CoupledBimorph] | None = None,
     ) -> None:
         good = isinstance(seed, (int, np.integer)) and seed >= 0
         require(good, "seed", seed, "an integer, 0 or above")
         self.coupled = coupled
         self.seed = seed
         self.effects = effects
-        self._parameters = sensor
-        self._history = history
+        self._coupled_at = coupled_at
         self._acquisition = sensor.acquisition
         self._keep_parts = keep_parts
         skew = effects.channel_skew_s
@@ -98,12 +96,8 @@ class BenchRun:
         self._sensor: Stream
         self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
         negligible_v = self.negligible_v
-        if history is not None:
-            self._sensor = VaryingStream(
-                lambda time_s: history.coupled_at(sensor, time_s),
-                delay_s=late_s,
-                negligible_v=negligible_v,
-            )
+        if coupled_at is not None:
+            self._sensor = VaryingStream(coupled_at, delay_s=late_s, negligible_v=negligible_v)
         elif effects.nonlinearity:
             self._sensor = NonlinearStream(coupled.modal, sensor.nonlinear, delay_s=late_s)
             if keep_parts:
@@ -127,9 +121,8 @@ class BenchRun:
 
         Of the contact at `time_s` since the start, where it changes.
         """
-        if self._history is None:
-            return truth_of(self.coupled, frequency_hz)
-        return truth_of(self._history.coupled_at(self._parameters, time_s), frequency_hz)
+        coupled = self.coupled if self._coupled_at is None else self._coupled_at(time_s)
+        return truth_of(coupled, frequency_hz)
 
     def effort(self, excitation: PeriodicExcitation | Lines) -> Effort:
         """Return what an excitation from rest takes; computed without playing it."""

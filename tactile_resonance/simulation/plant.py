@@ -33,12 +33,19 @@ from tactile_resonance.contact.vectors import (
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
+from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
 
 NEAR_M = 0.005
 """Below this height the tip is stepped on its tissue: a beam that swings before it touches."""
+
+SAME_PLACE = 0.1
+"""In ball radii: how near to the last touch the tissue remembers it."""
+
+STANDING_M = 1e-5
+"""A tip that moves less than this along the surface in a step is above the place that it will touch."""
 
 
 class Surface(Protocol):
@@ -224,10 +231,10 @@ class Plant:
     Parameters
     ----------
     surface : Surface
-        May be exchanged while the plant runs (``plant.surface = ...``): tissue that moves.
+        May be exchanged while the plant runs (``plant.surface = ...``).
     tissue_at : callable
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
-        touch. Asked when the tip comes near at a new place.
+        touch. Asked when the tip comes near at a new place, and where it stops to come down.
     tip : callable
         From a tissue to a `TipOnTissue` at rest on it; its ball is that of `contact_radius_m`.
     tip_radius_m : float
@@ -236,12 +243,17 @@ class Plant:
 
     Attributes
     ----------
+    motion : SurfaceMotion or None
+        Of every point of the surface along its normal, over `time_s`; None: at rest. It may be exchanged
+        while the plant runs. What carries the tissue moves it: no inertia of it is on the cell.
     time_s : float
         Since the start [s].
     force_n, torque_nm : Vector
         True wrench of the tissue on the ball, about its centre, in the base [N], [N m].
     depth_m : float
         Depth of the ball's lowest point below the undisturbed surface [m], 0 above it.
+    contact_radius_m : float
+        Of the ball on the tissue [m]; 0 out of contact.
     in_contact : bool
         Whether the tissue pushes on the ball.
     touches : int
@@ -250,6 +262,8 @@ class Plant:
         How long this contact has lasted [s]; 0 out of contact.
     tip_m : Vector
         Place of the frame `tip` in the base [m].
+    site_m : Vector or None
+        Where the tissue was asked for last.
     normal_force_n : float
         True force along the normal [N], compression positive.
     """
@@ -266,13 +280,14 @@ class Plant:
     ) -> None:
         require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")
         self.surface = surface
+        self.motion: SurfaceMotion | None = None
         self.tissue_at = tissue_at
         self.tip_radius_m = tip_radius_m
         self.mounting = CellMounting() if mounting is None else mounting
         self.friction = Friction() if friction is None else friction
         self.time_s = 0.0
         self.force_n = self.torque_nm = ORIGIN
-        self.depth_m = 0.0
+        self.depth_m = self.contact_radius_m = 0.0
         self.in_contact = False
         self.touches = 0
         self.contact_s = 0.0
@@ -280,7 +295,8 @@ class Plant:
         self.normal_force_n = 0.0
         self._tip = tip
         self._on: TipOnTissue | None = None
-        self._site: Vector | None = None  # where the tissue was last asked for
+        self.site_m: Vector | None = None
+        self._site_touched = False
         self._slip = ORIGIN  # elastic displacement of the contact along the surface
         self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
         self._turn = IDENTITY[0]  # of the tip
@@ -302,16 +318,20 @@ class Plant:
         self._stepped, self._period_s = True, dt_s
         self.time_s += dt_s
         height, normal = self.surface.height_of(place)
+        if self.motion is not None:
+            height -= self.motion.displacement_m(self.time_s)
         depth = self.tip_radius_m - height
         pushed = held = 0.0
-        self._find_tissue(place, height, normal)
+        self._find_tissue(place, height, normal, math.hypot(*_along(way, normal)))
         if self._on is not None:
             held = self._on.step(depth, dt_s)
             pushed = self._on.indenter.force_n
             self.depth_m = max(0.0, self._on.indenter.depth_m)
+            self.contact_radius_m = self._on.indenter.contact_radius_m
         else:
-            self.depth_m = 0.0
+            self.depth_m = self.contact_radius_m = 0.0
         touching = pushed > 0
+        self._site_touched |= touching
         self.touches += touching and not self.in_contact
         self.in_contact = touching
         self.contact_s = self.contact_s + dt_s if touching else 0.0
@@ -355,17 +375,21 @@ class Plant:
             rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
         )
 
-    def _find_tissue(self, place: Vector, height: float, normal: Vector) -> None:
-        """Tissue remembers the last touch within a ball's radius; further away it is fresh."""
+    def _find_tissue(self, place: Vector, height: float, normal: Vector, moved_m: float) -> None:
+        """Tissue remembers a touch at the same place; elsewhere it is fresh, and what lies exactly there."""
         if self.in_contact or height > self.tip_radius_m + NEAR_M:
             return
-        if self._site is not None:
-            way = _from(self._site, place)
-            if math.hypot(*_along(way, normal)) < self.tip_radius_m:
+        if self.site_m is not None:
+            away_m = math.hypot(*_along(_from(self.site_m, place), normal))
+            if self._site_touched:
+                known = away_m < SAME_PLACE * self.tip_radius_m
+            else:  # it is not asked for all along the way: that may take longer than a step
+                known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip_radius_m)
+            if known:
                 return
         tissue = self.tissue_at(np.array(place))
         self._on = None if tissue is None else self._tip(tissue)
-        self._site = place
+        self.site_m, self._site_touched = place, False
 
     def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:
         """Force along the surface on the ball [N]."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import number, require
+from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
@@ -23,6 +23,7 @@ from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -134,6 +135,7 @@ class Tabletop:
             tip_radius_m=radius_m,
             mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
         )
+        self.plant.motion = laid.scene.motion if laid else None
 
     def place_surface(self, fields: dict) -> dict:
         """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
@@ -143,6 +145,12 @@ class Tabletop:
             azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
         )
         self.plant.surface = Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        return {}
+
+    def move_surface(self, fields: dict) -> dict:
+        """Control port: how the surface moves from now on; fields of `SurfaceMotion`, none: at rest."""
+        asked = {name: value for name, value in fields.items() if name != "command"}
+        self.plant.motion = read_dataclass(SurfaceMotion, asked, "") if asked else None
         return {}
 
     def place_tissue(self, fields: dict) -> dict:
@@ -161,10 +169,12 @@ class Tabletop:
         return {
             "time_s": plant.time_s,
             "tip_m": plant.tip_m,
+            "site_m": plant.site_m,
             "force_n": plant.force_n,
             "normal_force_n": plant.normal_force_n,
             "contact_s": plant.contact_s,
             "depth_m": plant.depth_m,
+            "contact_radius_m": plant.contact_radius_m,
             "in_contact": plant.in_contact,
             "touches": plant.touches,
         }
@@ -207,11 +217,12 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = N
     """Add the commands of table and cell to the robot's control port, and the cell to its clock."""
     commands = robot.control.commands
     commands["place_surface"] = tabletop.place_surface
+    commands["move_surface"] = tabletop.move_surface
     commands["place_tissue"] = tabletop.place_tissue
     commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.pace.stalls}
     history = PlantHistory(tabletop.plant)
     commands["history"] = history.since
-    commands["mean_force"] = history.mean_force
+    commands["contact_over"] = history.contact_over
     robot.after_step.append(history.step)
     if cell is not None:
         commands["cell_fault"] = cell.inject

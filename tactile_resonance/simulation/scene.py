@@ -14,8 +14,10 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
     known_keys,
     number,
+    read_dataclass,
     read_yaml,
     require,
+    section,
 )
 from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
@@ -23,6 +25,7 @@ from tactile_resonance.simulation.materials import Material, mixture, read_mater
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.shapes import SHAPES, Shape, read_shape
+from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
 
@@ -76,6 +79,8 @@ class PhantomScene:
     regions : tuple of Region
     buried : tuple of Buried
         Felt from the surface of whatever region is there.
+    motion : SurfaceMotion or None
+        How the surface moves along its normal; None: it is at rest.
     tip_radius_m, poisson_ratio : float
         They set how deep the tip feels; of no account where nothing is buried.
     """
@@ -84,6 +89,7 @@ class PhantomScene:
     force_n: float
     regions: tuple[Region, ...]
     buried: tuple[Buried, ...] = ()
+    motion: SurfaceMotion | None = None
     tip_radius_m: float = 2.5e-3
     poisson_ratio: float = 0.49
 
@@ -127,8 +133,8 @@ class PhantomScene:
 def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene:
     """Read the phantoms of a scene file; by default ``config/scenes/gelatine_phantoms.yaml``.
 
-    Only the fields ``name``, ``force_n``, ``regions`` and, where it is there, ``buried`` are read
-    here; the tip is that of ``config/sensors/bimorph.yaml``.
+    Only the fields ``name``, ``force_n``, ``regions`` and, where they are there, ``buried`` and
+    ``motion`` are read here; the tip is that of ``config/sensors/bimorph.yaml``.
 
     Raises
     ------
@@ -154,6 +160,11 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
         ),
         buried=tuple(
             _read_buried(entry, library, f"{where}: buried[{i}]") for i, entry in enumerate(buried)
+        ),
+        motion=(
+            read_dataclass(SurfaceMotion, section(content, "motion", where), f"{where}: motion")
+            if "motion" in content
+            else None
         ),
         tip_radius_m=read_sensor().tip.radius_m,
         poisson_ratio=library.contact.poisson_ratio,

@@ -93,6 +93,8 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
     lying = (Pose(orientation=Quaternion(w=0.5)),)
     nowhere = (Pose(position=Point(x=math.nan)),)
     new = stack.folder / "new"
+    gated = stack.folder / "gated.yaml"
+    gated.write_text("gate: {force_rms_n: 3.0e-4}\nforce_n: 0.01\n")
     for changes, reason in (
         ({"poses": ()}, "scene: got ''; accepted is a scene file, or poses and force_n"),
         ({"frame": "camera"}, "got 'camera'; accepted is 'table' or 'base'"),
@@ -111,6 +113,7 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
         ({"run_directory": "/etc/new"}, "run_directory: got '/etc/new'; accepted is a path in"),
         ({"run_directory": "../new"}, "(goal_folders of scan_node adds others)"),
         ({"run_directory": "/etc", "resume": True}, "a path in"),
+        ({"scene": gated}, "contact is none: no force is measured then"),
     ):
         goal = {**GOAL, "run_directory": new, **changes}
         outcome = stack.ended(stack.client.scan(**goal))

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from tactile_resonance.srv import ForceOver
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.nodes import contact_source
 from tactile_resonance.nodes.contact_source import ANSWER_WITHIN_S
 from tactile_resonance.nodes.conversions import time_from_message, time_message
@@ -82,6 +83,7 @@ def test_what_the_service_tells_of_exactly_this_block_arrives(monkeypatch):
     def serve(request, response):
         asked.append((time_from_message(request.start), time_from_message(request.end)))
         response.force_n, response.force_std_n, response.coverage = 0.0101, 2e-5, 0.93
+        response.force_rms_n, response.force_min_n, response.force_max_n = 3e-4, 0.009, 0.011
         response.tip_pose = pose_at(START_NS + 5)
         return response
 
@@ -98,6 +100,7 @@ def test_what_the_service_tells_of_exactly_this_block_arrives(monkeypatch):
         frame_id="base",
         time_ns=START_NS + 5,
         coverage=0.93,
+        spread=ForceSpread(3e-4, 0.009, 0.011),
     )
 
 

@@ -10,6 +10,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not here")
 serialization = pytest.importorskip("rclpy.serialization")
 msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+from tactile_resonance.contact.force_spread import ForceSpread  # noqa: E402
 from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
 from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
 from tactile_resonance.identification.result import Poles, PolesStatus  # noqa: E402
@@ -26,7 +27,8 @@ from tactile_resonance.record import (  # noqa: E402
 
 RNG = np.random.default_rng(0)
 CONTACT = Contact(
-    0.0101, 2e-4, (0.1, -0.2, 0.3), (0.0, 0.6, 0.0, 0.8), "table", 1_700_000_000_123_456_789
+    *(0.0101, 2e-4, (0.1, -0.2, 0.3), (0.0, 0.6, 0.0, 0.8), "table", 1_700_000_000_123_456_789),
+    spread=ForceSpread(3e-4, 0.0093, 0.0112),
 )
 ORIGIN = Origin(
     measurement_id=2**50 + 1,
@@ -174,6 +176,7 @@ def test_unknown_position_is_an_empty_frame():
     message = conversions.poles_to_message(Poles(), Origin())
     assert message.tip_pose.header.frame_id == ""
     assert np.isnan(message.contact_force_n)
+    assert np.isnan(message.contact_force_rms_n)
     assert conversions.poles_from_message(message)[1].contact.position_m is None
 
 

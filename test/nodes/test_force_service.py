@@ -105,6 +105,9 @@ def test_mean_over_a_block_is_exact_and_its_place_that_of_the_middle(served):
     batches = [SLOPE_N_S * 0.04 * n for n in range(8)]
     variance = sum((b - sum(batches) / 8) ** 2 for b in batches) / 7 / 8
     assert told.force_std_n == pytest.approx(math.sqrt(variance + ZERO_STD_N**2), rel=1e-9)
+    # a ramp, in sixteen means over 20 ms
+    assert told.force_rms_n == pytest.approx(SLOPE_N_S * 0.32 / math.sqrt(12), rel=2e-2)
+    assert told.force_max_n - told.force_min_n == pytest.approx(SLOPE_N_S * 0.3, rel=1e-2)
     pose = told.tip_pose
     assert pose.header.frame_id == "base"
     assert time_from_message(pose.header.stamp) == BEGAN_NS + AHEAD_NS + 260 * MS
@@ -124,6 +127,7 @@ def test_a_block_of_which_too_little_was_heard_has_no_force_but_a_reason(served,
     if share < 0.8:
         assert math.isnan(told.force_n)
         assert math.isnan(told.force_std_n)
+        assert math.isnan(told.force_rms_n + told.force_min_n + told.force_max_n)
         assert told.reason == "forces cover 76.7 % of the block, at least 80 % are accepted"
     else:
         assert told.reason == ""

@@ -79,6 +79,14 @@ def test_force_over_a_block_is_the_integral_of_what_it_was(stays, start_s, end_s
     assert (told.force_std_n, told.coverage, told.reason) == (0.0, 1.0, "")
 
 
+def test_spread_over_a_block_is_that_of_what_it_was(stays):
+    told = over(stays, 11.0, 12.5)
+    # 10 mN for two thirds of it, nothing for the rest
+    assert told.force_rms_n == pytest.approx(0.01 * math.sqrt(2) / 3, rel=1e-12)
+    assert (told.force_min_n, told.force_max_n) == (0.0, 0.01)
+    assert over(stays, 10.5, 11.5).force_rms_n == 0.0
+
+
 def test_place_over_a_block_is_where_the_tip_was(stays):
     assert over(stays, 5.0, 6.0).tip_pose.header.frame_id == ""
     assert over(stays, 10.5, 11.5).tip_pose.pose.position.x == 1.0
@@ -92,6 +100,7 @@ def test_what_is_not_kept_any_more_is_not_made_up():
     for end_s in (50.0, 110.5):
         told = over(stays, 40.0, end_s)
         assert math.isnan(told.force_n)
+        assert math.isnan(told.force_rms_n + told.force_min_n + told.force_max_n)
         assert "before what is kept" in told.reason
     assert over(stays, 200.0, 201.0).force_n == 0.01
     assert over(stays, 201.0, 201.0).reason == "the interval is empty"

@@ -19,19 +19,21 @@ from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.truth import truth_of
 
 
-def test_truth_of_a_contact_that_creeps_is_its_mean():
+def test_truth_of_a_contact_that_changes_is_its_mean():
     bench, tissue = SimulatedBench.from_configuration(), read_tissues()["cortex"]
-    tip, told = BenchTip(tissue, 0.01, 0.3, creeping=True), []
+    tip, told = BenchTip(tissue, 0.01, 0.3), []
     node = SimpleNamespace(publish_on=lambda *_: SimpleNamespace(publish=told.append))
     topic = TruthTopic(node, bench, "tip")
-    topic.publish(PoseStamped(), tip, over_s=3.2)
-    topic.publish(PoseStamped(), replace(tip, since_s=0.3 + 1.6))
-    over, middle = told
-    each = []
-    for part in (np.arange(400) + 0.5) / 400:
-        modes = truth_of(replace(tip, since_s=0.3 + 3.2 * part).coupled(bench), ()).modes
-        each.append([(mode.f0_hz, mode.damping_ratio, mode.pole_rad_s.imag) for mode in modes])
+    forces = np.linspace(0.009, 0.012, 7)
+    parts = [replace(tip, force_n=force).coupled(bench) for force in forces]
+    topic.publish(PoseStamped(), tip, 5, parts)
+    topic.publish(PoseStamped(), tip)
+    over, now = told
+    each = [[(m.f0_hz, m.damping_ratio, m.pole_rad_s.imag) for m in part.modes] for part in parts]
     means = np.mean(each, axis=0).T
-    np.testing.assert_allclose([over.f0_hz, over.damping_ratio, over.imag_rad_s], means, rtol=1e-6)
-    near = int(np.argmin(np.abs(means[0] - 250)))
-    assert over.f0_hz[near] - middle.f0_hz[near] > 0.03  # it slows down
+    np.testing.assert_allclose([over.f0_hz, over.damping_ratio, over.imag_rad_s], means, rtol=1e-12)
+    assert over.contact_force_n == pytest.approx(forces.mean())
+    assert over.measurement_id == 5
+    modes = truth_of(tip.coupled(bench), ()).modes
+    np.testing.assert_allclose(now.f0_hz, [mode.f0_hz for mode in modes])
+    assert now.contact_force_n == 0.01

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import (
     BetweenSamples,
@@ -68,6 +69,7 @@ def record(excitation, block_index, rng=None):
                 orientation_xyzw=(0.0, 0.6, 0.0, 0.8),
                 frame_id="table",
                 time_ns=1_700_000_000_000_000_001,
+                spread=ForceSpread(1e-3 / 3, 0.1 / 3 - 2e-3, 0.1 / 3 + 2e-3),
             ),
         ),
     )

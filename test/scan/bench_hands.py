@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.controls import Controls
@@ -39,6 +40,8 @@ class Bench:
     seeds: list = field(default_factory=list)
     silent: list = field(default_factory=list)
     force_n: float = 0.01
+    rms_n: object = None  # of the force over the blocks so far, from the number of the measurement and of these
+    measurements: int = 0
 
     def now_s(self):
         return self.time_s
@@ -83,10 +86,14 @@ class Bench:
             )
             if self.on_measure is not None and label != "air":
                 self.on_measure(self, blocks)
+            if self.rms_n is not None and label != "air":
+                spread = ForceSpread(self.rms_n(self.measurements, blocks), 0.009, 0.011)
+                origin = replace(origin, contact=replace(contact, spread=spread))
             measured = Measured(poles, origin, AGE_S)
             if enough(measured, blocks):
                 break
         self.log.append(("measure", label, seed, blocks))
+        self.measurements += label != "air"
         return measured
 
     def retract(self):

@@ -12,6 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.point_result import TYPE as RESULT
@@ -24,7 +25,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from run_tables import RECORD, START_NS, plan, result
 
 KEY, N = 7, 200
-LACKS_TODAY = ("contact_coverage", "contact_reason")
+SPREAD = ("contact_force_rms_n", "contact_force_min_n", "contact_force_max_n")
+LACKS_TODAY = ("contact_coverage", "contact_reason", *SPREAD)
 
 
 def older(type_name, without=(), **kinds):
@@ -69,6 +71,9 @@ def record(block):
         sensor_v=np.arange(N) * 1e-4,
         contact_force_n=0.01,
         contact_force_std_n=1e-4,
+        contact_force_rms_n=2e-4,
+        contact_force_min_n=0.009,
+        contact_force_max_n=0.011,
         contact_coverage=1.0,
         contact_reason="not in older versions",
         label="hér",
@@ -117,20 +122,23 @@ def test_a_record_without_todays_fields_is_read_whole_and_they_are_unknown(tmp_p
         assert (contact.force_n, contact.force_std_n, read.origin.label) == (0.01, 1e-4, "hér")
         assert math.isnan(contact.coverage)
         assert contact.reason == ""
+        assert np.isnan([contact.spread.rms_n, contact.spread.min_n, contact.spread.max_n]).all()
 
 
 def test_what_todays_version_records_is_known(tmp_path):
     (first, _) = read_recorded(old_run(tmp_path / "run")).records
     assert first.origin.contact.coverage == 1.0
     assert first.origin.contact.reason == "not in older versions"
+    assert first.origin.contact.spread == ForceSpread(2e-4, 0.009, 0.011)
 
 
 def test_numbers_and_texts_of_a_result_that_were_not_recorded_are_unknown(tmp_path):
-    version = older(RESULT, ("f0_shift_hz", "disturbances"))
+    version = older(RESULT, ("f0_shift_hz", "disturbances", "force_rms_n"))
     content = read_run(old_run(tmp_path / "run", PointResult=version))
     (read,) = content.results
     assert content.problems == ()
     assert math.isnan(read.f0_shift_hz)
+    assert math.isnan(read.force_rms_n)
     assert (read.disturbances, read.repeats, read.notes) == ("", 2, "x")
     assert (read.index, read.f0_hz, read.damping_ratio) == (0, 250.0, 0.03)
 

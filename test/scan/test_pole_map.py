@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import Decision, Verdict
@@ -17,7 +18,7 @@ from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, measured_result
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import Outcome, PointResult, as_csv
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
     MapPoint,
@@ -78,6 +79,20 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     assert result.damping_drift_std_per_s == pytest.approx(2e-5)
     constant = main_mode(poles((250.0, 280.0), residues=[1.0, 2.0]))
     assert np.isnan([*constant.drift, *constant.drift_std]).all()
+
+
+def test_how_the_force_moved_stands_in_the_result():
+    there = origin()
+    there = replace(there, contact=replace(there.contact, spread=ForceSpread(3e-4, 0.009, 0.011)))
+    result = measured_result(
+        *(air_point(3), 0, scene(), Measured(poles((250.0,)), there)),
+        Decision(Verdict.MOST_BLOCKS, "", 8),
+        **{"time_ns": 1, "duration_s": 1.0},
+    )
+    assert (result.force_rms_n, result.force_min_n, result.force_max_n) == (3e-4, 0.009, 0.011)
+    header, row = as_csv([result]).splitlines()
+    at = header.split(",").index("force_rms_n")
+    assert row.split(",")[at : at + 3] == ["0.0003", "0.009", "0.011"]
 
 
 def origin(x=0.0, y=0.0, z=0.0, key=1, normal=(0.0, 0.0, 1.0)):

@@ -12,6 +12,7 @@ from tactile_resonance.simulation.materials import Uniform
 from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.scene import PhantomScene, Region, read_scene
 from tactile_resonance.simulation.shapes import Box, HalfSpace, Sphere
+from tactile_resonance.simulation.surface_motion import SurfaceMotion
 
 
 def write(tmp_path, content):
@@ -146,6 +147,22 @@ def test_a_wrong_region_is_named(tmp_path, library, change, named):
     content["regions"][0] = region
     with pytest.raises(ValueError, match=named):
         read_scene(library, write(tmp_path, content))
+
+
+def test_motion_of_a_scene_is_read_and_refused_by_name(tmp_path, library):
+    path = share_path("config/scenes/breathing.yaml")
+    assert read_scene(library, path).motion == SurfaceMotion(1e-3, 0.25, 3, 1e-4, 1.2, 1)
+    assert read_scene(library).motion is None
+    read_scan_scene(path)
+    content = load("config/scenes/breathing.yaml")
+    for motion, named in (
+        ({"breath_m": 0.5}, r"motion\.breath_m: got 0.5; accepted is 0 to 0.02"),
+        ({"breath_mm": 1.0}, r"motion\.breath_mm.*one of"),
+        ([1e-3], "motion: got .* accepted is a mapping"),
+    ):
+        content["motion"] = motion
+        with pytest.raises(ValueError, match=named):
+            read_scene(library, write(tmp_path, content))
 
 
 def test_shared_files_are_found_through_the_ament_index(tmp_path, monkeypatch):

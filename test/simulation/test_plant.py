@@ -144,6 +144,26 @@ def test_a_fresh_place_is_unrelaxed_and_the_old_one_remembers():
     assert press(p, 0.02) == pytest.approx(first, rel=1e-9)
 
 
+def test_what_is_felt_is_what_lies_under_the_touch_not_where_the_tip_came_near():
+    """On tissue whose modulus rises along x, touched at several places closer than a ball's radius."""
+    p = Plant(
+        Plane.tilted(0.0),
+        lambda place: Tissue("slope", 10e3 * (1 + 100 * place[0]), (), ()),
+        rigid,
+        tip_radius_m=RADIUS_M,
+    )
+    p.step(at(-2e-3, 0, RADIUS_M + 3e-3), 0.002)
+    for x in (0.0, 1e-3, 1.5e-3):
+        for part in np.linspace(0, 1, 20):
+            p.step(at(x - 1e-3 * (1 - part), 0, RADIUS_M + 3e-3), 0.002)
+        for height in np.linspace(3e-3, -3e-4, 60):
+            p.step(at(x, 0, RADIUS_M + height), 0.002)
+        assert p.normal_force_n == pytest.approx((1 + 100 * x) * hertz(3e-4), rel=1e-3)
+        np.testing.assert_allclose(p.site_m[0], x, atol=1e-9)
+        for height in np.linspace(-3e-4, 3e-3, 60):
+            p.step(at(x, 0, RADIUS_M + height), 0.002)
+
+
 def test_nothing_there_is_nothing_felt():
     p = Plant(Plane.tilted(0.0), lambda _: None, rigid, tip_radius_m=RADIUS_M)
     p.step(at(0, 0, 0), 0.002)

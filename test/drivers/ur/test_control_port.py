@@ -21,6 +21,8 @@ from tactile_resonance.simulation.robot.control_port import PORT
         ({"command": "script_starts", "value": 1}, "value: 1"),
         ({"command": "place_surface", "height_m": 7}, "surface_height_m"),
         ({"command": "place_tissue", "name": "granite"}, "tissue: .*'granite'"),
+        ({"command": "move_surface", "breath_m": 0.5}, "breath_m: got 0.5; accepted is 0 to 0.02"),
+        ({"command": "move_surface", "breath": 1e-3}, "breath.*one of"),
         ({"command": "cell_fault", "fault": "hungry", "value": 1}, "hungry"),
     ],
 )

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The contact of a plant as a simulated sensor feels it: known up to now, told part by part."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from tactile_resonance.fields import require
+from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.bench_tip import BenchTip
+from tactile_resonance.simulation.bimorph import CoupledBimorph
+
+LEAST_RADIUS_M = 1e-6
+"""A contact that is lost stays one of this radius: its stiffness is below a hundredth of that at 1 cN."""
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """Mean state of a contact over a part of time.
+
+    Attributes
+    ----------
+    force_n, contact_radius_m, depth_m : float
+        Along the normal; 0 out of contact.
+    """
+
+    force_n: float
+    contact_radius_m: float
+    depth_m: float
+
+
+class ContactSoFar:
+    """Contact over time, constant in each part; beyond the last part it stays.
+
+    A small vibration sees the contact radius alone, whatever force and motion brought it about.
+
+    Parameters
+    ----------
+    bench : SimulatedBench
+    start : BenchTip
+        On tissue, at time 0.
+
+    Attributes
+    ----------
+    parts : list of CoupledBimorph
+        The linear sensor on each part so far.
+    """
+
+    def __init__(self, bench: SimulatedBench, start: BenchTip) -> None:
+        self._bench, self._tip = bench, start
+        self._start = start.coupled(bench)
+        self._ends_s: list[float] = []
+        self.parts: list[CoupledBimorph] = []
+
+    def extend(self, length_s: float, states: Iterable[ContactState | None]) -> None:
+        """Take in what followed: equal parts over `length_s`; None: the plant stood still."""
+        states = list(states)
+        require(length_s > 0, "length_s", length_s, "a number above 0")
+        begin = self._ends_s[-1] if self._ends_s else 0.0
+        for number, state in enumerate(states, 1):
+            last = self.parts[-1] if self.parts else self._start
+            self.parts.append(last if state is None else self._coupled(state))
+            self._ends_s.append(begin + length_s * number / len(states))
+
+    def coupled_at(self, time_s: float) -> CoupledBimorph:
+        """Return the linear sensor on the contact of one time [s]."""
+        if not self.parts:
+            return self._start
+        return self.parts[min(bisect_right(self._ends_s, time_s), len(self.parts) - 1)]
+
+    def _coupled(self, state: ContactState) -> CoupledBimorph:
+        tip = replace(
+            self._tip,
+            force_n=state.force_n,
+            contact_radius_m=max(state.contact_radius_m, LEAST_RADIUS_M),
+            depth_m=state.depth_m,
+        )
+        return tip.coupled(self._bench)
+
+
+def parts_of(length_s: float, longest_s: float) -> int:
+    """Fewest equal parts of a length that are no longer than `longest_s`."""
+    return max(1, math.ceil(length_s / longest_s - 1e-9))
