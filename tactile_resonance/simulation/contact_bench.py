@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +15,14 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.beam import BeamModes
-from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.plant import (
     CellMounting,
     Plant,
     RigidTip,
     Surface,
     TipOnTissue,
-    contact_radius_m,
+    relative_radius_m,
 )
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
@@ -44,16 +45,28 @@ class Tip:
         None: held rigidly.
     poisson_ratio : float
         Of the tissue.
+    adhesion_j_per_m2 : float
+        See `Indenter`.
+    meets : callable, optional
+        From the ball on the tissue to what it meets: `OnBone`, `Clinging`.
     """
 
     radius_m: float = 2.5e-3
     beam: BeamModes | None = None
     poisson_ratio: float = 0.49
+    adhesion_j_per_m2: float = 0.0
+    meets: Callable[[Indenter], Ball] | None = None
 
     def on(self, tissue: Tissue, surface: Surface) -> TipOnTissue:
         """Return the tip at rest over a tissue with that surface."""
-        radius_m = contact_radius_m(self.radius_m, surface)
-        ball = Indenter(tissue, tip_radius_m=radius_m, poisson_ratio=self.poisson_ratio)
+        radius_m = relative_radius_m(self.radius_m, surface)
+        soft = Indenter(
+            tissue,
+            tip_radius_m=radius_m,
+            poisson_ratio=self.poisson_ratio,
+            adhesion_j_per_m2=self.adhesion_j_per_m2,
+        )
+        ball: Ball = soft if self.meets is None else self.meets(soft)
         return RigidTip(ball) if self.beam is None else SprungIndenter.on_beam(ball, self.beam)
 
 
@@ -75,6 +88,8 @@ class ContactBench:
         Mass beyond a tool-mounted cell [kg].
     tracking : TrackingParameters
     cell_parameters : CellParameters
+    period_s : float
+        Of robot and cell [s].
     seed : int
 
     Attributes
@@ -98,6 +113,7 @@ class ContactBench:
         tool_kg: float = 0.03,
         tracking: TrackingParameters | None = None,
         cell_parameters: CellParameters | None = None,
+        period_s: float = 0.002,
         seed: int = 0,
     ) -> None:
         tip = Tip() if tip is None else tip
@@ -111,7 +127,7 @@ class ContactBench:
             tip_radius_m=tip.radius_m,
             mounting=mounting,
         )
-        self.clock = VirtualBench(self.plant, start, tracking=tracking, seed=seed)
+        self.clock = VirtualBench(self.plant, start, tracking=tracking, period_s=period_s, seed=seed)
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, vector(centre)) if on_tool else None

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from math import exp, expm1, pi, sqrt
 from operator import mul
+from typing import Protocol
 
 import numpy as np
 
@@ -27,6 +28,37 @@ from tactile_resonance.simulation.tissue import Tissue
 
 NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes as its square
 MAX_NODES_PER_STEP = 64
+
+
+class Ball(Protocol):
+    """What presses on the tip: an `Indenter`, or one with something else to meet."""
+
+    @property
+    def force_n(self) -> float:
+        """On the tip along the outward normal [N]."""
+        ...
+
+    @property
+    def depth_m(self) -> float:
+        """Of the lowest point below the undisturbed surface [m]."""
+        ...
+
+    @property
+    def contact_radius_m(self) -> float:
+        """Of the contact on the tissue [m]."""
+        ...
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue."""
+        ...
+
+    def step(self, depth_m: float, dt_s: float) -> float:
+        """Move to a depth within a time; return the force [N]."""
+        ...
+
+    def tangent(self, dt_s: float) -> tuple[float, float]:
+        """Force after holding for a time [N], and per further depth [N/m]."""
+        ...
 
 
 class Indenter:

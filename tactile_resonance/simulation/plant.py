@@ -31,7 +31,7 @@ from tactile_resonance.contact.vectors import (
     turn_product,
 )
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.indenter import Ball
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
@@ -137,7 +137,7 @@ class Sphere:
         return sign * (away - self.radius_m), normal
 
 
-def contact_radius_m(tip_radius_m: float, surface: Surface) -> float:
+def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
     """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
 
     ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
@@ -159,7 +159,7 @@ class TipOnTissue(Protocol):
     """A tip on one tissue through time: `RigidTip`, `SprungIndenter`."""
 
     @property
-    def indenter(self) -> Indenter:
+    def indenter(self) -> Ball:
         """The ball."""
         ...
 
@@ -172,7 +172,7 @@ class TipOnTissue(Protocol):
 class RigidTip:
     """A ball that moves as the robot does."""
 
-    indenter: Indenter
+    indenter: Ball
 
     def step(self, depth_m: float, dt_s: float, /) -> float:
         """Advance with the depth of the ball [m]; return the force on it [N]."""
@@ -236,7 +236,7 @@ class Plant:
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
         touch. Asked when the tip comes near at a new place, and where it stops to come down.
     tip : callable
-        From a tissue to a `TipOnTissue` at rest on it; its ball is that of `contact_radius_m`.
+        From a tissue to a `TipOnTissue` at rest on it; its ball is that of `relative_radius_m`.
     tip_radius_m : float
     mounting : CellMounting
     friction : Friction

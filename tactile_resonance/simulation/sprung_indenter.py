@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import BeamModes
-from tactile_resonance.simulation.indenter import Indenter
+from tactile_resonance.simulation.indenter import Ball
 
 SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
 
@@ -23,13 +23,13 @@ class SprungIndenter:
 
     Parameters
     ----------
-    indenter : Indenter
+    indenter : Ball
     stiffness_n_per_m, mass_kg, damping_ns_per_m : float
         k, m, c.
 
     Attributes
     ----------
-    indenter : Indenter
+    indenter : Ball
     tip_depth_m : float
         x [m].
     force_n : float
@@ -39,7 +39,7 @@ class SprungIndenter:
 
     def __init__(
         self,
-        indenter: Indenter,
+        indenter: Ball,
         *,
         stiffness_n_per_m: float,
         mass_kg: float,
@@ -57,7 +57,7 @@ class SprungIndenter:
         self.reset()
 
     @classmethod
-    def on_beam(cls, indenter: Indenter, modes: BeamModes) -> SprungIndenter:
+    def on_beam(cls, indenter: Ball, modes: BeamModes) -> SprungIndenter:
         """Return the tip of a bimorph: ``k = 3 EI / L^3``, frequency and damping of mode 1."""
         stiffness, natural = modes.static_stiffness_n_per_m, float(modes.natural_rad_s[0])
         mass = stiffness / natural**2

@@ -60,12 +60,13 @@ def contact(
     limits=None,
     aim=None,
     seed=0,
+    tip=None,
     **bench,
 ):
     touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(touch.position_m + [0, 0, start_m], touch.rotation_rad)
     rig = ContactBench(
-        tissue, Plane.tilted(height_m, tilt_rad), start, tip=Tip(RADIUS_M), seed=seed, **bench
+        tissue, Plane.tilted(height_m, tilt_rad), start, tip=tip or Tip(RADIUS_M), seed=seed, **bench
     )
     controller = ContactController(parameters, Limits() if limits is None else limits)
     loop = ContactLoop(rig.arm, rig.force, rig.clock, controller)

@@ -10,7 +10,8 @@ import pytest
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.obstacles import Clinging
+from tactile_resonance.simulation.plant import Plane, RigidTip
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import SOFT, contact, started, stiffer
@@ -18,43 +19,20 @@ from contacts import SOFT, contact, started, stiffer
 PULL_N = Limits().pull_force_n
 
 
-class Clinging:
-    """Tissue that, once touched, holds the ball back above its surface.
-
-    `pull` says how hard [N], from how far above the surface the ball is [m] and how fast it goes up [m/s];
-    None: it has let go.
-    """
-
-    def __init__(self, tip, pull):
-        self._tip, self._pull, self._height_m, self._touched = tip, pull, 0.0, False
-        self.indenter = self
-        self.force_n = self.depth_m = 0.0
-
-    def step(self, depth_m, dt_s):
-        self.force_n = self._tip.step(depth_m, dt_s)
-        self._touched |= self.force_n > 0
-        up_m_s, self._height_m = (-depth_m - self._height_m) / dt_s, -depth_m
-        self.depth_m = max(depth_m, 1e-9)
-        if self._touched and depth_m < 0:
-            pull_n = self._pull(-depth_m, up_m_s)
-            self._touched = pull_n is not None
-            self.force_n = -(pull_n or 0.0)
-        return self.force_n
-
-
 def clinging(pull):
     made = started()
     assert made.run_until(State.HOLD)
     plant = made.bench.plant
-    plant._on = Clinging(plant._on, pull)
-    plant._on._touched = True
+    held = Clinging(plant._on.indenter, pull)
+    held._touched = True
+    plant._on = RigidTip(held)
     made.controller.retract()
     made.run_until(State.IDLE, 4.0)
-    return made
+    return made, held
 
 
 def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
-    made = clinging(lambda height_m, _: 40.0 * height_m)
+    made, _ = clinging(lambda height_m, _: 40.0 * height_m)
     assert made.controller.state is State.FAULT
     result = made.controller.result
     assert result.cause is Cause.HELD
@@ -65,7 +43,7 @@ def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
 
 
 def test_hook_that_is_asked_for_again_is_pulled_no_harder():
-    made = clinging(lambda height_m, _: 40.0 * height_m)
+    made, _ = clinging(lambda height_m, _: 40.0 * height_m)
     for _ in range(5):
         made.controller.retract()
         made.run(1.0)
@@ -74,8 +52,8 @@ def test_hook_that_is_asked_for_again_is_pulled_no_harder():
 
 
 def test_tip_that_is_freed_is_drawn_back_on_request():
-    made = clinging(lambda height_m, _: 40.0 * height_m)
-    made.bench.plant._on._pull = lambda *_: None
+    made, held = clinging(lambda height_m, _: 40.0 * height_m)
+    held.pull = lambda *_: None
     made.run(0.1)
     made.controller.retract()
     assert made.run_until(State.IDLE, 3.0)
@@ -85,7 +63,7 @@ def test_tip_that_is_freed_is_drawn_back_on_request():
 
 def test_film_that_pulls_as_fast_as_it_is_drawn_is_left_slowly():
     # 1 N s/m: at 20 mm/s it would pull with 20 mN; it tears 2 mm above the surface
-    made = clinging(lambda height_m, up_m_s: 1.0 * max(0.0, up_m_s) if height_m < 2e-3 else None)
+    made, _ = clinging(lambda height_m, up_m_s: 1.0 * max(0.0, up_m_s) if height_m < 2e-3 else None)
     assert made.controller.state is State.IDLE
     assert made.controller.result.retracted
     assert min(made.force_n) > -(PULL_N + 1e-3)

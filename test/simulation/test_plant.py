@@ -16,7 +16,7 @@ from tactile_resonance.simulation.plant import (
     Plant,
     RigidTip,
     Sphere,
-    contact_radius_m,
+    relative_radius_m,
 )
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
@@ -95,15 +95,15 @@ def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(
 
 
 def test_sphere_without_bounds_is_a_plane_and_a_ball_must_fit_into_its_hollow():
-    assert contact_radius_m(RADIUS_M, Plane.tilted(0.1)) == RADIUS_M
+    assert relative_radius_m(RADIUS_M, Plane.tilted(0.1)) == RADIUS_M
     for hollow in (False, True):
         far = Sphere(np.array([0, 0, 1e6 if hollow else -1e6]), 1e6, hollow)
         height, normal = far.height_of((0.01, 0.02, 3e-3))
         assert height == pytest.approx(3e-3, abs=1e-9)
         np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-7)
-        assert contact_radius_m(RADIUS_M, far) == pytest.approx(RADIUS_M, rel=1e-8)
+        assert relative_radius_m(RADIUS_M, far) == pytest.approx(RADIUS_M, rel=1e-8)
     with pytest.raises(ValueError, match="below the radius of the hollow, 0.002 m"):
-        contact_radius_m(RADIUS_M, Sphere(CENTRE_M, 2e-3, hollow=True))
+        relative_radius_m(RADIUS_M, Sphere(CENTRE_M, 2e-3, hollow=True))
 
 
 def test_friction_sticks_below_its_limit_and_slides_at_it():

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact on what lives: it moves, and there is bone below it."""
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.held_motion import HeldMotion
+from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Cause
+from tactile_resonance.simulation.beam import sensor_modes
+from tactile_resonance.simulation.contact_bench import Tip
+from tactile_resonance.simulation.obstacles import OnBone
+from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.simulation.surface_motion import SurfaceMotion
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, stiffer
+
+HEART = SurfaceMotion(heart_m=4e-4, heart_hz=1.2)
+BREATH = SurfaceMotion(breath_m=1e-3, breath_hz=0.25)
+
+
+def held(motion, seconds=3.0, seed=0):
+    made = contact(SOFT, seed=seed)
+    made.bench.plant.motion = motion
+    made.loop.start(made.goal)
+    assert made.run_until(State.HOLD), made.controller.result
+    at = len(made.force_n)
+    made.run(seconds)
+    return made, np.array(made.force_n[at:])
+
+
+@pytest.mark.parametrize("motion", [HEART, BREATH])
+@pytest.mark.parametrize("seed", range(3))
+def test_moving_tissue_is_held(motion, seed):
+    made, force_n = held(motion, seed=seed)
+    assert made.controller.state is State.HOLD
+    assert np.sqrt(np.mean((force_n / FORCE_N - 1) ** 2)) < 0.10
+    assert 0.6 * FORCE_N < force_n.min() < force_n.max() < 1.4 * FORCE_N
+
+
+def test_motion_is_said_with_its_size_and_rate():
+    made, _ = held(HEART)
+    said = re.fullmatch(r"moving tissue: (\d+) um at ([\d.]+) Hz", made.controller.motion)
+    assert float(said[1]) == pytest.approx(200, rel=0.15)
+    assert float(said[2]) == pytest.approx(1.2, abs=0.1)
+    made.controller.retract()
+    made.run(0.01)
+    assert "moving tissue" in made.controller.result.message
+
+
+def test_still_tissue_is_not_said_to_move():
+    made, _ = held(None, seconds=1.0)
+    assert made.controller.motion == ""
+
+
+def test_motion_that_has_not_turned_has_no_rate():
+    motion = HeldMotion()
+    for n in range(50):  # half a turn in 1 s
+        motion.add(n * 20_000_000 + 10**9, 1e-4 * np.sin(np.pi * n / 50))
+    assert re.fullmatch(r"moving tissue: \d+ um in 1.0 s", motion.describe())
+
+
+def peak_n(layer_m, parameters, seed, beam=None):
+    tip = Tip(RADIUS_M, beam, meets=lambda soft: OnBone(soft, layer_m=layer_m, radius_m=RADIUS_M))
+    tissue = replace(SOFT, relaxation_modulus_1s_pa=1.5e3)  # 3 kPa at once
+    made = contact(tissue, parameters=parameters, tip=tip, seed=seed, height_m=1.5e-3)
+    made.loop.start(made.goal)
+    made.run_until(State.IDLE, 30.0)
+    return max(made.force_n), made
+
+
+@pytest.mark.parametrize("layer_m", [0.0, 3e-4])
+@pytest.mark.parametrize("seed", range(3))
+def test_bone_is_met_below_the_hard_limit_where_nothing_is_known(layer_m, seed):
+    slow = replace(QUICK, unknown_speed_m_s=3e-4)
+    most_n, made = peak_n(layer_m, slow, seed)
+    assert most_n < Limits().hard_force_n
+    assert made.controller.result.cause in (Cause.FORCE_RATE, Cause.FORCE_ABORT)
+    assert peak_n(layer_m, QUICK, seed)[0] > 4 * Limits().hard_force_n  # what it would be
+
+
+def test_beam_protects_from_bone_at_full_speed():
+    modes = sensor_modes(read_sensor())
+    parameters = replace(
+        QUICK, unknown_speed_m_s=3e-4, beam_stiffness_n_per_m=modes.static_stiffness_n_per_m
+    )
+    assert parameters.first_speed_m_s(Limits().abort_force_n) > parameters.press_speed_m_s
+    assert peak_n(0.0, parameters, 0, modes)[0] < Limits().hard_force_n
+
+
+def test_near_a_contact_that_succeeded_the_next_touch_is_fast():
+    made = contact(stiffer(SOFT, 2.0), parameters=replace(QUICK, unknown_speed_m_s=3e-4))
+    took_s = []
+    for _ in range(2):
+        began_ns = made.bench.clock.time_ns
+        assert made.loop.make(made.goal).reached
+        took_s.append((made.bench.clock.time_ns - began_ns) * 1e-9)
+        made.run(0.1)
+        assert made.loop.retract().retracted
+    assert took_s[0] > 3 * took_s[1]
+
+
+def test_speed_that_a_beam_allows_is_that_at_which_it_bends_to_half_of_the_abort_force():
+    stiff = ContactParameters(beam_stiffness_n_per_m=500.0)
+    assert stiff.first_speed_m_s(0.03) == pytest.approx(0.015 / (500.0 * 0.03))
+    assert ContactParameters().first_speed_m_s(0.03) == ContactParameters().unknown_speed_m_s
