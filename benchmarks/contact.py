@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from tqdm import tqdm
 
-from benchmarks import contact_drivers
+from benchmarks import contact_drivers, contact_living
 from benchmarks.contact_case import (
     FORCE_N,
     Case,
@@ -82,7 +82,7 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
     quick : bool
         Few cases: shows that everything works, figures are rough.
     full : bool
-        All 270 cases and 1000 contacts in a row.
+        All 270 cases, 100 a row on living tissue, and 1000 contacts in a row.
     """
     chosen = cases(full)[:: 3 if quick else 1]
     jobs = [(setup.name, setup, None) for setup in SETUPS]
@@ -96,9 +96,10 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
                 done = run_controller(case, setup) if law is None else run_law(case, setup, law())
                 outcomes[name].append(done)
                 progress.update()
+    living = contact_living.run(100 if full else 1 if quick else 6)
     series = contact_series(1000 if full else 20 if quick else 60)
     peaks = stiff_peaks(10 if quick else 60)
-    text = _report(outcomes, series, peaks, drivers, len(chosen))
+    text = _report(outcomes, series, peaks, drivers, len(chosen)) + "\n" + living
     output.mkdir(parents=True, exist_ok=True)
     (output / "contact.md").write_text(text, encoding="utf-8")
     _draw(outcomes, series, chosen, output / "contact.png")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +18,9 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
+from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.plant import Plane, Surface
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters
@@ -31,6 +33,9 @@ TOOL = {
     "approach_speed_m_s": 3e-3,
 }
 """A tool on the cell: its inertia is known, it shakes with the robot, and it is started gently."""
+
+KNOWN = {"unknown_speed_m_s": 5e-3}
+"""As where a contact near by has succeeded: the touch is fast."""
 
 DEEPEST_M = 4.5e-3
 """The softest tissue creeps deeper than the default limit allows, and the beam bends."""
@@ -100,17 +105,32 @@ class Outcome:
 class Rig:
     """Bench of one case, and the record of its true force."""
 
-    def __init__(self, case: Case, setup: Setup) -> None:
+    def __init__(
+        self,
+        case: Case,
+        setup: Setup,
+        *,
+        surface: Surface | None = None,
+        adhesion_j_per_m2: float = 0.0,
+        meets: Callable[[Indenter], Ball] | None = None,
+        period_s: float = 0.002,
+    ) -> None:
         self.touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], case.radius_m)
         bench = self.bench = ContactBench(
             case.tissue(),
-            Plane.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
+            surface or Plane.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
             Pose(self.touch.position_m + [0, 0, STANDOFF_M], self.touch.rotation_rad),
-            tip=Tip(case.radius_m, MODES if setup.beam else None),
+            tip=Tip(
+                case.radius_m,
+                MODES if setup.beam else None,
+                adhesion_j_per_m2=adhesion_j_per_m2,
+                meets=meets,
+            ),
             mount=setup.mount,
             tool_kg=TOOL_KG,
             tracking=TrackingParameters(jitter_rms_m=setup.jitter_m),
             cell_parameters=replace(CellParameters.from_yaml(), force_noise_rms_n=setup.noise_n),
+            period_s=period_s,
             seed=case.seed,
         )
         self.force_n: list[float] = []
@@ -161,6 +181,7 @@ def run_controller(
             cell_noise_n=1.6 * noise if setup.mount is Mount.TOOL else noise,
             tare_std_n=3e-4 * noise / 1e-3,
             beam_stiffness_n_per_m=MODES.static_stiffness_n_per_m if setup.beam else 0.0,
+            **KNOWN,
             **(TOOL if setup.mount is Mount.TOOL else {}),
         )
     limits = Limits(
@@ -192,7 +213,7 @@ def stiff_peaks(count: int) -> np.ndarray:
         # the place of the touch between two periods varies
         rig = Rig(Case(2.5e-3, 400e3, 1.0, 1e-3 + 2e-6 * seed, 0.0, seed), Setup("stiff"))
         bench = rig.bench
-        controller = ContactController(ContactParameters(), Limits())
+        controller = ContactController(ContactParameters(**KNOWN), Limits())
         loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
         loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
         loop.run_while(lambda: True, 0.3)
@@ -204,7 +225,7 @@ def contact_series(count: int) -> np.ndarray:
     """Mean true force over 0.3 s of so many contacts in a row at one place [N], (count,)."""
     rig = Rig(Case(2.5e-3, 10e3, 1.0, 1.5e-3, 0.0, 1), Setup("series"))
     bench = rig.bench
-    parameters = ContactParameters(tare_s=0.2)
+    parameters = ContactParameters(tare_s=0.2, **KNOWN)
     controller = ContactController(parameters, Limits())
     loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
     means = []

@@ -9,6 +9,7 @@ at the force and hold the position, 50 ms after they stop.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
@@ -128,14 +129,35 @@ LAWS = {
 }
 
 
-def run_law(case: Case, setup: Setup, law: Law, record: list[float] | None = None) -> Outcome:
-    """Run a simple law on a case; the true force of each period is appended to `record`."""
-    rig = Rig(case, setup)
+class Admittance:
+    """4 mm/s until the touch, then as a mass of 0.1 kg in a damping of 5 N s/m that the force error drives."""
+
+    holds_position = False
+
+    def __init__(self) -> None:
+        self._recent: deque[float] = deque(maxlen=4)
+        self._touched, self._speed = False, -4e-3
+
+    def speed(self, force_n: float, dt_s: float) -> float | None:
+        self._recent.append(force_n)
+        force = float(np.mean(self._recent))
+        self._touched |= force > TOUCH_N
+        if self._touched:
+            self._speed += (force - FORCE_N - 5.0 * self._speed) * dt_s / 0.1
+        return self._speed
+
+
+LIVING_LAWS = {"admittance": Admittance, "PI": FixedPI}
+"""The laws that are put beside ours on tissue that moves."""
+
+
+def steps_of(rig: Rig, law: Law, force_n: float = FORCE_N) -> Iterator[bool]:
+    """Run a simple law on a bench, period by period; tell whether the force has been there for 50 ms."""
     bench, dt = rig.bench, rig.bench.clock.motion.period_s
     period_ns = round(1e9 * dt)
     forces: deque[float] = deque(maxlen=25)
     bias: list[float] = []
-    within, stopped, ready = 0, False, None
+    within, stopped = 0, False
     for n in range(round(LONGEST_S / dt)):
         bench.clock.wait_until((n + 1) * period_ns)
         samples = [float(sample.force_n[2]) for sample in bench.force.read()]
@@ -156,9 +178,18 @@ def run_law(case: Case, setup: Setup, law: Law, record: list[float] | None = Non
         if law.holds_position:
             within = within + 1 if stopped else 0
         else:
-            good = abs(np.mean(forces) / FORCE_N - 1) < 0.05
+            good = abs(np.mean(forces) / force_n - 1) < 0.05
             within = within + 1 if good else 0
-        if ready is None and within * dt >= 0.05:
+        yield within * dt >= 0.05
+
+
+def run_law(case: Case, setup: Setup, law: Law, record: list[float] | None = None) -> Outcome:
+    """Run a simple law on a case; the true force of each period is appended to `record`."""
+    rig = Rig(case, setup)
+    dt = rig.bench.clock.motion.period_s
+    ready: int | None = None
+    for now_ready in steps_of(rig, law):
+        if ready is None and now_ready:
             ready = len(rig.force_n)
         if ready is not None and len(rig.force_n) >= ready + round(1 / dt):
             break

@@ -14,7 +14,7 @@ EVERY_NS, NEWEST = 20_000_000, 1000
 ANEW_NS = 500_000_000
 """A motion is described anew after so long [ns]."""
 
-LEAST_S, LEAST_TURNS = 0.4, 1.5
+LEAST_S, LEAST_TURNS = 0.4, 2.5
 """A motion is described from so long [s] on; its rate where it has turned so often."""
 
 INNER = (2.5, 97.5)
@@ -42,7 +42,7 @@ class HeldMotion:
     def describe(self) -> str:
         """Say how far and how often it moves, as `moving tissue: 200 um at 1.2 Hz`; empty before it is known.
 
-        The distance is half of the whole way, less a linear creep.
+        The distance is half of the whole way.
         """
         if self._times_ns and self._times_ns[-1] - self._described[0] >= ANEW_NS:
             self._described = self._times_ns[-1], self._sentence()
@@ -53,7 +53,7 @@ class HeldMotion:
             return ""
         t_s = (np.array(self._times_ns) - self._times_ns[0]) * 1e-9  # (n,)
         heights = np.array(self._heights_m)
-        heights = heights - np.polyval(np.polyfit(t_s, heights, 1), t_s)
+        heights -= heights.mean()
         low, high = np.percentile(heights, INNER)
         text = f"moving tissue: {0.5e6 * (high - low):.0f} um"
         # on a grid of even steps: a loop that was late leaves gaps

@@ -83,7 +83,7 @@ class ContactResult:
         Whether the tip is back at the standoff.
     zero_change_n : float or None
         By how much the zero of the force has moved since the tare, once the tip is back [N]; None where it is
-        not known. Where that is more than noise, it is in the message and in `force_std_n`.
+        not known. What of it is no noise is in `force_std_n`, and in the message where it is much.
     """
 
     reached: bool

@@ -17,7 +17,7 @@ from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.move import Move, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M
@@ -28,7 +28,7 @@ BLIND_CAUSES = frozenset({Cause.FORCE_STALE, Cause.FORCE_SOURCE})
 SMOOTH_S = 0.008
 """Forces are averaged over about so long [s]."""
 
-LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.5
+LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.9
 """Speed with which the surface is left, until so far above it, once less than this share of the
 force is pressed with."""
 
@@ -81,7 +81,8 @@ class Withdrawal:
         self._pressed_n = PRESSED * touched_n
         now_n = self._observer.watch.force_n[2]
         self._smooth_n = now_n
-        self._step = None  # what it has felt stays: a tip that was held is not pulled harder on request
+        # what it has felt stays: a tip that was held is not pulled harder on request
+        self._step = None
         model = self._observer.model
         if self._least_n is None and self._observer.tared:
             self._surface_m = -math.inf if model is None else model.surface_m
@@ -115,17 +116,19 @@ class Withdrawal:
         """Of its speed with which the tip goes up; None where it is held."""
         if self._least_n is None:
             return 1.0
-        most = 1.0
+        most, p = 1.0, self._parameters
         # a beam bends by so much more before what clings to the ball pulls as hard as it may
-        leave_m = LEAVE_M + self._limits.pull_force_n / self._parameters.beam_n_per_m
+        leave_m = LEAVE_M + self._limits.pull_force_n / p.beam_n_per_m
         if self._smooth_n < self._pressed_n and height_m < self._surface_m + leave_m:
-            most = min(1.0, LEAVE_M_S / self._parameters.retract_speed_m_s)
+            # and takes so long to pull half as hard
+            bends_m_s = self._limits.pull_force_n / 2 / (p.beam_n_per_m * REACTION_S)
+            most = min(1.0, max(LEAVE_M_S, bends_m_s) / p.retract_speed_m_s)
         room = (self._smooth_n - self._least_n) / self._limits.pull_force_n
-        slowest = FEEL_M_S / self._parameters.retract_speed_m_s
+        slowest = FEEL_M_S / p.retract_speed_m_s
         if room > 0:
             self._felt_s = 0.0
             return max(slowest, most * min(1.0, room))
-        self._felt_s += self._parameters.period_s
+        self._felt_s += p.period_s
         # below the surface what it still presses with goes, too
         if self._felt_s <= FEEL_NOT_S or height_m < self._surface_m:
             self._felt_from = height_m, self._smooth_n

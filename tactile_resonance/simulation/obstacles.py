@@ -9,6 +9,9 @@ from collections.abc import Callable
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Indenter
 
+UP_M = 1e-7
+"""Over which the slope of a pull is taken [m]."""
+
 
 class OnBone:
     """Soft tissue on an elastic half-space: both press on the ball, the lower from its depth on.
@@ -123,6 +126,11 @@ class Clinging:
         return self.force_n
 
     def tangent(self, dt_s: float) -> tuple[float, float]:
-        """Force after holding for a time [N], and per further depth [N/m]; the pull is taken to stay."""
+        """Force after holding for a time [N], and per further depth [N/m]."""
         force_n, slope = self._soft.tangent(dt_s)
-        return force_n - self._pulled_n, slope
+        height_m = -self._soft.depth_m
+        if not self._touched or height_m <= 0:
+            return force_n, slope
+        pulled_n = self.pull(height_m, 0.0) or 0.0
+        further_n = self.pull(height_m + UP_M, UP_M / dt_s) or 0.0
+        return force_n - pulled_n, slope + max(0.0, further_n - pulled_n) / UP_M
