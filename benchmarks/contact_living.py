@@ -374,8 +374,8 @@ def _report(outcomes: dict[tuple[str, str], list[Held]], count: int) -> str:
         f"{count} cases a row, each drawn by its seed: ball of 1.5 to 3 mm, modulus of a sudden step 3 to",
         "30 kPa of which 60 % relax in .5 to 3 s, surface +-.5 mm from where it is expected, 1 mN rms noise at",
         "500 Hz. Heart: a sine of that amplitude at 1 to 2 Hz; breath: cos^6, peak to peak, at .2 to .3 Hz.",
-        "Held: for 4 s after it was ready. rms: of the true force about its aim while held, median / p95. Peak:",
-        "largest true force of all cases. Without a beam these are contacts near one that has succeeded.",
+        "Held: for 4 s after it was ready. rms: of the true force about its aim while held, median / p95.",
+        "Peak: largest true force. Without a beam these are contacts near one that has succeeded.",
         "",
         "| Tissue that moves | held % | ready, median / p95 s | rms % | peak mN "
         + "".join(f"| {law}: held %, rms % " for law in LIVING_LAWS)
