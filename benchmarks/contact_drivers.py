@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.contact_case import DEEPEST_M, FORCE_N, Outcome
+from benchmarks.contact_case import DEEPEST_M, FORCE_N, KNOWN, Outcome
 from benchmarks.simulated_robot import simulated_robot
 from tactile_resonance.clock import WallClock
 from tactile_resonance.configuration import share_path
@@ -111,7 +111,9 @@ def _connected() -> Iterator[ContactLoop]:
         force.start()
         parameters, limits = read_contact()
         # tilts here are not known to the controller; the ball is held rigidly
-        parameters = replace(parameters, beam_stiffness_n_per_m=0.0, travel_speed_m_s=0.1)
+        parameters = replace(
+            parameters, beam_stiffness_n_per_m=0.0, travel_speed_m_s=0.1, **KNOWN
+        )
         controller = ContactController(parameters, replace(limits, depth_m=DEEPEST_M))
         yield ContactLoop(arm, force, WallClock(), controller)
     finally:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contact import REFERENCE, cases
-from benchmarks.contact_case import FORCE_N, Outcome, run_controller
+from benchmarks.contact_case import FORCE_N, KNOWN, Outcome, run_controller
 from benchmarks.contact_client import ContactClient
 from benchmarks.contact_drivers import TISSUES
 from benchmarks.simulated_robot import simulated_robot
@@ -73,7 +73,7 @@ def run(output: Path, quick: bool) -> str:
     grid = cases(False)[:: 9 if quick else 1]
     virtual = {}
     for rate_hz in RATES_HZ:
-        parameters = ContactParameters(period_s=1 / rate_hz)
+        parameters = ContactParameters(period_s=1 / rate_hz, **KNOWN)
         virtual[rate_hz] = [run_controller(case, REFERENCE, parameters) for case in grid]
     text = _report(rows, virtual, contacts)
     output.mkdir(parents=True, exist_ok=True)
