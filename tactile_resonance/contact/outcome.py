@@ -88,12 +88,14 @@ class Outcome:
             return
         message, std = result.message, result.force_std_n
         if zero_n is not None:
-            if abs(zero_n) > ZERO_MOVED * zero_std_n:
-                text = f"the zero of the force moved by {1e3 * zero_n:.1f} mN in this contact"
-                message = f"{message}; {text}" if message else text
             # of what is no noise, the mean may have any part between nothing and all
             moved_n = math.sqrt(max(0.0, zero_n**2 - zero_std_n**2))
             std = None if std is None else math.hypot(std, moved_n / 2)
+            if abs(zero_n) > ZERO_MOVED * zero_std_n:
+                text = f"the zero of the force moved by {1e3 * zero_n:.1f} mN in this contact"
+                message = f"{message}; {text}" if message else text
+            else:
+                zero_n = 0.0
         self._result = replace(
             result, retracted=True, zero_change_n=zero_n, message=message, force_std_n=std
         )

@@ -82,8 +82,9 @@ class ContactResult:
     retracted : bool
         Whether the tip is back at the standoff.
     zero_change_n : float or None
-        By how much the zero of the force has moved since the tare, once the tip is back [N]; None where it is
-        not known. What of it is no noise is in `force_std_n`, and in the message where it is much.
+        By how much the zero of the force has moved since the tare, once the tip is back [N]; 0 where that is
+        within its noise, None where it is not known. What of it is no noise is in `force_std_n`, and in the
+        message where it is much.
     """
 
     reached: bool

@@ -122,6 +122,8 @@ def state_message(
     state.force_n, state.depth_m, state.stiffness_n_per_m = known(estimate)
     if result is not None:
         state.cause, state.message = result.cause.value, result.message
+    moved_n = None if result is None else result.zero_change_n
+    state.zero_moved_n = math.nan if moved_n is None else moved_n
     return state
 
 

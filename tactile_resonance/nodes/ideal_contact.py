@@ -263,6 +263,7 @@ class IdealContact:
         state.instance, state.stopped = self._node.instance, self._stop.stopped
         holds = self._state is State.HOLD
         state.force_n = stay.force_n if holds else math.nan
+        state.zero_moved_n = math.nan
         state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan
         self._states.publish(state)
         if stay.pose.header.frame_id:

@@ -213,10 +213,9 @@ class NodeHands:
             raise PointDisturbed(text, "place unknown")
         return measured
 
-    def retract(self) -> None:
-        """Draw the tip back and wait until it is free."""
-        if self._tip is not None:
-            self._tip.retract()
+    def retract(self) -> float:
+        """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N]."""
+        return 0.0 if self._tip is None else self._tip.retract()
 
     # helpers
 

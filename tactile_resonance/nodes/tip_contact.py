@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -120,17 +121,24 @@ class TipContact:
             finally:
                 self.retract(TOUCH_RETRACT_WITHIN_S)
 
-    def retract(self, within_s: float = RETRACT_WITHIN_S) -> None:
-        """Draw the tip back and wait until it is free."""
+    def retract(self, within_s: float = RETRACT_WITHIN_S) -> float:
+        """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N].
+
+        0 where it did not, or where nobody knows.
+        """
         if not self.touching:
-            return
+            return 0.0
         deadline = time.monotonic() + within_s
         while time.monotonic() < deadline:
             self._end_if_hung()
             self._time.go()
             if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
                 self.touching, self.touched_ns = False, None
-                return
+                moved_n = math.nan if self._state is None else self._state.zero_moved_n
+                return 0.0 if math.isnan(moved_n) else moved_n
+            state = self._state
+            if state is not None and state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:
+                raise ScanEnded(f"the tip is held: {state.message}")
         raise ScanEnded(
             f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
         )

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from tactile_resonance.identification.result import Poles
@@ -93,6 +94,13 @@ class Measured:
     origin: Origin
     contact_age_s: float = float("nan")
 
+    def with_zero_moved(self, moved_n: float) -> Measured:
+        """The same, its force uncertain by half of what its zero moved in the contact."""
+        contact = self.origin.contact
+        std_n = math.hypot(contact.force_std_n, moved_n / 2)
+        contact = replace(contact, force_std_n=std_n)
+        return replace(self, origin=replace(self.origin, contact=contact))
+
 
 class Hands(Protocol):
     """Robot and sensor, as a scan uses them.
@@ -143,6 +151,10 @@ class Hands(Protocol):
         """
         ...
 
-    def retract(self) -> None:
-        """Draw the tip back; harmless where it is free."""
+    def retract(self) -> float:
+        """Draw the tip back; harmless where it is free.
+
+        Returns by how much the zero of the force moved in the contact [N]: 0 where it did not, or where nobody
+        knows.
+        """
         ...

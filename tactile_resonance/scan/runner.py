@@ -205,7 +205,7 @@ class ScanRunner:
                 self._discard(point, recording, reason)
                 return
             self._say(point, Phase.RETRACT)
-            self._hands.retract()
+            moved_n = self._hands.retract()
             duration_s = self._hands.now_s() - begun_s
             if measured is None:
                 result = self._unmeasured(point, recording, outcome, reason, duration_s)
@@ -214,12 +214,15 @@ class ScanRunner:
                     point,
                     recording.attempt,
                     scene,
-                    measured,
+                    measured.with_zero_moved(moved_n),
                     decisions[-1],
                     time_ns=time.time_ns(),
                     duration_s=duration_s,
                     air=self._air,
                 )
+            if moved_n:
+                text = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
+                result = replace(result, reason=f"{result.reason}; {text}" if result.reason else text)
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(
                 result,

@@ -14,7 +14,7 @@ from tactile_resonance import msg
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.tip_contact import TipContact, _failure
-from tactile_resonance.scan.hands import PointDisturbed
+from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
 from tactile_resonance.scan.scene import Hold
 
 NOT_OF_THE_POINT = ("force_stale", "force_source", "force_invalid", "arm_stale", "arm_link", "cancelled")
@@ -47,3 +47,28 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     monkeypatch.setattr(tip, "_make", make)
     tip.hold(PoseStamped(), 0.01, Hold.FORCE, lambda: None, lambda: None)
     assert tip.touched_ns == 4_700_000_000
+
+
+def drawn_back(monkeypatch, **state):
+    """What `retract` comes to where contact_node then reports this state."""
+    tip = TipContact.__new__(TipContact)
+    tip.touching, tip.touched_ns, tip._end_if_hung = True, 1, lambda: None
+    tip._time = SimpleNamespace(go=lambda: None)
+
+    def ask():
+        tip._state = msg.ContactState(**state)
+        return True
+
+    monkeypatch.setattr(tip, "_ask_to_retract", ask)
+    monkeypatch.setattr("tactile_resonance.nodes.tip_contact.ASK_AGAIN_S", 0.05)
+    return tip.retract(1.0)
+
+
+def test_a_tip_that_is_held_ends_the_scan_with_the_reason(monkeypatch):
+    with pytest.raises(ScanEnded, match="the tip is held: a hook pulls"):
+        drawn_back(monkeypatch, state="fault", cause="held", message="a hook pulls")
+
+
+@pytest.mark.parametrize(("moved_n", "told_n"), [(-2e-3, -2e-3), (0.0, 0.0), (float("nan"), 0.0)])
+def test_a_tip_that_is_free_tells_how_far_its_zero_moved(monkeypatch, moved_n, told_n):
+    assert drawn_back(monkeypatch, state="idle", zero_moved_n=moved_n) == told_n

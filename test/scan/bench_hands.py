@@ -36,6 +36,7 @@ class Bench:
     on_measure: object = None
     holding: bool = False
     free_air: bool = True
+    zero_moved_n: float = 0.0
     time_s: float = 1000.0
     seeds: list = field(default_factory=list)
     silent: list = field(default_factory=list)
@@ -98,6 +99,7 @@ class Bench:
 
     def retract(self):
         self.holding = False
+        return self.zero_moved_n
 
 
 def note(text):

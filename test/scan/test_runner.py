@@ -133,6 +133,17 @@ def test_tissues_are_told_apart_at_the_nominal_force(tmp_path):
     assert reference.tissue_class == ""
 
 
+def test_a_zero_that_moved_in_the_contact_makes_the_force_less_certain(tmp_path):
+    _, run, _ = scan(tmp_path / "run", pressed_scene(), Bench(force_n=0.0095, zero_moved_n=-2e-3))
+    for result in run.latest:
+        # half of 2 mN, beside 0.1 mN of noise; at 2 Hz per mN that is 2 Hz of the pole at 10 mN
+        assert result.force_std_n == pytest.approx(np.hypot(1e-4, 1e-3))
+        assert result.nominal_f0_std_hz == pytest.approx(2.0, rel=0.05)
+        assert "the zero of the force moved by -2.0 mN" in result.reason
+    _, run, _ = scan(tmp_path / "steady", pressed_scene(), Bench(force_n=0.0095))
+    assert all("zero" not in result.reason for result in run.latest)
+
+
 def test_a_report_states_that_force_and_age_are_not_accounted_for(tmp_path):
     _, run, _ = scan(tmp_path / "run", replace(pressed_scene(), nominal_contact=None), Bench())
     reason = "force and age of contact are not accounted for: no nominal_contact is given"
