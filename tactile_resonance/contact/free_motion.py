@@ -37,6 +37,8 @@ class FreeMotion:
     limits : Limits
     touch_speed_m_s : float
         At which the tissue may be met, at most.
+    under_sample : bool
+        Whether the cell is under the sample: then its force counts on all of the way.
 
     Attributes
     ----------
@@ -53,7 +55,10 @@ class FreeMotion:
         parameters: ContactParameters,
         limits: Limits,
         touch_speed_m_s: float = math.inf,
+        *,
+        under_sample: bool = False,
     ) -> None:
+        self._under_sample = under_sample
         self._path, self._observer, self._touch_speed_m_s = path, observer, touch_speed_m_s
         self._parameters, self._limits = parameters, limits
         self.begun = False
@@ -96,8 +101,8 @@ class FreeMotion:
             if twist is not None:
                 return Move(twist)
             self._turning = None
-        # a cell under the sample feels what the tip does wherever it is, one on the tool how it is moved
-        near = place.height_m < self._limits.near_m or p.carried_kg == 0
+        # a cell under the sample feels the tip wherever it is, one on the tool how it is moved
+        near = place.height_m < self._limits.near_m or self._under_sample
         if self._path.must_lift(arm, p.standoff_m):
             # it may still press, where something ended while it did: up before it goes along
             return Move(self._path.lift(arm, p))

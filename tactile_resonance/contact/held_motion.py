@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
 
 EVERY_NS, NEWEST = 20_000_000, 1000
 """Of the tip's heights one is kept in so long [ns]; so many, the newest."""
@@ -42,7 +44,7 @@ class HeldMotion:
     def describe(self) -> str:
         """Say how far and how often it moves, as `moving tissue: 200 um at 1.2 Hz`; empty before it is known.
 
-        The distance is half of the whole way.
+        The distance is half of the whole way, creep taken off where the motion has turned often enough.
         """
         if self._times_ns and self._times_ns[-1] - self._described[0] >= ANEW_NS:
             self._described = self._times_ns[-1], self._sentence()
@@ -53,14 +55,16 @@ class HeldMotion:
             return ""
         t_s = (np.array(self._times_ns) - self._times_ns[0]) * 1e-9  # (n,)
         heights = np.array(self._heights_m)
-        heights -= heights.mean()
-        low, high = np.percentile(heights, INNER)
-        text = f"moving tissue: {0.5e6 * (high - low):.0f} um"
+        crept = heights - np.polyval(np.polyfit(t_s, heights, 2), t_s)
         # on a grid of even steps: a loop that was late leaves gaps
         even = np.arange(0.0, t_s[-1], EVERY_NS * 1e-9)
-        power = np.abs(np.fft.rfft(np.interp(even, t_s, heights), PADDED * even.size)) ** 2
+        power = np.abs(np.fft.rfft(np.interp(even, t_s, crept), PADDED * even.size)) ** 2
         rate_hz = np.argmax(power) / (PADDED * even.size * EVERY_NS * 1e-9)
-        turns = rate_hz * t_s[-1]
-        if turns < LEAST_TURNS or not math.isfinite(turns):
-            return f"{text} in {t_s[-1]:.1f} s"
-        return f"{text} at {rate_hz:.1f} Hz"
+        if rate_hz * t_s[-1] < LEAST_TURNS:
+            return f"moving tissue: {_half_way_um(heights):.0f} um in {t_s[-1]:.1f} s"
+        return f"moving tissue: {_half_way_um(crept):.0f} um at {rate_hz:.1f} Hz"
+
+
+def _half_way_um(heights_m: FloatArray) -> float:
+    low, high = np.percentile(heights_m, INNER)
+    return 0.5e6 * float(high - low)

@@ -65,6 +65,8 @@ class ContactController:
     limits : Limits
     tip : TipGeometry, optional
         For its housing, which is not watched without it.
+    under_sample : bool
+        Whether the cell is under the sample.
 
     Attributes
     ----------
@@ -75,10 +77,15 @@ class ContactController:
     """
 
     def __init__(
-        self, parameters: ContactParameters, limits: Limits, tip: TipGeometry | None = None
+        self,
+        parameters: ContactParameters,
+        limits: Limits,
+        tip: TipGeometry | None = None,
+        *,
+        under_sample: bool = False,
     ) -> None:
         limits.check(parameters)
-        self._tip = tip
+        self._tip, self._under_sample = tip, under_sample
         self.parameters, self.limits = parameters, limits
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
@@ -156,7 +163,7 @@ class ContactController:
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
         speed = math.inf if self._is_known(goal) else p.first_speed_m_s(limits.abort_force_n)
-        free = FreeMotion(path, observer, p, limits, speed)
+        free = FreeMotion(path, observer, p, limits, speed, under_sample=self._under_sample)
         if arm is not None and is_finite(arm):
             free.begin(arm)
         self.goal, self._observer, self._free = goal, observer, free

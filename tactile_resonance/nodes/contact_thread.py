@@ -11,7 +11,7 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import ForceError, NodeArm
+from tactile_resonance.contact.interfaces import ForceError, Mount, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -66,7 +66,8 @@ class ContactThread:
         listener: Callable[[Cycle], None],
         failed: Callable[[], None],
     ) -> None:
-        self.controller = ContactController(parameters, limits, tip)
+        under_sample = force.info.mount is Mount.TABLE
+        self.controller = ContactController(parameters, limits, tip, under_sample=under_sample)
         self.error: Exception | None = None
         self.moves = ""
         self._arm, self._force, self._failed = arm, force, failed

@@ -61,6 +61,7 @@ def contact(
     aim=None,
     seed=0,
     tip=None,
+    under_sample=False,
     **bench,
 ):
     touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
@@ -68,7 +69,8 @@ def contact(
     rig = ContactBench(
         tissue, Plane.tilted(height_m, tilt_rad), start, tip=tip or Tip(RADIUS_M), seed=seed, **bench
     )
-    controller = ContactController(parameters, Limits() if limits is None else limits)
+    limits = Limits() if limits is None else limits
+    controller = ContactController(parameters, limits, under_sample=under_sample)
     loop = ContactLoop(rig.arm, rig.force, rig.clock, controller)
     goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
     return Contact(rig, controller, loop, goal)

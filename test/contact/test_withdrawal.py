@@ -127,3 +127,18 @@ def test_broken_source_does_not_keep_the_tip():
     assert result.cause is Cause.FORCE_STUCK
     assert result.retracted
     assert result.zero_change_n is None
+
+
+@pytest.mark.parametrize("under_sample", [True, False])
+def test_force_on_the_way_counts_where_the_cell_is_under_the_sample(under_sample):
+    made = contact(start_m=0.05, under_sample=under_sample)
+    made.loop.start(made.goal)
+    made.run(0.2)
+    assert made.controller.state is State.TRAVEL
+    made.bench.cell.faults.bias_step_n = -0.05  # something is touched, or somebody leans on the dish
+    made.run(0.1)
+    result = made.controller.result
+    assert (result is not None) == under_sample
+    if under_sample:
+        assert result.cause is Cause.SURFACE_EARLY
+        assert "on the way" in result.message
