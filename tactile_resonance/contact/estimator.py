@@ -105,6 +105,8 @@ class ContactFilter:
         Unseen vibration of the tip [m] rms: at stiff tissue it adds to the noise.
     walk_per_sqrt_s : float
         Random walk of ln C [1/sqrt(s)]; that of its rate is five times as large per second.
+    inflation : float
+        By which means of forces scatter more than white noise lets them.
 
     Attributes
     ----------
@@ -123,7 +125,9 @@ class ContactFilter:
         beam_n_per_m: float = hertz.RIGID,
         vibration_m: float = 3e-6,
         walk_per_sqrt_s: float = 0.05,
+        inflation: float = 1.0,
     ) -> None:
+        self._inflation = inflation
         self._noise_n, self._vibration_m = noise_n, vibration_m
         self._beam, self._walk = beam_n_per_m, walk_per_sqrt_s
         mean, covariance = touch_posterior(
@@ -205,7 +209,8 @@ class ContactFilter:
         gain0, gain1, gain2, gain3 = ph0 / spread, ph1 / spread, ph2 / spread, ph3 / spread
         innovation, motion = error / math.sqrt(spread), self._motion
         # the speed is not known when a motion is detected
-        unknown = SPEED_STD_M_S**2 if motion.judge(innovation, self._passed_s) else 0.0
+        seen = motion.judge(innovation / self._inflation, self._passed_s)
+        unknown = SPEED_STD_M_S**2 if seen else 0.0
         self._p = (
             p00 - gain0 * ph0,
             p01 - gain0 * ph1,

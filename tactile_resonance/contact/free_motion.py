@@ -22,9 +22,6 @@ STILL_M_S, STILL_NS = 5e-4, 50_000_000
 TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL = 0.01, 8.0
 """Change of the untared force, near the surface, that is a touch [N]; more where so much is noise."""
 
-SLOWING_M = 2e-4
-"""So far above the highest place of the surface the tip becomes as slow as the touch may be."""
-
 
 class FreeMotion:
     """Leads the tip to where the tissue should begin; of one contact.
@@ -73,6 +70,12 @@ class FreeMotion:
         """With respect to the surface that counts: the goal's, or that which the tip is leaving to turn."""
         turning = self._turning
         return self._path if turning is None or not turning.leaving else turning.departure
+
+    @property
+    def clear_m(self) -> float:
+        """Height above `path` at which the tip is free of what it may have stood on."""
+        standoff_m = self._parameters.standoff_m
+        return standoff_m if self.path is self._path else standoff_m + self._limits.depth_m
 
     def begin(self, arm: ArmSample) -> None:
         """Find the way from where the tip is; ``ValueError`` where there is none."""
@@ -158,9 +161,7 @@ class FreeMotion:
         if place.height_m < -p.search_m:
             text = f"no touch down to {1e3 * p.search_m:g} mm below the expected surface"
             return failed(Cause.SURFACE_MISSING, text)
-        speed = p.approach_speed_m_s
-        if place.height_m < p.early_m + SLOWING_M:
-            speed = min(speed, self._touch_speed_m_s)
+        speed = min(p.approach_speed_m_s, self._touch_speed_m_s)
         if self.told_m is not None:
             speed = min(speed, p.told_speed_m_s)
         return Move(self._path.along_normal(arm, -speed))

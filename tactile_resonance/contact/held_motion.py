@@ -55,7 +55,7 @@ class HeldMotion:
             return ""
         t_s = (np.array(self._times_ns) - self._times_ns[0]) * 1e-9  # (n,)
         heights = np.array(self._heights_m)
-        crept = heights - np.polyval(np.polyfit(t_s, heights, 2), t_s)
+        crept = heights - np.polyval(np.polyfit(t_s, heights, 1), t_s)
         # on a grid of even steps: a loop that was late leaves gaps
         even = np.arange(0.0, t_s[-1], EVERY_NS * 1e-9)
         power = np.abs(np.fft.rfft(np.interp(even, t_s, crept), PADDED * even.size)) ** 2

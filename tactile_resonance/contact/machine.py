@@ -20,6 +20,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.judgement import Judgement
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.move import REST, Move
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.outcome import Outcome
@@ -47,8 +48,8 @@ STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
 """And after these: nor does it go on where it is held."""
 
 
-SUCCEEDED = 10_000
-"""So many places of contacts are kept: near them the tissue is known."""
+SUCCEEDED, KNOWN_SHARE = 10_000, 1.25
+"""So many places of contacts are kept: near them the tissue is known, for forces up to so much larger."""
 
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
@@ -92,7 +93,9 @@ class ContactController:
         self._envelope = Envelope(limits)
         self._observer = Observer(parameters, limits)
         self._outcome = Outcome(self._observer, 0)
-        self._succeeded: deque[Vector] = deque(maxlen=SUCCEEDED)  # where contacts were
+        # where contacts were, and with how much force
+        self._succeeded: deque[tuple[Vector, float]] = deque(maxlen=SUCCEEDED)
+        self._pressed_n = 0.0
         self._height_m = 0.0
         self._state_ns = 0
         self._wish_retract = False
@@ -106,8 +109,10 @@ class ContactController:
     @property
     def motion(self) -> str:
         """How tissue that moves does so under the held tip, in a sentence; empty where it is still."""
-        model = self._observer.model
-        return "" if model is None or not model.moving else self._pressing.motion.describe()
+        model, goal = self._observer.model, self.goal
+        if model is None or not model.moving or goal is None or goal.aim.hold is not HoldMode.FORCE:
+            return ""  # a tip that keeps its place says nothing of the tissue's
+        return self._pressing.motion.describe()
 
     @property
     def estimate(self) -> ContactEstimate | None:
@@ -145,6 +150,8 @@ class ContactController:
         if self.state is not State.IDLE:
             raise ValueError(f"parameters: refused in state {self.state.value}; accepted in idle")
         limits.check(parameters)
+        if parameters.beam_stiffness_n_per_m != self.parameters.beam_stiffness_n_per_m:
+            self._succeeded.clear()  # what was safe with one tip need not be with another
         self.parameters, self.limits = parameters, limits
         self._envelope = Envelope(limits)
 
@@ -172,6 +179,7 @@ class ContactController:
         self._withdrawal = Withdrawal(free, observer, p, limits)
         self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
         self._stays = self._pressed_too_hard = False
+        self._pressed_n = 0.0
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
@@ -306,16 +314,24 @@ class ContactController:
 
     def _is_known(self, goal: ContactGoal) -> bool:
         """Whether a contact near a goal has succeeded."""
-        place_m = vector(goal.touch.position_m)
-        return any(math.dist(place_m, m) <= self.parameters.known_radius_m for m in self._succeeded)
+        most_n = goal.aim.force_n / KNOWN_SHARE
+        return any(force_n >= most_n for _, force_n in self._near(goal))
+
+    def _near(self, goal: ContactGoal) -> list[tuple[Vector, float]]:
+        """Contacts near a goal that have succeeded."""
+        place_m, radius_m = vector(goal.touch.position_m), self.parameters.known_radius_m
+        return [entry for entry in self._succeeded if math.dist(place_m, entry[0]) <= radius_m]
 
     def _remember(self) -> None:
-        """Keep where a contact was that was reached and ended as it should."""
-        result = self.result
-        if self.goal is None or result is None or not result.reached:
+        """Keep where a contact was that ended as it should; where one pressed too hard nothing is known."""
+        goal, result = self.goal, self.result
+        if goal is None or result is None:
             return
-        if result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
-            self._succeeded.append(vector(self.goal.touch.position_m))
+        if result.cause in PRESSING_CAUSES:
+            for entry in self._near(goal):
+                self._succeeded.remove(entry)
+        elif result.reached and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
+            self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
 
     # pieces
 
@@ -328,15 +344,16 @@ class ContactController:
         self._height_m = above = path.height_m(arm)
         if model is not None and self.state in TOUCHING:
             depth = model.surface_m - above
+            self._pressed_n = min(self._pressing.aim_n, model.force_at(above))
             above = -depth
         housing_m = path.housing_m(arm, above)
         return Place(path.normal, self._height_m, depth, path.off_rad(arm), housing_m)
 
     def _enter(self, state: State, now_ns: int) -> None:
         if state is State.RETRACT:
-            result, touched = self.result, self._observer.model is not None
-            aim_n = self.goal.aim.force_n if touched and self.goal is not None else 0.0
-            self._withdrawal.begin(Cause.NONE if result is None else result.cause, aim_n)
+            result = self.result
+            cause = Cause.NONE if result is None else result.cause
+            self._withdrawal.begin(cause, self._pressed_n)
         self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None

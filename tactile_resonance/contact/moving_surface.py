@@ -18,17 +18,21 @@ LEAST, MOST = math.log(1e-11), math.log(2e-4)
 FIRST, LEAST_MOVING = math.log(2e-5), math.log(4e-6)
 """The same when a motion is detected, and at least after it."""
 
-MEAN_OF, SQUARES_OF = 12.0, 100.0
-"""Innovations are averaged over about so many forces, the squares of that mean over so many."""
+MEAN_OF, SLOW_OF, SQUARES_OF = 12.0, 48.0, 100.0
+"""Innovations are averaged over so many forces, and over so many; squares of the first mean over so many."""
 
 LARGEST = 5.0
 """A larger innovation, in deviations, counts as this: one bad force is no motion."""
 
-OF_MEAN = math.sqrt(2 * MEAN_OF - 1)
-"""Deviation of one white innovation over that of their running mean."""
+OF_MEAN, OF_SLOW = math.sqrt(2 * MEAN_OF - 1), math.sqrt(2 * SLOW_OF - 1)
+"""Deviation of one white innovation over those of both means."""
 
-DETECTED, EXCEEDED, MOST_SQUARE = 16.0, 4.0, 25.0
-"""Square of the running mean, in its deviations: a motion; one that is followed too slowly; counted at most."""
+DETECTED, SLOWLY, EXCEEDED, MOST_SQUARE = 36.0, 14.0, 4.0, 25.0
+"""Square of the running mean, in its deviations: a motion; one where the slow mean is as large; one that is
+followed too slowly; counted at most."""
+
+STILL_S = 5.0
+"""So long without need of more than the least intensity the surface counts as still again [s]."""
 
 RISE_PER_S, FALL_PER_S, QUIET_FALL_PER_S = 10.0, 3.0, 20.0
 """Of ln of the intensity: for what the square exceeds; always; more where squares are less than white ones'."""
@@ -58,7 +62,8 @@ class MovingSurface:
     def __init__(self) -> None:
         self.moving = False
         self.acceleration_m_s2 = 0.0
-        self._ln_intensity, self._mean, self._square = LEAST, 0.0, 1.0
+        self._ln_intensity, self._mean, self._slow, self._square = LEAST, 0.0, 0.0, 1.0
+        self._quiet_s = 0.0
         self._learnt_s = self._middle_m = self._middle_n = self._way_m2 = self._speed_m2_s2 = 0.0
 
     @property
@@ -75,16 +80,22 @@ class MovingSurface:
         """Take an innovation, in deviations; return whether it is the one that shows a motion."""
         within = min(LARGEST, max(-LARGEST, innovation))
         self._mean += (within - self._mean) / MEAN_OF
+        self._slow += (within - self._slow) / SLOW_OF
         square = (self._mean * OF_MEAN) ** 2
         if not self.moving:
-            self.moving = square > DETECTED
+            both = min(square, (self._slow * OF_SLOW) ** 2)
+            self.moving = square > DETECTED or both > SLOWLY
             if self.moving:
-                self._ln_intensity = FIRST
+                self._ln_intensity, self._quiet_s = FIRST, 0.0
             return self.moving
         self._square += (square - self._square) / SQUARES_OF
         rate = RISE_PER_S * max(0.0, min(square, MOST_SQUARE) - EXCEEDED) - FALL_PER_S
         rate -= QUIET_FALL_PER_S * max(0.0, 1.0 - self._square)
         self._ln_intensity = min(MOST, max(LEAST_MOVING, self._ln_intensity + rate * dt_s))
+        self._quiet_s = self._quiet_s + dt_s if self._ln_intensity == LEAST_MOVING else 0.0
+        if self._quiet_s > STILL_S:
+            self.moving, self._ln_intensity = False, LEAST
+            self.acceleration_m_s2 = self._learnt_s = 0.0
         return False
 
     def learn(

@@ -42,6 +42,8 @@ class Observer:
         Whether forces are collected for a tare; whether there is a zero.
     sound : bool
         Whether no force of this contact was bad.
+    touched_m : float or None
+        Height of the surface as the first touch showed it.
     noise_n, bias_std_n : float
         Of one force and of the bias, from the last tare [N].
     """
@@ -55,6 +57,7 @@ class Observer:
         self.model: ContactFilter | None = None
         self.taring = False
         self.tared, self.sound = False, True
+        self.touched_m: float | None = None
         self._unloaded: list[WrenchSample] = []
         self.noise_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
@@ -97,7 +100,7 @@ class Observer:
 
     def seek_touch(self) -> None:
         """Forget the contact and look for a touch."""
-        self.model = None
+        self.model = self.touched_m = None
         self._window.clear()
         self._detector = TouchDetector(self._inflation * self.noise_n, self.bias_std_n)
 
@@ -157,7 +160,10 @@ class Observer:
             noise_n=self.noise_n,
             beam_n_per_m=self._parameters.beam_n_per_m,
             vibration_m=self._parameters.arm_vibration_m,
+            inflation=self._inflation,
         )
+        if self.touched_m is None:
+            self.touched_m = self.model.surface_m
         self._model_ns = time_ns
         return self.model
 

@@ -328,10 +328,10 @@ class Limits:
             value = getattr(parameters, name)
             require(value <= limit, name, value, f"at most the limit {limit}")
         p = parameters
-        slow_m, way_m = p.early_m + p.search_m, p.standoff_m + p.search_m
+        way_m = p.standoff_m + p.search_m
         speed = min(p.approach_speed_m_s, p.first_speed_m_s(self.abort_force_n))
-        least = slow_m / speed + (way_m - slow_m) / p.approach_speed_m_s
-        need = f"{least:.3g} s or more for {1e3 * way_m:g} mm, {1e3 * slow_m:g} of them at {speed:.3g} m/s"
+        least = way_m / speed
+        need = f"{least:.3g} s or more for {1e3 * way_m:g} mm at {speed:.3g} m/s"
         require(self.approach_s >= least, "approach_s", self.approach_s, need)
 
 

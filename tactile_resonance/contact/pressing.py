@@ -42,6 +42,7 @@ class Pressing:
 
     Attributes
     ----------
+    aim_n : float
     touched_ns : int
         When contact was found.
     motion : HeldMotion
@@ -58,6 +59,7 @@ class Pressing:
         touch_speed_m_s: float = math.inf,
     ) -> None:
         self._touch_speed_m_s = touch_speed_m_s
+        self.aim_n = goal.aim.force_n
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
@@ -98,11 +100,9 @@ class Pressing:
                 model, place.height_m, pending, self._aim.force_n, p, holding=holding
             )
         most = deepest = p.press_speed_m_s
-        if not holding:
+        if self._touch_speed_m_s < most:
             # what stiffens more than Hertz says is not gone into further
-            deepest = min(most, self._touch_speed_m_s)
-            if model.surprise > STIFFENS and self._touch_speed_m_s < most:
-                deepest = 0.0
+            deepest = 0.0 if model.surprise > STIFFENS else most if holding else self._touch_speed_m_s
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         reached = model.estimate(place.height_m) if to is State.HOLD else None
         return Move(twist, to, estimate=reached)

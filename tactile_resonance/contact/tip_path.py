@@ -107,9 +107,16 @@ class TipPath:
 
     # twists in the base
 
-    def lift(self, arm: ArmSample, parameters: ContactParameters, share: float = 1.0) -> Six:
-        """Straight up to the standoff, neither along the surface nor turning, at a share of its speed."""
-        left = max(0.0, parameters.standoff_m - self.height_m(arm))
+    def lift(
+        self,
+        arm: ArmSample,
+        parameters: ContactParameters,
+        height_m: float | None = None,
+        share: float = 1.0,
+    ) -> Six:
+        """Straight up to a height, the standoff by default, neither along the surface nor turning."""
+        to_m = parameters.standoff_m if height_m is None else height_m
+        left = max(0.0, to_m - self.height_m(arm))
         p = parameters
         speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
         return *scaled(max(share * speed, 1e-4), self.normal), *ZERO

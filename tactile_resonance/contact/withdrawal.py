@@ -32,15 +32,15 @@ LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.9
 """Speed with which the surface is left, until so far above it, once less than this share of the
 force is pressed with."""
 
-FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 5e-4, 0.08, 4e-4, 2e-3
+FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 1e-3, 0.08, 1e-3, 2e-3
 """Speed of a tip that is pulled too hard, until its mean force has come to what it is, the way after that, and
 growth of the pull on it that is no zero."""
 
 LEFT_N, NOISES = 2e-3, 5.0
 """Force at the standoff that is looked into [N], or so many deviations of the mean of 50 ms."""
 
-BEYOND_M_S, STEP_M, BEYOND_M = 5e-3, 1e-3, 0.02
-"""Beyond the standoff: speed, way between two means that are compared, and how far."""
+BEYOND_M_S, STEP_S, BEYOND_M = 5e-3, 0.2, 0.02
+"""Beyond the standoff: speed, length of the means that are compared, and how far."""
 
 
 class Withdrawal:
@@ -72,6 +72,8 @@ class Withdrawal:
         self._smooth_n = math.nan
         self._felt_s, self._felt_from = 0.0, (0.0, 0.0)  # height and force
         self._step: tuple[float, list[float]] | None = None  # where it begins, and its forces
+        self._left_n = math.nan  # at the standoff
+        self._zero_moved = False  # once in a contact
         self._before_n = math.nan  # mean of the last step
 
     def begin(self, cause: Cause, touched_n: float) -> None:
@@ -81,33 +83,29 @@ class Withdrawal:
         self._pressed_n = PRESSED * touched_n
         now_n = self._observer.watch.force_n[2]
         self._smooth_n = now_n
-        # what it has felt stays: a tip that was held is not pulled harder on request
-        self._step = None
-        model = self._observer.model
+        self._step, self._felt_s = None, 0.0
+        model, touched_m = self._observer.model, self._observer.touched_m
         if self._least_n is None and self._observer.tared:
-            self._surface_m = -math.inf if model is None else model.surface_m
+            if model is not None and touched_m is not None:
+                self._surface_m = max(model.surface_m, touched_m)
             # the force goes down by what is pressed with, wherever the zero is now
             self._least_n = min(0.0, now_n - max(touched_n, now_n)) - self._limits.pull_force_n
 
     def step(self, now_ns: int, since_s: float, arm: ArmSample, place: Place) -> Move:
         """One cycle; `since_s` has gone by in this state."""
         if since_s > self._limits.retract_s:
-            return failed(Cause.TIME, "retraction took too long")
+            return failed(Cause.HELD, f"not free within retract_s = {self._limits.retract_s:g} s")
         watch, p = self._observer.watch, self._parameters
         believed = self._believed and self._observer.sound
         believed = believed and watch.age_s(now_ns) <= self._limits.force_age_s
         force_n = watch.force_n[2]
-        self._smooth_n += (force_n - self._smooth_n) * p.period_s / SMOOTH_S
-        if self._step is None and p.standoff_m - place.height_m >= ARRIVED_M:
+        self._smooth_n += (force_n - self._smooth_n) * -math.expm1(-p.period_s / SMOOTH_S)
+        clear_m = self._free.clear_m
+        if self._step is None and clear_m - place.height_m >= ARRIVED_M:
             share = self._share(place.height_m) if believed else 1.0
             if share is None:
-                return failed(
-                    Cause.HELD,
-                    f"{-1e3 * self._smooth_n:.1f} mN pull on the tip {1e3 * place.height_m:.2f} mm above the "
-                    f"surface and grow while it is drawn back, accepted are "
-                    f"{-1e3 * (self._least_n or 0.0):.1f} mN: free it, then ask it to retract",
-                )
-            return Move(self._free.path.lift(arm, p, share))
+                return self._held(place.height_m)
+            return Move(self._free.path.lift(arm, p, clear_m, share))
         if not believed:
             return Move(None, State.IDLE)
         return self._leave(arm, place.height_m, force_n)
@@ -133,12 +131,26 @@ class Withdrawal:
         if self._felt_s <= FEEL_NOT_S or height_m < self._surface_m:
             self._felt_from = height_m, self._smooth_n
         begun_m, begun_n = self._felt_from
-        if self._smooth_n < begun_n - GROWS_N:
+        if self._smooth_n < begun_n - self._grown_n():
             return None
         if height_m - begun_m > FEEL_M:  # the zero has moved
+            if self._zero_moved:  # it does not do so again and again
+                return None
+            self._zero_moved = True
             self._least_n = self._smooth_n - self._limits.pull_force_n
             self._felt_s = 0.0
         return slowest
+
+    def _held(self, height_m: float) -> Move:
+        text = f"{-1e3 * self._smooth_n:.1f} mN pull on the tip {1e3 * height_m:.2f} mm above the surface and"
+        least_mn = -1e3 * (self._least_n or 0.0)
+        text = f"{text} grow while it is drawn back, accepted are {least_mn:.1f} mN"
+        return failed(Cause.HELD, f"{text}: free it, then ask it to retract")
+
+    def _grown_n(self) -> float:
+        """Growth of a pull that is no noise of the smoothed force."""
+        noise_n = self._observer.noise_n * math.sqrt(self._parameters.period_s / SMOOTH_S / 2)
+        return max(GROWS_N, NOISES * noise_n)
 
     def _leave(self, arm: ArmSample, height_m: float, force_n: float) -> Move:
         """At the standoff: idle where nothing presses or pulls, else on until it no longer changes."""
@@ -152,16 +164,24 @@ class Withdrawal:
                 self.zero_n = mean_n if observer.tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), math.nan
+            self._felt_s = 0.0
+        self._felt_s += self._parameters.period_s
+        if self._felt_s <= FEEL_NOT_S:
+            self._left_n = self._smooth_n
+        if observer.tared and self._smooth_n < self._left_n - self._grown_n():
+            return self._held(height_m)
         begun_m, forces_n = self._step
         forces_n.append(force_n)
-        if height_m - begun_m >= STEP_M and len(forces_n) > 1:
+        if len(forces_n) * self._parameters.period_s >= STEP_S and len(forces_n) > 1:
             now_n, std_n = mean(forces_n), stdev(forces_n)
             change_n = abs(now_n - self._before_n)
+            if height_m - begun_m < BEYOND_M_S * STEP_S / 4:
+                return failed(Cause.HELD, f"{1e3 * now_n:.1f} mN at the standoff, and no room above it")
             if change_n < max(LEFT_N / 2, NOISES * std_n * math.sqrt(2 / len(forces_n))):
                 self.zero_n = now_n if observer.tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), now_n
-        if height_m - self._parameters.standoff_m > BEYOND_M:
+        if height_m - self._free.clear_m > BEYOND_M:
             if not observer.tared:  # a source that is not steady enough for a zero says no more
                 return Move(None, State.IDLE)
             text = f"the force still changes {1e3 * height_m:.0f} mm above the surface"

@@ -110,7 +110,7 @@ def test_fault_of_the_force_stops_the_tip_and_draws_it_back(name, state):
     before = made.controller.state
     inject(made)
     at = len(made.force_n)
-    made.run_until(State.IDLE, 4.0)
+    made.run_until(State.IDLE, 6.0)
     result = made.controller.result
     assert max(made.force_n) < HARD_N
     if before is State.RETRACT:  # by position alone, or feeling its way

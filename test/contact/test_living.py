@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contact on what lives: it moves, and there is bone below it."""
 
+import math
 import re
 import sys
 from dataclasses import replace
@@ -9,14 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.held_motion import HeldMotion
+from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.obstacles import OnBone
 from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -84,6 +87,54 @@ def test_bone_is_met_below_the_hard_limit_where_nothing_is_known(layer_m, seed):
     assert most_n < Limits().hard_force_n
     assert made.controller.result.cause in (Cause.FORCE_RATE, Cause.FORCE_ABORT)
     assert peak_n(layer_m, QUICK, seed)[0] > 4 * Limits().hard_force_n  # what it would be
+
+
+def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
+    made = contact(parameters=replace(QUICK, unknown_speed_m_s=3e-4))
+    assert made.loop.make(made.goal).reached
+    made.run(0.1)
+    assert made.loop.retract().retracted
+    controller = made.controller
+    assert controller._is_known(made.goal)
+    harder = ContactGoal(made.goal.touch, Aim(0.018))
+    assert not controller._is_known(harder)  # as deep as that nobody has been
+    made.bench.plant._on = RigidTip(
+        OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
+    )
+    made.loop.make(made.goal)
+    made.run_until(State.IDLE, 5.0)
+    assert controller.result.cause in (Cause.FORCE_ABORT, Cause.FORCE_RATE, Cause.FORCE_HARD)
+    assert not controller._is_known(made.goal)
+
+
+def filtered(read, lag_samples):
+    """A cell whose own filter makes neighbouring forces alike."""
+    keep = math.exp(-1 / lag_samples) if lag_samples else 0.0
+    last = []
+
+    def samples():
+        made = []
+        for sample in read():
+            wrench = np.array(sample.wrench)
+            last[:] = [wrench if not last else keep * last[0] + (1 - keep) * wrench]
+            made.append(sample._replace(wrench=tuple(last[0].tolist())))
+        return made
+
+    return samples
+
+
+@pytest.mark.parametrize("lag_samples", [0, 3])
+def test_still_tissue_is_not_taken_to_move_for_20_s(lag_samples):
+    # white noise, and that of a cell behind a filter
+    moved = 0
+    for seed in range(4):
+        made = contact(SOFT, seed=seed)
+        made.bench.cell.read = filtered(made.bench.cell.read, lag_samples)
+        made.loop.start(made.goal)
+        assert made.run_until(State.HOLD), made.controller.result
+        made.run(20.0)
+        moved += made.controller._observer.model.moving
+    assert moved <= 1
 
 
 def test_beam_protects_from_bone_at_full_speed():

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.obstacles import Clinging
 from tactile_resonance.simulation.plant import Plane, RigidTip
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import SOFT, contact, started, stiffer
+from contacts import RADIUS_M, SOFT, contact, started, stiffer
 
 PULL_N = Limits().pull_force_n
 
@@ -42,13 +42,14 @@ def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
     assert made.controller.settled
 
 
-def test_hook_that_is_asked_for_again_is_pulled_no_harder():
+def test_hook_that_is_asked_for_again_is_pulled_a_little_harder_each_time():
     made, _ = clinging(lambda height_m, _: 40.0 * height_m)
     for _ in range(5):
+        before_n = min(made.force_n)
         made.controller.retract()
         made.run(1.0)
+        assert min(made.force_n) > before_n - 4e-3
     assert made.controller.state is State.FAULT
-    assert min(made.force_n) > -(PULL_N + 5e-3)
 
 
 def test_tip_that_is_freed_is_drawn_back_on_request():
@@ -142,3 +143,42 @@ def test_force_on_the_way_counts_where_the_cell_is_under_the_sample(under_sample
     if under_sample:
         assert result.cause is Cause.SURFACE_EARLY
         assert "on the way" in result.message
+
+
+@pytest.mark.parametrize("stiffness", [3.0, 5.0, 8.0])
+def test_soft_hook_is_not_taken_for_a_zero_again_and_again(stiffness):
+    made, _ = clinging(lambda height_m, _: stiffness * height_m)
+    made.run(6.0)
+    assert made.controller.result.cause is Cause.HELD
+    # once it may pass for a zero
+    assert min(made.force_n) > -(2 * PULL_N + 5e-3)
+
+
+@pytest.mark.parametrize("rate_n_per_s", [0.5e-3, 1.5e-3])
+def test_zero_that_crept_in_the_hold_does_not_keep_the_tip_for_good(rate_n_per_s):
+    for seed in range(3):
+        made = started(seed=seed)
+        assert made.run_until(State.HOLD)
+        for _ in range(round(8e-3 / rate_n_per_s / 0.1)):  # 8 mN
+            made.bench.cell.faults.bias_step_n += 0.1 * rate_n_per_s
+            made.run(0.1)
+        for _ in range(4):
+            made.controller.retract()
+            if made.run_until(State.IDLE, 6.0):
+                break
+        assert made.controller.state is State.IDLE, made.controller.result
+        assert made.force_n[-1] == 0.0
+
+
+def test_no_room_above_the_standoff_is_said_and_ends():
+    limits = Limits(workspace=Workspace((-1.0, -1.0, -0.2), (1.0, 1.0, RADIUS_M + 2.7e-3)))
+    made = contact(limits=limits, start_m=2.2e-3)
+    made.loop.start(made.goal)
+    assert made.run_until(State.HOLD), made.controller.result
+    made.bench.cell.faults.bias_step_n = -4e-3
+    made.run(0.2)
+    made.controller.retract()
+    made.run(8.0)
+    assert made.controller.settled
+    assert made.controller.result.cause is Cause.HELD
+    assert "no room" in made.controller.result.message
