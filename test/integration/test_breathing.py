@@ -77,11 +77,12 @@ def breathe(folder, motion, blocks, more=""):
 
 
 def test_tissue_that_breathes_is_measured_and_its_motion_stated(domain, tmp_path):
-    found = breathe(tmp_path, MOTION, blocks=4)
+    # a breath that is never quiet: of any 1.6 s of it a quarter of the way is seen, in means of a block
+    found = breathe(tmp_path, {**MOTION, "breath_power": 1}, blocks=4)
     assert len(found.done) == 3
     # it did move: the tip followed the breath of a flat surface, creep is 20 um
     heights = [r.tip_pose.pose.position.z for n in range(3) for r in found.records(n)]
-    assert 0.3 * MOTION["breath_m"] < np.ptp(heights) < 2 * MOTION["breath_m"]
+    assert 0.2 * MOTION["breath_m"] < np.ptp(heights) < 2 * MOTION["breath_m"]
     assert len(heights) == 3 * 4
     page = (found.run.path / "report.html").read_text()
     assert "rms of the force, smallest to largest [mN]" in page
