@@ -12,7 +12,7 @@ from tactile_resonance.contact.held_motion import HeldMotion
 from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
 from tactile_resonance.contact.move import Move, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import TipPath
@@ -103,6 +103,10 @@ class Pressing:
         if self._touch_speed_m_s < most:
             # what stiffens more than Hertz says is not gone into further
             deepest = 0.0 if model.surprise > STIFFENS else most if holding else self._touch_speed_m_s
+        if holding:
+            # stiff tissue is not followed faster than the arm can be stopped in before it is too much
+            slope, _ = model.slope_at(model.depth_for(self.aim_n))
+            deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         reached = model.estimate(place.height_m) if to is State.HOLD else None
         return Move(twist, to, estimate=reached)
