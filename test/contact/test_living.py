@@ -165,7 +165,7 @@ def test_speed_that_a_beam_allows_is_that_at_which_it_bends_to_half_of_the_abort
 
 
 def test_stiff_tissue_is_not_followed_faster_than_the_arm_can_be_stopped():
-    slow = replace(QUICK, approach_speed_m_s=1e-3, press_speed_m_s=2e-3)
+    slow = replace(QUICK, approach_speed_m_s=1e-3, press_speed_m_s=4e-3)
     made = contact(stiffer(SOFT, 30.0), parameters=slow)  # 260 kPa at once, some 280 N/m at 1 cN
     made.loop.start(made.goal)
     assert made.run_until(State.HOLD), made.controller.result
@@ -175,5 +175,5 @@ def test_stiff_tissue_is_not_followed_faster_than_the_arm_can_be_stopped():
     at = len(made.speed_m_s)
     made.run(0.06)
     most_m_s = Limits().abort_force_n / 2 / (stiffness * REACTION_S)
-    assert most_m_s < 2e-3
+    assert most_m_s < 0.8 * slow.press_speed_m_s
     assert 0.5 * most_m_s < -min(made.speed_m_s[at:]) < 1.3 * most_m_s
