@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.contact_living import BONE_ROWS, run_case
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.held_motion import HeldMotion
 from tactile_resonance.contact.law import Aim
-from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import Tip
@@ -23,7 +24,7 @@ from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, lower, stiffer
+from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, stiffer
 
 HEART = SurfaceMotion(heart_m=4e-4, heart_hz=1.2)
 BREATH = SurfaceMotion(breath_m=1e-3, breath_hz=0.25)
@@ -164,16 +165,7 @@ def test_speed_that_a_beam_allows_is_that_at_which_it_bends_to_half_of_the_abort
     assert ContactParameters().first_speed_m_s(0.03) == ContactParameters().unknown_speed_m_s
 
 
-def test_stiff_tissue_is_not_followed_faster_than_the_arm_can_be_stopped():
-    slow = replace(QUICK, approach_speed_m_s=1e-3, press_speed_m_s=4e-3)
-    made = contact(stiffer(SOFT, 30.0), parameters=slow)  # 260 kPa at once, some 280 N/m at 1 cN
-    made.loop.start(made.goal)
-    assert made.run_until(State.HOLD), made.controller.result
-    made.run(0.1)
-    stiffness = made.controller.estimate.stiffness_n_per_m
-    lower(made.bench, 3e-4)  # it gives way
-    at = len(made.speed_m_s)
-    made.run(0.06)
-    most_m_s = Limits().abort_force_n / 2 / (stiffness * REACTION_S)
-    assert most_m_s < 0.8 * slow.press_speed_m_s
-    assert 0.5 * most_m_s < -min(made.speed_m_s[at:]) < 1.3 * most_m_s
+def test_bone_that_is_held_by_chance_is_not_followed_as_tissue_that_moves():
+    # a case in which the arm's vibration brings the force within its tolerance on 10 MPa
+    bare = next(row for row in BONE_ROWS if row.name == "bare, rigid")
+    assert run_case((bare, 36, "")).peak_n < Limits().hard_force_n
