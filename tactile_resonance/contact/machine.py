@@ -45,11 +45,11 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 """After these the tip is not drawn back: the arm moves again only on request."""
 
 STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
-"""And after these: nor does it go on where it is held."""
-
+"""After these the tip stays where it is until it is asked to retract."""
 
 SUCCEEDED, KNOWN_SHARE = 10_000, 1.25
-"""So many places of contacts are kept: near them the tissue is known, for forces up to so much larger."""
+"""Places of successful contacts that are kept, at most. Near one the tissue counts as known for forces up to
+its own times the second."""
 
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
@@ -122,7 +122,7 @@ class ContactController:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing more happens by itself: idle, or in a fault that the tip stays in."""
+        """Whether nothing more happens without a request: idle, or in a fault after which the tip stays."""
         stays = self.state is State.FAULT and self._stays and not self._wish_retract
         return stays or self.state is State.IDLE
 
@@ -219,13 +219,14 @@ class ContactController:
         fault : ArmError or ForceError, optional
             What a device raised in this cycle.
         """
-        if self.state is State.IDLE or self.goal is None:
+        goal = self.goal
+        if self.state is State.IDLE or goal is None:
             return None
         place = None
         if arm is not None and is_finite(arm):  # of one whose place is not finite nothing else is known
             if self.state is State.TRAVEL and not self._free.begun:
                 self._begin_way(now_ns, arm)
-            place = self._place(arm)
+            place = self._place(goal, arm)
         breach = self._judgement.breach(
             self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
         )
@@ -237,8 +238,8 @@ class ContactController:
             self._heed_wish(now_ns, breach)
         if arm is None or place is None:
             return self._stop()
-        move = self._act(now_ns, arm, place)
-        self._follow(move, now_ns)
+        move = self._act(goal, now_ns, arm, place)
+        self._follow(goal, move, now_ns)
         if move.twist is None:
             return self._stop()
         twist = self._envelope.bound(move.twist, arm.position_m, place)
@@ -273,7 +274,7 @@ class ContactController:
         elif now_ns - self._wish_ns > WISH_NS:
             self._wish_retract, self._wish_ns = False, None
 
-    def _act(self, now_ns: int, arm: ArmSample, place: Place) -> Move:
+    def _act(self, goal: ContactGoal, now_ns: int, arm: ArmSample, place: Place) -> Move:
         """What the present state wishes."""
         if self.state is State.APPROACH:
             move = self._free.approach(arm, place)
@@ -281,7 +282,7 @@ class ContactController:
                 return move
             self._pressing.begin(now_ns)
             self._enter(State.CONTACT, now_ns)
-            place = self._place(arm)
+            place = self._place(goal, arm)
         if self.state in TOUCHING:
             return self._pressing.step(now_ns, self.state, arm, place)
         if self.state is State.TRAVEL:
@@ -295,7 +296,7 @@ class ContactController:
         after_s = 0.0 if self._pressed_too_hard else RETRACT_AFTER_S
         return REST if self._stays or since_s < after_s else Move(None, State.RETRACT)
 
-    def _follow(self, move: Move, now_ns: int) -> None:
+    def _follow(self, goal: ContactGoal, move: Move, now_ns: int) -> None:
         """Go over to the state that follows."""
         if move.breach is not None:
             self._fail(move.breach, now_ns)
@@ -309,7 +310,7 @@ class ContactController:
                 count = self.limits.lost_s / self.parameters.period_s
                 std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
                 self._outcome.drawn_back(self._withdrawal.zero_n, std_n)
-                self._remember()
+                self._remember(goal)
             self._enter(move.to, now_ns)
 
     def _is_known(self, goal: ContactGoal) -> bool:
@@ -322,16 +323,16 @@ class ContactController:
         place_m, radius_m = vector(goal.touch.position_m), self.parameters.known_radius_m
         return [entry for entry in self._succeeded if math.dist(place_m, entry[0]) <= radius_m]
 
-    def _remember(self) -> None:
-        """Keep where a contact was that ended as it should; where one pressed too hard nothing is known."""
-        goal, result = self.goal, self.result
-        if goal is None or result is None:
-            return
-        if result.cause in PRESSING_CAUSES:
-            for entry in self._near(goal):
-                self._succeeded.remove(entry)
-        elif result.reached and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
+    def _remember(self, goal: ContactGoal) -> None:
+        """Keep where a contact was that ended as it should."""
+        result = self.result
+        if result is not None and result.reached and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
             self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
+
+    def _forget(self, goal: ContactGoal) -> None:
+        """Near a contact that pressed too hard nothing is known, whatever becomes of it."""
+        for entry in self._near(goal):
+            self._succeeded.remove(entry)
 
     # pieces
 
@@ -339,12 +340,12 @@ class ContactController:
         """How long the state has lasted [s]."""
         return (now_ns - self._state_ns) * 1e-9
 
-    def _place(self, arm: ArmSample) -> Place:
+    def _place(self, goal: ContactGoal, arm: ArmSample) -> Place:
         path, model, depth = self._free.path, self._observer.model, None
         self._height_m = above = path.height_m(arm)
         if model is not None and self.state in TOUCHING:
             depth = model.surface_m - above
-            self._pressed_n = min(self._pressing.aim_n, model.force_at(above))
+            self._pressed_n = min(goal.aim.force_n, model.force_at(above))
             above = -depth
         housing_m = path.housing_m(arm, above)
         return Place(path.normal, self._height_m, depth, path.off_rad(arm), housing_m)
@@ -362,6 +363,8 @@ class ContactController:
         """Note why, and stop."""
         self._stays = breach.cause in STAYING_CAUSES
         self._pressed_too_hard = breach.cause in PRESSING_CAUSES
+        if self._pressed_too_hard and self.goal is not None:
+            self._forget(self.goal)
         self._end(breach, now_ns)
         self._enter(State.FAULT, now_ns)
 

@@ -42,7 +42,6 @@ class Pressing:
 
     Attributes
     ----------
-    aim_n : float
     touched_ns : int
         When contact was found.
     motion : HeldMotion
@@ -59,7 +58,6 @@ class Pressing:
         touch_speed_m_s: float = math.inf,
     ) -> None:
         self._touch_speed_m_s = touch_speed_m_s
-        self.aim_n = goal.aim.force_n
         self._aim, self._path, self._observer = goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
@@ -105,7 +103,7 @@ class Pressing:
             deepest = 0.0 if model.surprise > STIFFENS else most if holding else self._touch_speed_m_s
         if holding:
             # stiff tissue is not followed faster than the arm can be stopped in before it is too much
-            slope, _ = model.slope_at(model.depth_for(self.aim_n))
+            slope, _ = model.slope_at(model.depth_for(self._aim.force_n))
             deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         reached = model.estimate(place.height_m) if to is State.HOLD else None

@@ -112,14 +112,14 @@ class TipPath:
         arm: ArmSample,
         parameters: ContactParameters,
         height_m: float | None = None,
-        share: float = 1.0,
+        most_m_s: float = math.inf,
     ) -> Six:
         """Straight up to a height, the standoff by default, neither along the surface nor turning."""
         to_m = parameters.standoff_m if height_m is None else height_m
         left = max(0.0, to_m - self.height_m(arm))
         p = parameters
         speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
-        return *scaled(max(share * speed, 1e-4), self.normal), *ZERO
+        return *scaled(max(min(most_m_s, speed), 1e-4), self.normal), *ZERO
 
     def travel(self, arm: ArmSample, parameters: ContactParameters) -> Six:
         """Straight to the standoff; what little is left is turned meanwhile."""

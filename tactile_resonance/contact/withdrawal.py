@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drawing the tip back: whether it comes free is judged by force, where force can be believed.
 
-What clings to the tip (a film, a fibre, tissue that sticks) pulls the harder the further the tip goes; a zero
-that has moved does not. So the tip goes the slower the more it is pulled, and where the pull is beyond what
-is accepted it feels its way: if the pull grows the tip is held, if not it was the zero. At the standoff what
-is still there is told apart in the same way: tissue that presses is left behind, a zero is not.
+What clings to the tip pulls harder the further it goes (a fibre, tissue that sticks) or the faster it goes (a
+film); a zero that has moved does neither. So the tip leaves the surface slowly, goes slower the more it is
+pulled, and where the pull is beyond what is accepted it moves a little further: if the pull grows, the tip is
+held; if not, the zero has moved. A force that is left at the standoff is distinguished in the same way:
+tissue that presses is left behind, a zero is not.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.move import Move, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M
@@ -28,11 +29,14 @@ BLIND_CAUSES = frozenset({Cause.FORCE_STALE, Cause.FORCE_SOURCE})
 SMOOTH_S = 0.008
 """Forces are averaged over about so long [s]."""
 
-LEAVE_M_S, LEAVE_M, PRESSED = 5e-3, 5e-4, 0.9
-"""Speed with which the surface is left, until so far above it, once less than this share of the
-force is pressed with."""
+LEAVE_M_S, LEAVE_M, LEAVE_M_S2, PRESSED = 3.5e-3, 2e-4, 0.08, 1.5
+"""Speed with which the surface is left until so far above it, and its growth from there on [m/s2]; faster
+only while more than this multiple of the force is pressed with."""
 
-FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 1e-3, 0.08, 1e-3, 2e-3
+CLINGS, SLOW_M_S, SLOW_N = 0.3, 6e-3, 3e-3
+"""A pull beyond this share of the last limits the speed, from the second at no pull to none at the last."""
+
+FEEL_M_S, FEEL_NOT_S, FEEL_M, GROWS_N = 1e-3, 0.08, 1e-3, 2.5e-3
 """Speed of a tip that is pulled too hard, until its mean force has come to what it is, the way after that, and
 growth of the pull on it that is no zero."""
 
@@ -69,8 +73,11 @@ class Withdrawal:
         self.zero_n: float | None = None
         self._least_n: float | None = None  # force along the normal that is accepted
         self._surface_m = -math.inf  # where the tissue was touched
-        self._smooth_n = math.nan
-        self._felt_s, self._felt_from = 0.0, (0.0, 0.0)  # height and force
+        self._smooth_n = self._pressed_n = math.nan
+        self._believed = self._must_leave = False
+        self._speed_m_s = LEAVE_M_S
+        self._felt_s = 0.0  # with the slowest speed
+        self._felt_from: tuple[float, float] | None = None  # height and force
         self._step: tuple[float, list[float]] | None = None  # where it begins, and its forces
         self._left_n = math.nan  # at the standoff
         self._zero_moved = False  # once in a contact
@@ -81,9 +88,12 @@ class Withdrawal:
         self._believed = cause not in BLIND_CAUSES
         self._must_leave = cause in (Cause.SURFACE_EARLY, Cause.TARE)
         self._pressed_n = PRESSED * touched_n
-        now_n = self._observer.watch.force_n[2]
-        self._smooth_n = now_n
-        self._step, self._felt_s = None, 0.0
+        watch = self._observer.watch
+        self._smooth_n = now_n = watch.force_n[2]
+        self._step, self._felt_from, self._felt_s = None, None, 0.0
+        if self._least_n is not None and watch.mean_n is not None:
+            # asked for again: the tip stands, and its force is steady
+            self._smooth_n, self._felt_s = watch.mean_n, FEEL_NOT_S
         model, touched_m = self._observer.model, self._observer.touched_m
         if self._least_n is None and self._observer.tared:
             if model is not None and touched_m is not None:
@@ -102,34 +112,40 @@ class Withdrawal:
         self._smooth_n += (force_n - self._smooth_n) * -math.expm1(-p.period_s / SMOOTH_S)
         clear_m = self._free.clear_m
         if self._step is None and clear_m - place.height_m >= ARRIVED_M:
-            share = self._share(place.height_m) if believed else 1.0
-            if share is None:
+            most_m_s = self._speed(place.height_m) if believed else p.retract_speed_m_s
+            if most_m_s is None:
                 return self._held(place.height_m)
-            return Move(self._free.path.lift(arm, p, clear_m, share))
+            return Move(self._free.path.lift(arm, p, clear_m, most_m_s))
         if not believed:
             return Move(None, State.IDLE)
         return self._leave(arm, place.height_m, force_n)
 
-    def _share(self, height_m: float) -> float | None:
-        """Of its speed with which the tip goes up; None where it is held."""
+    def _speed(self, height_m: float) -> float | None:
+        """Largest speed with which the tip goes up [m/s]; None where it is held."""
         if self._least_n is None:
-            return 1.0
-        most, p = 1.0, self._parameters
-        # a beam bends by so much more before what clings to the ball pulls as hard as it may
-        leave_m = LEAVE_M + self._limits.pull_force_n / p.beam_n_per_m
-        if self._smooth_n < self._pressed_n and height_m < self._surface_m + leave_m:
-            # and takes so long to pull half as hard
-            bends_m_s = self._limits.pull_force_n / 2 / (p.beam_n_per_m * REACTION_S)
-            most = min(1.0, max(LEAVE_M_S, bends_m_s) / p.retract_speed_m_s)
-        room = (self._smooth_n - self._least_n) / self._limits.pull_force_n
-        slowest = FEEL_M_S / p.retract_speed_m_s
-        if room > 0:
-            self._felt_s = 0.0
-            return max(slowest, most * min(1.0, room))
-        self._felt_s += p.period_s
+            return self._parameters.retract_speed_m_s
+        p, pull_n = self._parameters, self._limits.pull_force_n
+        fastest = p.retract_speed_m_s
+        # a beam bends by so much more before what clings to the ball is felt
+        leave_m = LEAVE_M + SLOW_N / p.beam_n_per_m
+        room_n = self._smooth_n - self._least_n
+        pulled = (pull_n - room_n) / SLOW_N
+        if self._smooth_n > self._pressed_n:
+            self._speed_m_s = fastest
+        elif height_m < self._surface_m + leave_m:
+            self._speed_m_s = LEAVE_M_S
+        else:
+            self._speed_m_s += LEAVE_M_S2 * p.period_s
+        if pulled > CLINGS:  # it may pull the harder the faster the tip goes
+            self._speed_m_s = min(self._speed_m_s, SLOW_M_S * (1.0 - pulled))
+        self._speed_m_s = min(max(FEEL_M_S, self._speed_m_s), fastest)
+        slowest = self._speed_m_s == FEEL_M_S
+        self._felt_s = self._felt_s + p.period_s if slowest else 0.0
         # below the surface what it still presses with goes, too
-        if self._felt_s <= FEEL_NOT_S or height_m < self._surface_m:
+        early = room_n > 0 or self._felt_s <= FEEL_NOT_S or height_m < self._surface_m
+        if early or self._felt_from is None:
             self._felt_from = height_m, self._smooth_n
+            return self._speed_m_s
         begun_m, begun_n = self._felt_from
         if self._smooth_n < begun_n - self._grown_n():
             return None
@@ -138,8 +154,7 @@ class Withdrawal:
                 return None
             self._zero_moved = True
             self._least_n = self._smooth_n - self._limits.pull_force_n
-            self._felt_s = 0.0
-        return slowest
+        return FEEL_M_S
 
     def _held(self, height_m: float) -> Move:
         text = f"{-1e3 * self._smooth_n:.1f} mN pull on the tip {1e3 * height_m:.2f} mm above the surface and"

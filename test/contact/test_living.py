@@ -18,7 +18,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import Tip
-from tactile_resonance.simulation.obstacles import OnBone
+from tactile_resonance.simulation.obstacles import Clinging, OnBone
 from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
@@ -105,6 +105,23 @@ def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 5.0)
     assert controller.result.cause in (Cause.FORCE_ABORT, Cause.FORCE_RATE, Cause.FORCE_HARD)
+    assert not controller._is_known(made.goal)
+
+
+def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
+    made = contact(parameters=replace(QUICK, unknown_speed_m_s=3e-4))
+    for _ in range(2):
+        assert made.loop.make(made.goal).reached
+        assert made.loop.retract().retracted
+    controller = made.controller
+    assert controller._is_known(made.goal)
+    # bone below, and a hook that holds the tip when it is drawn back: `held` is the cause in the end
+    bone = OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
+    made.bench.plant._on = RigidTip(Clinging(bone, lambda height_m, _: 40.0 * height_m))
+    made.loop.make(made.goal)
+    made.run_until(State.IDLE, 4.0)
+    assert controller.state is State.FAULT
+    assert controller.result.cause is Cause.HELD
     assert not controller._is_known(made.goal)
 
 

@@ -11,7 +11,8 @@ from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.obstacles import Clinging
-from tactile_resonance.simulation.plant import Plane, RigidTip
+from tactile_resonance.simulation.plant import RigidTip
+from tactile_resonance.simulation.surfaces import Plane
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import RADIUS_M, SOFT, contact, started, stiffer
@@ -37,7 +38,7 @@ def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
     result = made.controller.result
     assert result.cause is Cause.HELD
     assert "grow while it is drawn back" in result.message
-    assert min(made.force_n) > -(PULL_N + 5e-3)
+    assert min(made.force_n) > -(PULL_N + 6e-3)
     assert np.abs(made.speed_m_s[-100:]).max() < 3e-4
     assert made.controller.settled
 
@@ -48,7 +49,7 @@ def test_hook_that_is_asked_for_again_is_pulled_a_little_harder_each_time():
         before_n = min(made.force_n)
         made.controller.retract()
         made.run(1.0)
-        assert min(made.force_n) > before_n - 4e-3
+        assert min(made.force_n) > before_n - 5e-3
     assert made.controller.state is State.FAULT
 
 
@@ -62,12 +63,16 @@ def test_tip_that_is_freed_is_drawn_back_on_request():
     assert made.controller.result.cause is Cause.HELD  # what happened stays said
 
 
-def test_film_that_pulls_as_fast_as_it_is_drawn_is_left_slowly():
+@pytest.mark.parametrize("damping_ns_per_m", [0.3, 0.6, 1.0])
+def test_film_that_pulls_as_fast_as_it_is_drawn_is_left_slowly(damping_ns_per_m):
     # 1 N s/m: at 20 mm/s it would pull with 20 mN; it tears 2 mm above the surface
-    made, _ = clinging(lambda height_m, up_m_s: 1.0 * max(0.0, up_m_s) if height_m < 2e-3 else None)
+    def pull(height_m, up_m_s):
+        return damping_ns_per_m * max(0.0, up_m_s) if height_m < 2e-3 else None
+
+    made, _ = clinging(pull)
     assert made.controller.state is State.IDLE
     assert made.controller.result.retracted
-    assert min(made.force_n) > -(PULL_N + 1e-3)
+    assert min(made.force_n) > -5.5e-3
 
 
 @pytest.mark.parametrize("step_n", [0.02, -0.02])
