@@ -20,7 +20,7 @@ from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.plant import Plane, Surface
+from tactile_resonance.simulation.surfaces import Plane, Surface
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters

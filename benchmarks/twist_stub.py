@@ -23,8 +23,8 @@ from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.plant import Plane
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.surfaces import Plane
 
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
 CLEAR_M = 0.02

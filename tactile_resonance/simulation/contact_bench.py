@@ -16,15 +16,9 @@ from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.indenter import Ball, Indenter
-from tactile_resonance.simulation.plant import (
-    CellMounting,
-    Plant,
-    RigidTip,
-    Surface,
-    TipOnTissue,
-    relative_radius_m,
-)
+from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.surfaces import Surface, relative_radius_m
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters

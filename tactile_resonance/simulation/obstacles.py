@@ -13,7 +13,24 @@ UP_M = 1e-7
 """Over which the slope of a pull is taken [m]."""
 
 
-class OnBone:
+class OnSoft:
+    """A ball on soft tissue that something else acts on, too."""
+
+    def __init__(self, soft: Indenter) -> None:
+        self._soft = soft
+
+    @property
+    def depth_m(self) -> float:
+        """Of the ball's lowest point below the undisturbed surface [m]."""
+        return self._soft.depth_m
+
+    @property
+    def contact_radius_m(self) -> float:
+        """On the soft tissue [m]."""
+        return self._soft.contact_radius_m
+
+
+class OnBone(OnSoft):
     """Soft tissue on an elastic half-space: both press on the ball, the lower from its depth on.
 
     The layer's force is that of a thick one: on bone a thin one is stiffer (Dimitriadis
@@ -41,23 +58,14 @@ class OnBone:
         poisson_ratio: float = 0.3,
     ) -> None:
         require(layer_m >= 0, "layer_m", layer_m, "0 or above")
-        self._soft, self._layer_m = soft, layer_m
+        super().__init__(soft)
+        self._layer_m = layer_m
         self._c = 4 / 3 * modulus_pa / (1 - poisson_ratio**2) * math.sqrt(radius_m)
 
     @property
     def force_n(self) -> float:
         """On the ball along the outward normal [N]."""
         return self._soft.force_n + self._bone()[0]
-
-    @property
-    def depth_m(self) -> float:
-        """Of the ball's lowest point below the undisturbed surface [m]."""
-        return self._soft.depth_m
-
-    @property
-    def contact_radius_m(self) -> float:
-        """On the layer [m]."""
-        return self._soft.contact_radius_m
 
     def reset(self) -> None:
         """Return to undisturbed tissue."""
@@ -80,7 +88,7 @@ class OnBone:
         return self._c * root**3, 1.5 * self._c * root
 
 
-class Clinging:
+class Clinging(OnSoft):
     """Tissue that, once touched, holds the ball back above its surface: a film, a fibre, a hook.
 
     Parameters
@@ -93,22 +101,13 @@ class Clinging:
 
     def __init__(self, soft: Indenter, pull: Callable[[float, float], float | None]) -> None:
         self.pull = pull
-        self._soft, self._touched, self._pulled_n = soft, False, 0.0
+        super().__init__(soft)
+        self._touched, self._pulled_n = False, 0.0
 
     @property
     def force_n(self) -> float:
         """On the ball along the outward normal [N]."""
         return self._soft.force_n - self._pulled_n
-
-    @property
-    def depth_m(self) -> float:
-        """Of the ball's lowest point below the undisturbed surface [m]."""
-        return self._soft.depth_m
-
-    @property
-    def contact_radius_m(self) -> float:
-        """On the tissue [m]."""
-        return self._soft.contact_radius_m
 
     def reset(self) -> None:
         """Return to undisturbed tissue."""

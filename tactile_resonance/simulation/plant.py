@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -24,16 +23,19 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import (
     Vector,
     cross,
+    difference,
     dot,
     rotated,
     rotated_back,
     turn_from_vector,
     turn_product,
+    vector,
 )
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Ball
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
+from tactile_resonance.simulation.surfaces import Surface
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
@@ -46,113 +48,6 @@ SAME_PLACE = 0.1
 
 STANDING_M = 1e-5
 """A tip that moves less than this along the surface in a step is above the place that it will touch."""
-
-
-class Surface(Protocol):
-    """The undisturbed surface of what lies on the table."""
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Along any direction [1/m]; above 0 where it bulges out, below 0 where it is hollow."""
-        ...
-
-    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the surface [m], along the outward normal there."""
-        ...
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A flat surface through a point; `normal` points out of the tissue and has length 1."""
-
-    point_m: FloatArray
-    normal: FloatArray
-
-    @classmethod
-    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Plane:
-        """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
-        sine = math.sin(tilt_rad)
-        normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
-        return cls(np.array([0.0, 0.0, height_m]), np.array(normal))
-
-    @property
-    def curvature_per_m(self) -> float:
-        """None [1/m]."""
-        return 0.0
-
-    @cached_property
-    def _floats(self) -> tuple[Vector, Vector]:
-        return _vector(self.point_m), _vector(self.normal)
-
-    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the plane [m], and the normal."""
-        (x, y, z), normal = self._floats
-        return dot(normal, (position_m[0] - x, position_m[1] - y, position_m[2] - z)), normal
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
-
-    Heights are radial, so that a ball of radius r is pressed in by r less the height of its centre, exactly,
-    wherever it is.
-
-    Attributes
-    ----------
-    centre_m : (3,) array
-    radius_m : float
-    hollow : bool
-        Whether the tissue is outside of it.
-    """
-
-    centre_m: FloatArray
-    radius_m: float
-    hollow: bool = False
-
-    def __post_init__(self) -> None:
-        require(0 < self.radius_m < math.inf, "radius_m", self.radius_m, "a number above 0")
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Along any direction [1/m]; below 0 of a hollow."""
-        return -1 / self.radius_m if self.hollow else 1 / self.radius_m
-
-    @cached_property
-    def _centre(self) -> Vector:
-        return _vector(self.centre_m)
-
-    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the surface [m], and the normal there: from the centre, or towards it.
-
-        Raises
-        ------
-        ValueError
-            In the centre, which has no normal.
-        """
-        x, y, z = _from(self._centre, position_m)
-        away = math.hypot(x, y, z)
-        require(away > 0, "position_m", position_m, "a place beside the sphere's centre")
-        sign = -1.0 if self.hollow else 1.0
-        normal = sign * x / away, sign * y / away, sign * z / away
-        return sign * (away - self.radius_m), normal
-
-
-def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
-    """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
-
-    ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
-    Mechanics* (1985), section 4.2): smaller on a sphere, larger in a hollow. The tissue still yields as a
-    half-space, which holds while the contact is small against the surface's own radius.
-
-    Raises
-    ------
-    ValueError
-        If the ball is not smaller than the hollow: it would touch along its rim.
-    """
-    flatter = 1 / tip_radius_m + surface.curvature_per_m
-    accepted = f"below the radius of the hollow, {-1 / (surface.curvature_per_m or -1):g} m"
-    require(flatter > 0, "tip_radius_m", tip_radius_m, accepted)
-    return 1 / flatter
 
 
 class TipOnTissue(Protocol):
@@ -294,6 +189,7 @@ class Plant:
         self.tip_m = ORIGIN
         self.normal_force_n = 0.0
         self._tip = tip
+        self._tissue: Tissue | None = None
         self._on: TipOnTissue | None = None
         self.site_m: Vector | None = None
         self._site_touched = False
@@ -302,9 +198,9 @@ class Plant:
         self._turn = IDENTITY[0]  # of the tip
         self._stepped = False
         cell = self.mounting
-        self._cell_m, self._carried_m = _vector(cell.frame.position_m), _vector(cell.centre_m)
-        self._cell_turn = turn_from_vector(_vector(cell.frame.rotation_rad))
-        self._gravity_m_s2 = _vector(GRAVITY_M_S2)
+        self._cell_m, self._carried_m = vector(cell.frame.position_m), vector(cell.centre_m)
+        self._cell_turn = turn_from_vector(vector(cell.frame.rotation_rad))
+        self._gravity_m_s2 = vector(GRAVITY_M_S2)
         self._places: list[Vector] = []  # of the carried mass, newest last
         self._period_s = 0.0
 
@@ -314,7 +210,7 @@ class Plant:
         For a beam that is where the undeflected tip would be.
         """
         self._turn, place = tip
-        way = _from(self.tip_m, place) if self._stepped else ORIGIN
+        way = difference(place, self.tip_m) if self._stepped else ORIGIN
         self._stepped, self._period_s = True, dt_s
         self.time_s += dt_s
         height, normal = self.surface.height_of(place)
@@ -368,8 +264,8 @@ class Plant:
             ax, ay, az = self._mass_acceleration()
             gx, gy, gz = gx - ax, gy - ay, gz - az
         load = (mass * gx, mass * gy, mass * gz)
-        tx, ty, tz = cross(_from(origin, self.tip_m), (fx, fy, fz))
-        lx, ly, lz = cross(_from(origin, centre), load)
+        tx, ty, tz = cross(difference(self.tip_m, origin), (fx, fy, fz))
+        lx, ly, lz = cross(difference(centre, origin), load)
         return (
             rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
             rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
@@ -380,7 +276,7 @@ class Plant:
         if self.in_contact or height > self.tip_radius_m + NEAR_M:
             return
         if self.site_m is not None:
-            away_m = math.hypot(*_along(_from(self.site_m, place), normal))
+            away_m = math.hypot(*_along(difference(place, self.site_m), normal))
             if self._site_touched:
                 known = away_m < SAME_PLACE * self.tip_radius_m
             else:  # it is not asked for all along the way: that may take longer than a step
@@ -388,7 +284,9 @@ class Plant:
             if known:
                 return
         tissue = self.tissue_at(np.array(place))
-        self._on = None if tissue is None else self._tip(tissue)
+        if tissue != self._tissue or self._site_touched:  # else the beam goes on swinging
+            self._on = None if tissue is None else self._tip(tissue)
+        self._tissue = tissue
         self.site_m, self._site_touched = place, False
 
     def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:
@@ -411,7 +309,7 @@ class Plant:
         if len(self._places) < 3:
             return ORIGIN
         first, second, third = self._places
-        (x, y, z), (lx, ly, lz) = _from(second, third), _from(first, second)
+        (x, y, z), (lx, ly, lz) = difference(third, second), difference(second, first)
         square = self._period_s**2
         return (x - lx) / square, (y - ly) / square, (z - lz) / square
 
@@ -419,16 +317,6 @@ class Plant:
         """What has a place in the frame `tip`, in the base."""
         (x, y, z), (dx, dy, dz) = self.tip_m, rotated(self._turn, place_m)
         return x + dx, y + dy, z + dz
-
-
-def _vector(values: FloatArray) -> Vector:
-    x, y, z = map(float, values)
-    return x, y, z
-
-
-def _from(start: Vector, end: Vector) -> Vector:
-    """Way from a place to another."""
-    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 
 def _along(way: Vector, normal: Vector) -> Vector:

@@ -18,12 +18,13 @@ from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.parameters import SensorParameters
-from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
+from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
+from tactile_resonance.simulation.surfaces import Plane
 from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.tissue import Tissue
 

@@ -13,7 +13,7 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.surfaces import Plane
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, FORCE_N = 2.5e-3, 0.01

@@ -17,7 +17,7 @@ from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.surfaces import Plane
 from tactile_resonance.simulation.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -21,7 +21,7 @@ from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.turning import MARGIN_M, PASSED_RAD, TurningWay
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.plant import Plane, Sphere
+from tactile_resonance.simulation.surfaces import Plane, Sphere
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT

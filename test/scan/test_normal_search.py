@@ -23,7 +23,7 @@ from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
 from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.plant import Sphere
+from tactile_resonance.simulation.surfaces import Sphere
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT

@@ -9,17 +9,10 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import (
-    CellMounting,
-    Friction,
-    Plane,
-    Plant,
-    RigidTip,
-    Sphere,
-    relative_radius_m,
-)
+from tactile_resonance.simulation.plant import CellMounting, Friction, Plant, RigidTip
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.surfaces import Plane, Sphere, relative_radius_m
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU = 2.5e-3, 0.49
@@ -216,6 +209,25 @@ def test_beam_in_series_is_softer_by_its_own_compliance():
     # what the beam bends by is what the ball stays behind
     assert p.force_n[2] == pytest.approx(stiffness * (8e-4 - p.depth_m), rel=1e-4)
     assert p.force_n[2] == pytest.approx(hertz(p.depth_m), rel=1e-4)
+
+
+def test_beam_keeps_swinging_while_the_tip_comes_down_along_a_tilt():
+    """Its swing is the beam's, not the tissue's: the same tissue asked for again does not stop it."""
+    made = []
+
+    def sprung(tissue):
+        ball = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU)
+        made.append(
+            SprungIndenter(ball, stiffness_n_per_m=14.8, mass_kg=2.6e-4, damping_ns_per_m=0.02)
+        )
+        return made[-1]
+
+    tilted = Plane.tilted(0.0, np.deg2rad(10.0))
+    p = Plant(tilted, lambda _: Tissue("soft", 10e3, (), ()), sprung, tip_radius_m=RADIUS_M)
+    for height in np.linspace(4e-3, -3e-4, 500):
+        p.step(at(0, 0, RADIUS_M + height), 0.002)
+    assert p.in_contact
+    assert len(made) == 1
 
 
 def test_not_stepped_is_said():

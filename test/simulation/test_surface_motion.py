@@ -7,11 +7,12 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import Plane, Plant, RigidTip
+from tactile_resonance.simulation.plant import Plant, RigidTip
 from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
+from tactile_resonance.simulation.surfaces import Plane
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU, MODULUS_PA = 2.5e-3, 0.49, 10e3

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surfaces of what lies on the simulated table: flat, a sphere, a hollow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.vectors import Vector, difference, dot, vector
+from tactile_resonance.fields import require
+
+FloatArray = NDArray[np.float64]
+
+
+class Surface(Protocol):
+    """The undisturbed surface of what lies on the table."""
+
+    @property
+    def curvature_per_m(self) -> float:
+        """Along any direction [1/m]; above 0 where it bulges out, below 0 where it is hollow."""
+        ...
+
+    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
+        """Height of a position above the surface [m], along the outward normal there."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A flat surface through a point; `normal` points out of the tissue and has length 1."""
+
+    point_m: FloatArray
+    normal: FloatArray
+
+    @classmethod
+    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Plane:
+        """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
+        sine = math.sin(tilt_rad)
+        normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
+        return cls(np.array([0.0, 0.0, height_m]), np.array(normal))
+
+    @property
+    def curvature_per_m(self) -> float:
+        """None [1/m]."""
+        return 0.0
+
+    @cached_property
+    def _floats(self) -> tuple[Vector, Vector]:
+        return vector(self.point_m), vector(self.normal)
+
+    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
+        """Height of a position above the plane [m], and the normal."""
+        (x, y, z), normal = self._floats
+        return dot(normal, (position_m[0] - x, position_m[1] - y, position_m[2] - z)), normal
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
+
+    Heights are radial, so that a ball of radius r is pressed in by r less the height of its centre, exactly,
+    wherever it is.
+
+    Attributes
+    ----------
+    centre_m : (3,) array
+    radius_m : float
+    hollow : bool
+        Whether the tissue is outside of it.
+    """
+
+    centre_m: FloatArray
+    radius_m: float
+    hollow: bool = False
+
+    def __post_init__(self) -> None:
+        require(0 < self.radius_m < math.inf, "radius_m", self.radius_m, "a number above 0")
+
+    @property
+    def curvature_per_m(self) -> float:
+        """Along any direction [1/m]; below 0 of a hollow."""
+        return -1 / self.radius_m if self.hollow else 1 / self.radius_m
+
+    @cached_property
+    def _centre(self) -> Vector:
+        return vector(self.centre_m)
+
+    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
+        """Height of a position above the surface [m], and the normal there: from the centre, or towards it.
+
+        Raises
+        ------
+        ValueError
+            In the centre, which has no normal.
+        """
+        x, y, z = difference(position_m, self._centre)
+        away = math.hypot(x, y, z)
+        require(away > 0, "position_m", position_m, "a place beside the sphere's centre")
+        sign = -1.0 if self.hollow else 1.0
+        normal = sign * x / away, sign * y / away, sign * z / away
+        return sign * (away - self.radius_m), normal
+
+
+def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
+    """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
+
+    ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
+    Mechanics* (1985), section 4.2): smaller on a sphere, larger in a hollow. The tissue still yields as a
+    half-space, which holds while the contact is small against the surface's own radius.
+
+    Raises
+    ------
+    ValueError
+        If the ball is not smaller than the hollow: it would touch along its rim.
+    """
+    flatter = 1 / tip_radius_m + surface.curvature_per_m
+    accepted = f"below the radius of the hollow, {-1 / (surface.curvature_per_m or -1):g} m"
+    require(flatter > 0, "tip_radius_m", tip_radius_m, accepted)
+    return 1 / flatter
