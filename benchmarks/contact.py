@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from tqdm import tqdm
 
-from benchmarks import contact_drivers, contact_living
+from benchmarks import contact_drivers, contact_living_table
 from benchmarks.contact_case import (
     FORCE_N,
     Case,
@@ -100,7 +100,7 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
             for done in pool.map(_run_case, [(case, setup, law) for case in chosen]):
                 outcomes[name].append(done)
                 progress.update()
-    living = contact_living.run(100 if full else 1 if quick else 6)
+    living = contact_living_table.run(100 if full else 1 if quick else 6)
     series = contact_series(1000 if full else 20 if quick else 60)
     peaks = stiff_peaks(10 if quick else 60)
     text = _report(outcomes, series, peaks, drivers, len(chosen)) + "\n" + living

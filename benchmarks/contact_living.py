@@ -6,14 +6,10 @@ Each case is drawn from the ranges of its row by its own seed. Everything is sim
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks.contact_case import FORCE_N, KNOWN, MODES, Case, Rig, Setup
 from benchmarks.contact_laws import LIVING_LAWS, steps_of
@@ -29,9 +25,6 @@ from tactile_resonance.simulation.surfaces import Sphere
 
 HOLD_S, SETTLED_S, SOFT_PA = 4.0, 0.5, 3e3
 """Held for so long; drawn back within 10 s and this; modulus of the layer on bone."""
-
-SIMPLE_CASES = 30
-"""Of a row, so many are run with each of the simple laws."""
 
 Draw = np.random.Generator
 
@@ -210,8 +203,10 @@ class Held:
         Largest true force, and largest pull, from the touch until 0.5 s after the end.
     stated_error : float
         Of the stated mean force, in its deviations.
-    cause, message : str
+    cause : str
         Of the end.
+    needed_n : float
+        Pull that adhesion itself needs.
     """
 
     ready: bool
@@ -222,11 +217,11 @@ class Held:
     pull_n: float
     stated_error: float
     cause: str
-    message: str
+    needed_n: float = np.nan
 
 
-def drawn(row: Row, seed: int) -> tuple[Case, Rig, float]:
-    """Case and bench of a row, and the pull that adhesion itself needs [N]."""
+def drawn(row: Row, seed: int) -> tuple[Rig, float]:
+    """Bench of a row's case, and the pull that adhesion itself needs [N]."""
     rng = np.random.default_rng([seed, 17])
     radius_m = rng.uniform(1.5e-3, 3e-3)
     modulus_pa = float(np.exp(rng.uniform(np.log(3e3), np.log(30e3))))
@@ -262,17 +257,18 @@ def drawn(row: Row, seed: int) -> tuple[Case, Rig, float]:
 
         rig.bench.clock.on_step.append(creep)
     # Johnson, Kendall & Roberts (1971)
-    return case, rig, 1.5 * np.pi * work * radius_m
+    return rig, 1.5 * np.pi * work * radius_m
 
 
 def run_case(job: tuple[Row, int, str]) -> Held:
     """Run one case of a row with our controller, or with a simple law by its name."""
     row, seed, law = job
-    _, rig, needed_n = drawn(row, seed)
-    return _ours(row, rig, needed_n) if not law else _simple(row, rig, law)
+    rig, needed_n = drawn(row, seed)
+    held = _simple(row, rig, law) if law else _ours(row, rig)
+    return replace(held, needed_n=needed_n)
 
 
-def _ours(row: Row, rig: Rig, needed_n: float) -> Held:
+def _ours(row: Row, rig: Rig) -> Held:
     bench = rig.bench
     parameters = ContactParameters(
         beam_stiffness_n_per_m=MODES.static_stiffness_n_per_m if row.beam else 0.0,
@@ -294,9 +290,7 @@ def _ours(row: Row, rig: Rig, needed_n: float) -> Held:
     error = np.nan
     if ready and end > at and result.force_n is not None and result.force_std_n is not None:
         error = (result.force_n - np.mean(rig.force_n[at:end])) / result.force_std_n
-    return _held(
-        row, rig, at if ready else None, end, held, error, result.cause.value, result.message
-    )
+    return _held(row, rig, at if ready else None, end, held, result.cause.value, error)
 
 
 def _simple(row: Row, rig: Rig, law: str) -> Held:
@@ -311,7 +305,7 @@ def _simple(row: Row, rig: Rig, law: str) -> Held:
     # out of contact for as long as our controller calls it lost, or beyond the hard limit
     lost = ready is not None and _longest_run(force[ready:] <= 0) * row.period_s > 0.05
     held = ready is not None and not lost and bool(force.max() < Limits().hard_force_n)
-    return _held(row, rig, ready, end, held, np.nan, "none" if held else "lost", "")
+    return _held(row, rig, ready, end, held, "none" if held else "lost")
 
 
 def _longest_run(where: np.ndarray) -> int:
@@ -325,9 +319,8 @@ def _held(
     ready: int | None,
     end: int,
     held: bool,
-    error: float,
     cause: str,
-    message: str,
+    error: float = np.nan,
 ) -> Held:
     force = np.array(rig.force_n)
     touched = int(np.argmax(force > 0)) if (force > 0).any() else 0
@@ -343,124 +336,4 @@ def _held(
         pull_n=float(-force.min()),
         stated_error=float(error),
         cause=cause,
-        message=message,
     )
-
-
-def needed_pull_n(row: Row, seed: int) -> float:
-    """Pull that adhesion itself needs in a case [N]."""
-    return drawn(row, seed)[2]
-
-
-def run(count: int) -> str:
-    """Run all rows with so many cases each; return the tables."""
-    jobs = [(row, "") for row in (*MOTION_ROWS, *BONE_ROWS, *CLINGING_ROWS, *OTHER_ROWS)]
-    jobs += [(row, law) for row in MOTION_ROWS for law in LIVING_LAWS]
-    outcomes: dict[tuple[str, str], list[Held]] = {}
-    with (
-        ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool,
-        tqdm(desc="living", unit="") as progress,
-    ):
-        for row, law in jobs:
-            done = []
-            cases = min(count, SIMPLE_CASES) if law else count
-            for held in pool.map(run_case, [(row, seed, law) for seed in range(cases)]):
-                done.append(held)
-                progress.update()
-            outcomes[row.name, law] = done
-    return _report(outcomes, count)
-
-
-def _report(outcomes: dict[tuple[str, str], list[Held]], count: int) -> str:
-    rows = [
-        "## Living tissue",
-        "",
-        f"{count} cases a row, each drawn by its seed: ball of 1.5 to 3 mm, modulus of a sudden step 3 to",
-        "30 kPa of which 60 % relax in .5 to 3 s, surface +-.5 mm from where it is expected, 1 mN rms noise at",
-        "500 Hz. Heart: a sine of that amplitude at 1 to 2 Hz; breath: cos^6, peak to peak, at .2 to .3 Hz.",
-        "Held: for 4 s after it was ready. rms: of the true force about its aim while held, median / p95.",
-        "Peak: largest true force. Without a beam these are contacts near one that has succeeded. The simple",
-        f"laws: {min(count, SIMPLE_CASES)} cases.",
-        "",
-        "| Tissue that moves | held % | ready, median / p95 s | rms % | peak mN "
-        + "".join(f"| {law}: held %, rms % " for law in LIVING_LAWS)
-        + "|",
-        "|---|---|---|---|---|" + "---|" * len(LIVING_LAWS),
-    ]
-    for row in MOTION_ROWS:
-        simple = ""
-        for law in LIVING_LAWS:
-            other = outcomes[row.name, law]
-            simple += f"| {_share(other)}, {_rms(other)} "
-        rows.append(f"| {row.name} {_middle(outcomes[row.name, ''])} {simple}|")
-    rows += [
-        "",
-        "10 MPa, met where nothing is known of the tissue: without a beam at .3 mm/s.",
-        "",
-        "| Bone | peak, median / largest mN | ended as |",
-        "|---|---|---|",
-    ]
-    for row in BONE_ROWS:
-        done = outcomes[row.name, ""]
-        peaks = 1e3 * np.array([o.peak_n for o in done])
-        rows.append(
-            f"| {row.name} | {np.median(peaks):.0f} / {peaks.max():.0f} | {_causes(done)} |"
-        )
-    rows += [
-        "",
-        "Pull beyond what adhesion itself needs (1.5 pi w R); a film pulls with .3 to 1 N s/m and tears, a",
-        "hook with 5 to 40 N/m and does not.",
-        "",
-        "| What clings | pull beyond, median / largest mN | ended as |",
-        "|---|---|---|",
-    ]
-    for row in CLINGING_ROWS:
-        done = outcomes[row.name, ""]
-        beyond = [o.pull_n - needed_pull_n(row, seed) for seed, o in enumerate(done)]
-        beyond_mn = 1e3 * np.array(beyond)
-        rows.append(
-            f"| {row.name} | {np.median(beyond_mn):.1f} / {beyond_mn.max():.1f} | {_causes(done)} |"
-        )
-    rows += [
-        "",
-        "| Other | held % | ready, median / p95 s | rms % | peak mN |",
-        "|---|---|---|---|---|",
-    ]
-    rows += [f"| {row.name} {_middle(outcomes[row.name, ''])} |" for row in OTHER_ROWS]
-    rows += ["", "Stated mean force within 4 of its deviations of the true mean while held:", ""]
-    worst = [
-        (share, name)
-        for (name, law), done in outcomes.items()
-        if not law and np.isfinite(share := _stated(done))
-    ]
-    rows.append(
-        f"all rows {100 * np.mean([share for share, _ in worst]):.1f} % of the cases; least "
-        + ", ".join(f"{100 * share:.0f} % {name}" for share, name in sorted(worst)[:3])
-        + "."
-    )
-    return "\n".join(rows) + "\n"
-
-
-def _share(done: Sequence[Held]) -> str:
-    return f"{100 * np.mean([o.held for o in done]):.0f}"
-
-
-def _rms(done: Sequence[Held]) -> str:
-    rms = 100 * np.array([o.rms for o in done if o.held])
-    return f"{np.median(rms):.1f} / {np.quantile(rms, 0.95):.1f}" if rms.size else "-"
-
-
-def _middle(done: Sequence[Held]) -> str:
-    ready = np.quantile([o.ready_s for o in done], [0.5, 0.95], method="higher")
-    peak = 1e3 * max(o.peak_n for o in done)
-    return f"| {_share(done)} | {ready[0]:.2f} / {ready[1]:.2f} | {_rms(done)} | {peak:.0f}"
-
-
-def _stated(done: Sequence[Held]) -> float:
-    errors = np.array([o.stated_error for o in done])
-    errors = np.abs(errors[np.isfinite(errors)])
-    return float(np.mean(errors < 4)) if errors.size else np.nan
-
-
-def _causes(done: Sequence[Held]) -> str:
-    return ", ".join(f"{cause} {n}" for cause, n in Counter(o.cause for o in done).most_common())
