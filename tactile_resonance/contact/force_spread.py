@@ -2,7 +2,7 @@
 """How much the force of a contact moved while it was measured, beside the noise of its sensor.
 
 Tissue moves with breath and heartbeat, at up to a few hertz; a force sensor makes noise up to its own rate.
-Both are told apart by time: what means over 10 ms differ by from one to the next is noise (mean square
+They are distinguished by time scale: what means over 10 ms differ by from one to the next is noise (mean square
 successive difference; von Neumann, Ann. Math. Stat. 12 (1941) 367), what means over 20 ms differ by beyond
 their share of it is the force.
 """

@@ -2,7 +2,7 @@
 """Measuring only while the force is quiet, as between two breaths.
 
 The blocks of a measurement are one record from rest, whose transient is estimated along: none can be left out
-of it. So a measurement during which the force moved too much is ended and begun again, in the same contact.
+of it. So a measurement during which the force moved too much is ended and repeated in the same contact.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ class ScanScene:
         When a point's blocks are enough; None: after the most blocks.
     blocks : BlockLimits
     gate : Gate or None
-        A measurement during which the force moved more is begun again; None: none is.
+        A measurement during which the force moved more is repeated; None: none is.
     tissue_classes : tuple of TissueClass
         Tissues that a point may be called; empty: none is called.
     nominal_contact : NominalContact or None
