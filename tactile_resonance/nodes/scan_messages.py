@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
 from tactile_resonance.action import Scan
+from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
 from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import SensorHealth
@@ -41,21 +38,9 @@ def feedback_message(progress: Progress, run_directory: str) -> Scan.Feedback:
         time_left_s=float(progress.time_left_s),
         repeats=progress.repeats,
     )
-    nan = math.nan
-    feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
-    poles = progress.poles
-    if poles is not None and poles.f0_hz.size:
-        feedback.f0_hz, feedback.damping_ratio = (
-            float(poles.f0_hz[0]),
-            float(poles.damping_ratio[0]),
-        )
-        covariance = (
-            poles.total_covariance if poles.total_covariance is not None else poles.covariance
-        )
-        if covariance is not None:
-            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(
-                np.diag(covariance[0])
-            ).tolist()
+    mode = Poles().main if progress.poles is None else progress.poles.main
+    feedback.f0_hz, feedback.damping_ratio = mode.estimate.tolist()
+    feedback.f0_std_hz, feedback.damping_ratio_std = mode.std.tolist()
     return feedback
 
 

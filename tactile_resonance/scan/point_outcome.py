@@ -10,7 +10,6 @@ import numpy as np
 
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import NAN, Outcome, PointResult
 from tactile_resonance.scan.pole_map import MapPoint, map_point
 from tactile_resonance.scan.references import AirReference, relative_to_air
@@ -59,7 +58,7 @@ def measured_result(
         nominal=scene.nominal_contact,
         age_s=measured.contact_age_s,
     )
-    mode = main_mode(poles)
+    mode = poles.main
     std = found.std
     relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
     blank = unmeasured_result(

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
-from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import (
@@ -139,7 +138,7 @@ def map_point(
         raise ValueError(
             f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
         )
-    mode = main_mode(poles)
+    mode = poles.main
     name, probability, reason, referred = "", float("nan"), "", None
     if classes and mode.found:
         pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)

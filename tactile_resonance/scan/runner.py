@@ -28,7 +28,6 @@ from tactile_resonance.scan.hands import (
     Recording,
     ScanEnded,
 )
-from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import NAN, Kind, Outcome, PointResult
@@ -238,7 +237,7 @@ class ScanRunner:
             )
 
     def _decide(self, measured: Measured, blocks: int) -> Decision:
-        mode = main_mode(measured.poles)
+        mode = measured.poles.main
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
         if isinstance(wanted, Separate):
@@ -248,11 +247,13 @@ class ScanRunner:
             at = refer_to_nominal(
                 mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
             )
-            decision = decide(at.compared, None, at.covariance, blocks, wanted, limits, block_s)
+            decision = decide(
+                *(at.compared, at.covariance, at.covariance, blocks, wanted, limits, block_s)
+            )
             if np.isnan(at.compared).any() and at.note:
                 return replace(decision, reason=at.note)
             return decision
-        return decide(mode.estimate, mode.noise, mode.total, blocks, wanted, limits, block_s)
+        return decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan.

@@ -67,11 +67,10 @@ def measure(scene, phantoms, design, bench, point, attempt):
             harmonics=excitation.harmonics,
             band_hz=band,
         )
-        known = poles.f0_hz.size == 1
         decision = decide(
-            [poles.f0_hz[0], poles.damping_ratio[0]] if known else [np.nan] * 2,
-            poles.covariance[0] if known and poles.covariance is not None else None,
-            poles.total_covariance[0] if known and poles.total_covariance is not None else None,
+            poles.main.estimate,
+            poles.main.covariance,
+            poles.main.noise,
             len(u),
             scene.precision,
             scene.blocks,
