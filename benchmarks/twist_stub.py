@@ -19,10 +19,10 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
 from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.plant import Plane
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 

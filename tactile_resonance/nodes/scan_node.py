@@ -55,7 +55,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
 from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.scan.table_calibration import CalibrationRequest
-from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.sensor import read_sensor
 
 PARAMETERS = (
     Parameter(

@@ -24,7 +24,7 @@ from tactile_resonance.scan.table_calibration import (
     calibrate_table,
 )
 from tactile_resonance.scan.table_file import NOT_ESTIMATED, as_text
-from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.sensor import read_sensor
 
 OPTIONS = (
     *("force_n", "search_m", "flatness_m", "most_tilt_rad"),

@@ -14,7 +14,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.nodes.goals import POLL_S
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.sensor import read_sensor
 
 SERVICE = "contact_node/get_parameters"
 ANSWERED_WITHIN_S = 5.0

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import BeamModes, sensor_modes
 from tactile_resonance.simulation.contact import Contact
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray, PoleResidueModel
-from tactile_resonance.simulation.parameters import SensorParameters
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.contact import (
     Contact,
@@ -18,7 +19,6 @@ from tactile_resonance.simulation.contact import (
 )
 from tactile_resonance.simulation.indentation import indent
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
-from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.tissue import Tissue
 
 

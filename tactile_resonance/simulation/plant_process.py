@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_dataclass, require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plane, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated sensor, read from ``config/sensors/bimorph.yaml``.
+"""The sensor, read from ``config/sensors/bimorph.yaml``: its geometry, and what it is simulated by.
 
 Sources and honesty marks of the default values stand beside them in that file.
 """
