@@ -133,6 +133,11 @@ class SensorParameters:
     acquisition: AcquisitionParameters
 
 
+def sensor_named(name: str) -> SensorParameters:
+    """Parameters of a sensor of ``config/sensors``."""
+    return read_sensor(share_path(f"config/sensors/{name}.yaml"))
+
+
 def read_sensor(path: Path | None = None) -> SensorParameters:
     """Read sensor parameters; without a path, those of ``config/sensors/bimorph.yaml``.
 

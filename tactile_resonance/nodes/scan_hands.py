@@ -36,11 +36,12 @@ from tactile_resonance.scan.hands import (
     Recording,
     ScanEnded,
     Stopped,
+    Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, Touch
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0

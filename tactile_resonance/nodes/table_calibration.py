@@ -12,19 +12,17 @@ from typing import BinaryIO
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance.action import CalibrateTable
-from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.scan.goal import Frames
-from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.scan.table_calibration import (
     CalibrationRequest,
     TableCalibration,
     calibrate_table,
 )
 from tactile_resonance.scan.table_file import NOT_ESTIMATED, as_text
-from tactile_resonance.sensor import read_sensor
+from tactile_resonance.sensor import sensor_named
 
 OPTIONS = (
     *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
@@ -62,7 +60,7 @@ def calibrate(
     who : str
         Made it, for the file.
     """
-    radius_m = read_sensor(share_path(f"config/sensors/{request.sensor}.yaml")).tip.radius_m
+    radius_m = sensor_named(request.sensor).tip.radius_m
     feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
 
     def touch(point: ScanPoint) -> Touch:

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,16 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_file import offered_qos
 from tactile_resonance.scan.point_result import COLUMNS, Kind, Outcome, as_csv
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.scene import Output
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import scene
 from run_tables import (
     POLES,
     RECORD,
@@ -319,7 +323,10 @@ def record_until_killed(path, after_s):
 
 
 def test_expected_bytes_bounds_what_a_run_takes(tmp_path):
-    samples, blocks, lines = 20_000, 3, 4000
+    samples, blocks = 20_000, 3
+    design = design_measurement(scene(outputs=(Output.POLES, Output.FRF)))
+    design = replace(design, periods=blocks)
+    assert (design.samples, design.lines) == (samples, 3997)
     with create(tmp_path / "run", 2) as run:
         for index in range(2):
             with run.begin_point(index) as recording:
@@ -327,4 +334,4 @@ def test_expected_bytes_bounds_what_a_run_takes(tmp_path):
                     recording.write("/record", RECORD, START_NS, record_cdr(index, samples))
                 recording.finish(result(index))
     taken = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*") if path.is_file())
-    assert 2 * blocks * 4 * samples < taken < expected_bytes(2, blocks, samples, lines)
+    assert 2 * blocks * 4 * samples < taken < expected_bytes(2, design)
