@@ -17,8 +17,9 @@ from benchmarks.twist_controller import TwistController
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
-from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES
+from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip

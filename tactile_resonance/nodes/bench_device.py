@@ -14,14 +14,11 @@ from tactile_resonance import msg
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.conversions import (
-    excitation_to_message,
-    record_from_message,
-    time_from_message,
-)
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.record import BetweenSamples, InputKind
+from tactile_resonance.recording.messages import record_from_message, time_from_message
 from tactile_resonance.srv import Play
 
 ANSWER_TIMEOUT_S = 10.0

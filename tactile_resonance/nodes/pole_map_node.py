@@ -13,11 +13,11 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
-from tactile_resonance.nodes.conversions import poles_from_message
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.map_messages import (
     cloud_message,
     header_message,

@@ -16,17 +16,18 @@ from rclpy.duration import Duration
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
 from tactile_resonance.nodes.excitation_design import GRIDS
 from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import pose_to_message
 from tactile_resonance.nodes.node_watch import Instances, NodeWatch
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.hands import (
     Check,
     Measured,

@@ -20,9 +20,15 @@ from tactile_resonance.nodes.one_goal import RUNNING, OneGoal
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_hands import NodeHands
-from tactile_resonance.nodes.scan_messages import feedback_message, fill_result, goal_of
+from tactile_resonance.nodes.scan_messages import (
+    calibration_request,
+    fill_scan_result,
+    no_table,
+    scan_feedback,
+    scan_goal,
+)
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.nodes.table_calibration import calibrate, no_table, request_of
+from tactile_resonance.nodes.table_calibration import calibrate
 from tactile_resonance.nodes.tip_use import TipUseClient
 from tactile_resonance.scan.controls import Request
 from tactile_resonance.scan.goal import Frames, named_frames, resumed_run
@@ -139,7 +145,7 @@ class ScanNode(ManagedNode):
 
     async def _check_scan(self, message: Scan.Goal) -> Frames:
         """Frames as they stand now, for a goal that is in order."""
-        goal, frames = self._files.checked(goal_of(message)), self._frames
+        goal, frames = self._files.checked(scan_goal(message)), self._frames
         if goal.resume:
             resumed_run(goal)
             return frames
@@ -154,7 +160,7 @@ class ScanNode(ManagedNode):
     async def _check_calibration(self, message: CalibrateTable.Goal) -> CalibrationRequest:
         accepted = "robot: a table is calibrated by touch"
         require(self._hands.free_air, "contact", "none", accepted)
-        request = request_of(message)
+        request = calibration_request(message)
         if request.file:
             path = self._files.to_write(request.file, "file")
             require(not os.path.lexists(path), "file", str(path), "a new file")
@@ -195,7 +201,7 @@ class ScanNode(ManagedNode):
         (seed,) = values(self, "seed")
         controls, files = self._goals.controls, self._files
         started = start_run(
-            *(files.checked(goal_of(goal.request)), frames, files, self._hands),
+            *(files.checked(scan_goal(goal.request)), frames, files, self._hands),
             seed=seed,
             tip_use=None if self._tip_use is None else self._tip_use.ask,
             tell=self._tell,
@@ -215,7 +221,7 @@ class ScanNode(ManagedNode):
                 *(started.scene, plan, run, self._hands, controls),
                 *(self._tell, started.seed, self._publish),
             )
-            fill_result(result, runner.run())
+            fill_scan_result(result, runner.run())
 
     def _publish(self, result: bytes) -> None:
         if self.active:  # a scan that the node's end interrupts ends after its publishers
@@ -243,7 +249,7 @@ class ScanNode(ManagedNode):
     def _feed_back(self, progress: Progress) -> None:
         goal = self._goals.handle
         if goal is not None:
-            goal.publish_feedback(feedback_message(progress, self._run_directory))
+            goal.publish_feedback(scan_feedback(progress, self._run_directory))
 
 
 def main() -> None:

@@ -14,9 +14,9 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import ForceConfig
-from tactile_resonance.nodes.conversions import time_from_message
 from tactile_resonance.nodes.lockstep import Arrivals
 from tactile_resonance.nodes.running import SERIES
+from tactile_resonance.recording.messages import time_from_message
 
 EARLIEST_S = 0.005
 LATEST_S = 0.5

@@ -12,7 +12,7 @@ from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.nodes.conversions import poles_from_message
+from tactile_resonance.recording.messages import poles_from_message
 
 FloatArray = npt.NDArray[np.float64]
 IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)

@@ -31,12 +31,13 @@ from tactile_resonance.contact.vectors import (
     vector_from_turn,
 )
 from tactile_resonance.drivers.twist_config import TwistConfig
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.listener import Listener
 from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
+from tactile_resonance.recording.messages import time_from_message
 
 REST: Six = (*ZERO, *ZERO)
 VELOCITY_OVER_NS = 7_000_000

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.recording.from_messages import poles_from_message
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
 from tactile_resonance.scan.run_content import RECORDING, RunContent

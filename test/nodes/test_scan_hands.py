@@ -15,9 +15,9 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
