@@ -24,7 +24,7 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant import Plane
+from tactile_resonance.simulation.plant import FlatSurface
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
@@ -60,7 +60,7 @@ class TwistStub:
         start = Pose.from_vector(np.array(TABLE_IN_BASE))
         bench = ContactBench(
             self._tissues[tissue],
-            Plane(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
+            FlatSurface(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
             Pose(start.position_m + [0.0, 0.0, CLEAR_M], start.rotation_rad),
             tip=Tip(sensor.tip.radius_m, sensor_modes(sensor)),
             seed=seed,

@@ -11,7 +11,7 @@ from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
-from tactile_resonance.simulation.contact import ContactParameters, hertz_contact
+from tactile_resonance.simulation.contact import HertzParameters, hertz_contact
 from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.tissue import Tissue
@@ -32,7 +32,7 @@ class SimulatedBench:
     """
 
     sensor: SensorParameters
-    contact: ContactParameters
+    contact: HertzParameters
 
     @classmethod
     def from_configuration(cls) -> SimulatedBench:

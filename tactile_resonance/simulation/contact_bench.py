@@ -19,8 +19,8 @@ from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.plant import (
     CellMounting,
     Plant,
+    PlantSurface,
     RigidTip,
-    Surface,
     TipOnTissue,
     relative_radius_m,
 )
@@ -57,7 +57,7 @@ class Tip:
     adhesion_j_per_m2: float = 0.0
     meets: Callable[[Indenter], Ball] | None = None
 
-    def on(self, tissue: Tissue, surface: Surface) -> TipOnTissue:
+    def on(self, tissue: Tissue, surface: PlantSurface) -> TipOnTissue:
         """Return the tip at rest over a tissue with that surface."""
         radius_m = relative_radius_m(self.radius_m, surface)
         soft = Indenter(
@@ -77,7 +77,7 @@ class ContactBench:
     ----------
     tissue : Tissue
         Everywhere under the surface.
-    surface : Surface
+    surface : PlantSurface
         What takes its place later must be curved alike.
     start : Pose
         Of the tip.
@@ -105,7 +105,7 @@ class ContactBench:
     def __init__(
         self,
         tissue: Tissue,
-        surface: Surface,
+        surface: PlantSurface,
         start: Pose,
         *,
         tip: Tip | None = None,

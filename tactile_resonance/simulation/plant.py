@@ -48,7 +48,7 @@ STANDING_M = 1e-5
 """A tip that moves less than this along the surface in a step is above the place that it will touch."""
 
 
-class Surface(Protocol):
+class PlantSurface(Protocol):
     """The undisturbed surface of what lies on the table."""
 
     @property
@@ -62,14 +62,14 @@ class Surface(Protocol):
 
 
 @dataclass(frozen=True)
-class Plane:
+class FlatSurface:
     """A flat surface through a point; `normal` points out of the tissue and has length 1."""
 
     point_m: FloatArray
     normal: FloatArray
 
     @classmethod
-    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Plane:
+    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> FlatSurface:
         """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
         sine = math.sin(tilt_rad)
         normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
@@ -91,7 +91,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Sphere:
+class RoundSurface:
     """A sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
 
     Heights are radial, so that a ball of radius r is pressed in by r less the height of its centre, exactly,
@@ -137,7 +137,7 @@ class Sphere:
         return sign * (away - self.radius_m), normal
 
 
-def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
+def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:
     """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
 
     ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
@@ -230,7 +230,7 @@ class Plant:
 
     Parameters
     ----------
-    surface : Surface
+    surface : PlantSurface
         May be exchanged while the plant runs (``plant.surface = ...``).
     tissue_at : callable
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
@@ -270,7 +270,7 @@ class Plant:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: PlantSurface,
         tissue_at: Callable[[FloatArray], Tissue | None],
         tip: Callable[[Tissue], TipOnTissue],
         *,

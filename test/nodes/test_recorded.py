@@ -26,7 +26,7 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording import messages
 from tactile_resonance.recording.store_recording import recording_of
-from tactile_resonance.scan.point_result import Kind, PointResult
+from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.recorded import EXCITATION, RECORD, read_recorded
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -106,7 +106,7 @@ def run(tmp_path_factory):
                 recording.write(
                     "/left/record", RECORD, time_ns, serialize_message(record_to_message(record))
                 )
-            recording.finish(PointResult(2, kind=Kind.AIR, measurement_id=13))
+            recording.finish(PointResult(2, kind=PointKind.AIR, measurement_id=13))
     return folder
 
 

@@ -22,7 +22,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.plant import Sphere
+from tactile_resonance.simulation.plant import RoundSurface
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT
@@ -240,7 +240,7 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
     true = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     # the ball touches level with the point, its centre straight above it; a level normal is expected there
     centre = np.array([0, 0, RADIUS_M]) + (7.5e-3 if hollow else -12.5e-3) * true
-    surface = Sphere(centre, 10e-3, hollow)
+    surface = RoundSurface(centre, 10e-3, hollow)
     told = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(told.position_m + [0, 0, 3e-3], told.rotation_rad)
     bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M), seed=5)

@@ -17,7 +17,7 @@ from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, measured_result
-from tactile_resonance.scan.point_result import Outcome, PointResult, as_csv
+from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
     MapPoint,
@@ -287,6 +287,6 @@ def test_a_run_s_results_make_the_same_point():
     np.testing.assert_allclose(again.covariance, point.covariance)
     np.testing.assert_allclose(again.position_m, point.position_m)
     assert again.status is PolesStatus.MODEL_ERROR
-    failed = point_of_result(replace(result, outcome=Outcome.FAILED, reason="contact lost"))
+    failed = point_of_result(replace(result, outcome=PointOutcome.FAILED, reason="contact lost"))
     assert failed.failed
     assert failed.reason == "contact lost"

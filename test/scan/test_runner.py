@@ -23,7 +23,7 @@ from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.references import SensorHealth, reference_of
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -219,9 +219,9 @@ def test_skip_repeat_and_cancel(tmp_path):
     # 0 is left for good; 1 is left, done again; 3 is left when the scan is cancelled
     assert touched == [0, 1, 1, 2, 3]
     assert [result.outcome for result in run.latest] == [
-        Outcome.SKIPPED,
-        Outcome.DONE,
-        Outcome.DONE,
+        PointOutcome.SKIPPED,
+        PointOutcome.DONE,
+        PointOutcome.DONE,
     ]
     assert run.next_point.index == 3
     assert not bench.holding
@@ -237,7 +237,7 @@ def test_skip_repeat_and_cancel(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("request_", "first"), [(Request.SKIP, Outcome.SKIPPED), (Request.REPEAT, Outcome.DONE)]
+    ("request_", "first"), [(Request.SKIP, PointOutcome.SKIPPED), (Request.REPEAT, PointOutcome.DONE)]
 )
 def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
     tmp_path, request_, first
@@ -254,7 +254,7 @@ def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
     summary, run, _ = scan(tmp_path / "run", scene(2), Asked(), controls)
     assert not asked
     assert summary.complete
-    assert [result.outcome for result in run.latest] == [first, Outcome.DONE]
+    assert [result.outcome for result in run.latest] == [first, PointOutcome.DONE]
     assert len([file for file in run.files if file.name.startswith("reference-")]) == 2
 
 

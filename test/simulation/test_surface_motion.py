@@ -7,7 +7,7 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import Plane, Plant, RigidTip
+from tactile_resonance.simulation.plant import FlatSurface, Plant, RigidTip
 from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.scene import read_scene
@@ -69,7 +69,7 @@ def test_phases_follow_from_the_seed():
 def test_a_tip_that_stands_is_pressed_as_the_tissue_rises():
     """Hertz at the depth that place and motion make, on a surface that is tilted."""
     tilt, depth_m = 0.2, 3e-4
-    surface = Plane.tilted(0.1, tilt)
+    surface = FlatSurface.tilted(0.1, tilt)
     tissue = Tissue("elastic", MODULUS_PA, (), ())
 
     def tip(found):

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import Plane, Plant, RigidTip
+from tactile_resonance.simulation.plant import FlatSurface, Plant, RigidTip
 from tactile_resonance.simulation.robot.machine import MachineConfig
 from tactile_resonance.simulation.robot.safety import SafetyMode
 from tactile_resonance.simulation.tissue import Tissue
@@ -33,7 +33,7 @@ def hertz(depth_m: float) -> float:
 def plant() -> Plant:
     rubber = Tissue("rubber", MODULUS_PA, (), ())
     return Plant(
-        Plane.tilted(TOUCH_Z - RADIUS_M),
+        FlatSurface.tilted(TOUCH_Z - RADIUS_M),
         lambda _: rubber,
         lambda tissue: RigidTip(Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=POISSON)),
         tip_radius_m=RADIUS_M,
