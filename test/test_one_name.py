@@ -5,14 +5,13 @@ import ast
 from collections import Counter
 from pathlib import Path
 
-import tactile_resonance
+from tactile_resonance import cli
 
 
 def test_no_two_classes_have_one_name():
-    (folder,) = {Path(path) for path in tactile_resonance.__path__ if (Path(path) / "cli.py").exists()}
     names = Counter(
         node.name
-        for path in folder.rglob("*.py")
+        for path in Path(cli.__file__).parent.rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.ClassDef)
     )
