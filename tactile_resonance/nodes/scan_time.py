@@ -55,6 +55,10 @@ class ScanTime:
             self._clock.close()
             self._clock = None
 
+    def patience_s(self, real_s: float) -> float:
+        """Longest wait for nodes at work: in simulated time for as long as one may be silent [s]."""
+        return self.silent_s if self.simulated else real_s
+
     def now_s(self) -> float:
         """Time for durations [s]; never goes back."""
         if not self.simulated:
