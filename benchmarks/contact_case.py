@@ -16,11 +16,11 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.indenter import Ball, Indenter
-from tactile_resonance.simulation.parameters import read_sensor
-from tactile_resonance.simulation.surfaces import Plane, Surface
+from tactile_resonance.simulation.surfaces import FlatSurface, PlantSurface
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters
@@ -110,7 +110,7 @@ class Rig:
         case: Case,
         setup: Setup,
         *,
-        surface: Surface | None = None,
+        surface: PlantSurface | None = None,
         adhesion_j_per_m2: float = 0.0,
         meets: Callable[[Indenter], Ball] | None = None,
         period_s: float = 0.002,
@@ -118,7 +118,7 @@ class Rig:
         self.touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], case.radius_m)
         bench = self.bench = ContactBench(
             case.tissue(),
-            surface or Plane.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
+            surface or FlatSurface.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
             Pose(self.touch.position_m + [0, 0, STANDOFF_M], self.touch.rotation_rad),
             tip=Tip(
                 case.radius_m,

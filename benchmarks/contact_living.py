@@ -21,7 +21,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.obstacles import Clinging, OnBone
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import Sphere
+from tactile_resonance.simulation.surfaces import RoundSurface
 
 HOLD_S, SETTLED_S, SOFT_PA = 4.0, 0.5, 3e3
 """Held for so long; drawn back within 10 s and this; modulus of the layer on bone."""
@@ -236,7 +236,7 @@ def drawn(row: Row, seed: int) -> tuple[Rig, float]:
         radius = abs(row.curvature_m)
         # its top, or bottom, at the height of the case and up to 1 mm beside the place asked for
         centre = np.array([*rng.uniform(-1e-3, 1e-3, 2), case.height_m - row.curvature_m])
-        surface = Sphere(centre, radius, hollow=row.curvature_m < 0)
+        surface = RoundSurface(centre, radius, hollow=row.curvature_m < 0)
     rig = Rig(
         case,
         Setup(row.name, beam=row.beam),

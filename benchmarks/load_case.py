@@ -20,7 +20,7 @@ import numpy as np
 
 from tactile_resonance.processes import end_with_parent
 from tactile_resonance.scan.bench_truth import deviations, truths_of
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 
 LONGEST_S = 1800.0
@@ -191,7 +191,7 @@ def findings(run_folder: Path) -> Findings:
         return Findings(0, 0, (), np.nan, np.nan)
     run = read_run(run_folder)
     truths = truths_of(run)
-    done = [result for result in run.latest if result.outcome is Outcome.DONE]
+    done = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     forces = [(r.force_n - truths[r.index].force_n) / r.force_std_n for r in done]
     return Findings(
         len(done),

@@ -16,9 +16,9 @@ from tactile_resonance.action import Measure
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
-from tactile_resonance.nodes.conversions import record_from_message
 from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S
 from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.recording.messages import record_from_message
 
 TOPICS = {"bench/block": msg.Record, "record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}
 ALL_WITHIN_S = 60.0

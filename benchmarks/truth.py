@@ -275,9 +275,7 @@ def _creep_row(name: str, blocks: int, count: int) -> str:
         constant.append(_poles_of(bench.start(tissue, seed=seed, **middle), blocks, seed))
     errors, rates, inside, instants = [], [], [], []
     for poles in found:
-        covariance = (
-            poles.covariance if poles.total_covariance is None else poles.total_covariance
-        )[0]
+        covariance = poles.best_covariance[0]
         error = np.array([poles.f0_hz[0], poles.damping_ratio[0]]) - mean
         errors.append(error / np.sqrt(np.diag(covariance)))
         inside.append(error @ np.linalg.solve(covariance, error) < INSIDE)

@@ -17,14 +17,15 @@ from benchmarks.twist_controller import TwistController
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
-from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES
+from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.surfaces import Plane
+from tactile_resonance.simulation.surfaces import FlatSurface
 
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
 CLEAR_M = 0.02
@@ -59,7 +60,7 @@ class TwistStub:
         start = Pose.from_vector(np.array(TABLE_IN_BASE))
         bench = ContactBench(
             self._tissues[tissue],
-            Plane(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
+            FlatSurface(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
             Pose(start.position_m + [0.0, 0.0, CLEAR_M], start.rotation_rad),
             tip=Tip(sensor.tip.radius_m, sensor_modes(sensor)),
             seed=seed,

@@ -277,12 +277,7 @@ def as_text(analysis: Analysis) -> str:
         f"(expected {poles.expected_cost:.4g}), variance {poles.variance_model}",
     ]
     for k, pole in enumerate(poles.poles_rad_s):
-        f0_std = damping_std = float("nan")
-        covariance = (
-            poles.total_covariance if poles.total_covariance is not None else poles.covariance
-        )
-        if covariance is not None:
-            f0_std, damping_std = np.sqrt(np.diag(covariance[k]))
+        f0_std, damping_std = np.sqrt(np.diag(poles.best_covariance[k]))
         lines.append(
             f"mode: f0 {poles.f0_hz[k]:.4f} +- {f0_std:.2g} Hz, damping ratio "
             f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, pole {pole.real:.3f} "

@@ -136,8 +136,8 @@ class _Bench:
 
         from tactile_resonance.contact.interfaces import Mount
         from tactile_resonance.contact.samples import Pose
+        from tactile_resonance.sensor import read_sensor
         from tactile_resonance.simulation.library import read_tissues
-        from tactile_resonance.simulation.parameters import read_sensor
         from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
         from tactile_resonance.simulation.scene import read_scene
 

@@ -50,7 +50,7 @@ class DeviceInfo:
 
 
 @dataclass(frozen=True)
-class Block:
+class AcquiredBlock:
     """One period of both channels.
 
     Attributes
@@ -100,7 +100,7 @@ class AcquisitionDevice(Protocol):
         """Start output and inputs together, from rest."""
         ...
 
-    def read_block(self, timeout_s: float) -> Block:
+    def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next period. No block is skipped: a device that lost one raises."""
         ...
 

@@ -24,7 +24,7 @@ CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
 
 @dataclass(frozen=True)
-class Command:
+class CellCommand:
     """A frame to the cell, and whether it answers."""
 
     name: str
@@ -75,7 +75,7 @@ class CanDescription:
     full_scale_counts : int or None
         At and beyond which a count is an overload.
     command_id : int or None
-    stop, start, setup : Command or None, tuple of Command
+    stop, start, setup : CellCommand or None, tuple of CellCommand
     rates : dict
         From wrenches a second to the command that sets it; empty where the rate is fixed.
     request : bytes or None
@@ -93,10 +93,10 @@ class CanDescription:
     invalid_counts: tuple[int, ...] = ()
     full_scale_counts: int | None = None
     command_id: int | None = None
-    stop: Command | None = None
-    start: Command | None = None
-    setup: tuple[Command, ...] = ()
-    rates: dict[int, Command] = field(default_factory=dict)
+    stop: CellCommand | None = None
+    start: CellCommand | None = None
+    setup: tuple[CellCommand, ...] = ()
+    rates: dict[int, CellCommand] = field(default_factory=dict)
     request: bytes | None = None
     reply: Reply | None = None
 
@@ -265,7 +265,7 @@ def _commands(part: Any, most_id: int, size: int) -> dict[str, Any]:
     result: dict[str, Any] = {"command_id": command_id}
     for name in ("stop", "start"):
         if part.get(name) is not None:
-            result[name] = Command(name, _bytes(part[name], f"commands.{name}"), False)
+            result[name] = CellCommand(name, _bytes(part[name], f"commands.{name}"), False)
     if part.get("request") is not None:
         result["request"] = _bytes(part["request"], "commands.request")
     setup = []
@@ -274,12 +274,12 @@ def _commands(part: Any, most_id: int, size: int) -> dict[str, Any]:
         require(isinstance(item, dict), where, item, "fields with values")
         known_keys(item, {"name", "data", "reply"}, where)
         data = _bytes(item.get("data"), f"{where}.data")
-        setup.append(Command(str(item.get("name", where)), data, bool(item.get("reply", True))))
+        setup.append(CellCommand(str(item.get("name", where)), data, bool(item.get("reply", True))))
     result["setup"] = tuple(setup)
     rates = part.get("rates") or {}
     require(isinstance(rates, dict), "commands.rates", rates, "commands by rate")
     result["rates"] = {
-        rate: Command(f"rate {rate} Hz", _bytes(data, f"commands.rates.{rate}"), True)
+        rate: CellCommand(f"rate {rate} Hz", _bytes(data, f"commands.rates.{rate}"), True)
         for rate, data in rates.items()
     }
     if part.get("reply") is not None:

@@ -17,7 +17,7 @@ from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import Bus, Flow, Frame, SocketcandBus, one_line, open_bus
-from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, Command
+from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, CellCommand
 from tactile_resonance.drivers.force_config import ForceConfig
 
 ANSWER_WITHIN_S = 0.25
@@ -224,7 +224,7 @@ class CanWrench:
             if time.monotonic() > deadline_s:
                 raise ForceError(ForceFault.SILENT, f"{self._where}: sends no wrench")
 
-    def _await_reply(self, bus: Bus, command: Command, within_s: float) -> None:
+    def _await_reply(self, bus: Bus, command: CellCommand, within_s: float) -> None:
         reply = self._can.description.reply
         assert reply is not None
         assembler = self._new_assembler()

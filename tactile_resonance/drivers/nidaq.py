@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.drivers.nidaq_calls import attempt, load, translated
 from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
 from tactile_resonance.drivers.nidaq_scale import CountScale
@@ -166,7 +166,7 @@ class NiDaqDevice:
     def interrupt(self) -> None:
         """Nothing: the library's call ends with its block."""
 
-    def read_block(self, timeout_s: float) -> Block:
+    def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next period, whole; on any error the output is set to 0 V first."""
         task, output, excitation = self._input, self._output, self._armed
         if excitation is None or task is None or output is None:
@@ -189,7 +189,7 @@ class NiDaqDevice:
         channels = [scale.channel(row) for scale, row in zip(self._scales, raw, strict=True)]
         if not self._config.actuator:
             channels.insert(0, Channel(self._drive))
-        block = Block(
+        block = AcquiredBlock(
             self._index,
             self._start_ns + round(self._index * excitation.period_s * 1e9),
             channels[0],

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
@@ -184,7 +184,7 @@ class ReplayDevice:
         """End the wait for a block."""
         self._stopped.set()
 
-    def read_block(self, timeout_s: float) -> Block:
+    def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next block, when its last sample would have been taken; a gap is an error."""
         excitation = self._armed
         if excitation is None:
@@ -209,7 +209,7 @@ class ReplayDevice:
             )
         self._index += 1
         passed_ns = round(index * excitation.period_s * 1e9)
-        return Block(
+        return AcquiredBlock(
             index,
             record.origin.time_ns or self._start_ns + passed_ns,
             record.actuator,

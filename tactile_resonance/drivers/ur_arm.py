@@ -16,7 +16,7 @@ from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.rtde_stream import RtdeStream
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Command, Seen
+from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Seen, UrCommand
 from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, stop_fault
 from tactile_resonance.drivers.ur_states import StateReader
@@ -52,7 +52,7 @@ class UrArm:
         self.config, self.tip_in_tool = config, config.tip_in_flange
         self._time = ArmTime(time)
         self._dated = True  # False: states are dated once the loop knows the time again
-        self._pending: Command | None = None  # sent with the next time that the loop waits for
+        self._pending: UrCommand | None = None  # sent with the next time that the loop waits for
         self._heard_s = 0.0  # when the robot was last heard
         self._client: ClientProcess | None = None
         self._stream: RtdeStream | None = None
@@ -235,7 +235,7 @@ class UrArm:
             self._time.look_again()
             return
         self._time.name_ports(0 if self._stream is None else self._stream.local_port)
-        command, self._pending = self._pending or Command(NOTHING), None
+        command, self._pending = self._pending or UrCommand(NOTHING), None
 
         def check() -> None:
             client.look()
@@ -366,7 +366,7 @@ class UrArm:
     def _send(self, kind: bytes, twist: Six, acceleration_m_s2: float) -> None:
         assert self._client is not None
         self._number += 1
-        command = Command(kind, self._number, 0, 0, twist, acceleration_m_s2)
+        command = UrCommand(kind, self._number, 0, 0, twist, acceleration_m_s2)
         self._sent[self._number] = (kind, time.monotonic())
         if self._time.led is not None:
             self._pending = command  # with the next word on the time

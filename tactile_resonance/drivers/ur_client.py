@@ -33,9 +33,9 @@ from tactile_resonance.drivers.ur_exchange import (
     EXIT_ORDERLY,
     SPEED,
     STOP,
-    Command,
     Exchange,
     Seen,
+    UrCommand,
 )
 from tactile_resonance.drivers.ur_session import Session
 
@@ -75,7 +75,7 @@ class Client:
                     if message[:1] == b"{":
                         self._request(json.loads(message))
                     else:
-                        self._obey(Command.unpack(message))
+                        self._obey(UrCommand.unpack(message))
                 if self._session is not None:
                     self._keep_alive(self._session)
         except OwnerGoneError:
@@ -111,7 +111,7 @@ class Client:
             if message[:1] != SPEED or later[:1] not in (SPEED, STOP)
         ]
 
-    def _obey(self, command: Command) -> None:
+    def _obey(self, command: UrCommand) -> None:
         session = self._session
         assert session is not None
         if command.kind == STOP:

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, Command, Exchange
+from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, Exchange, UrCommand
 
 GRACE_S = 1.5
 # Of what ur_rtde 1.6.5 writes when it finds its connection lost.
@@ -85,7 +85,7 @@ class ClientProcess:
                 return
         raise self._death()
 
-    def send(self, command: Command) -> None:
+    def send(self, command: UrCommand) -> None:
         """Send a command and do not wait. Raises ArmError where the client is gone."""
         try:
             self._commands.send(command.pack(), socket.MSG_DONTWAIT)

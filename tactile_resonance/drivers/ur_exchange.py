@@ -23,7 +23,7 @@ _COMMAND = struct.Struct("<cxxxxxxxqqq7d")
 EXIT_ORDERLY, EXIT_BROKEN, EXIT_LINK_LOST = 0, 1, 3
 
 
-class Command(NamedTuple):
+class UrCommand(NamedTuple):
     """One message of the owner.
 
     Attributes
@@ -51,7 +51,7 @@ class Command(NamedTuple):
         return _COMMAND.pack(*self[:4], *self.twist, self.acceleration)
 
     @classmethod
-    def unpack(cls, data: bytes) -> Command:
+    def unpack(cls, data: bytes) -> UrCommand:
         """From what was sent."""
         values = _COMMAND.unpack(data)
         return cls(*values[:4], values[4:10], values[10])

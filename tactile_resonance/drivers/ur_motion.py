@@ -17,7 +17,7 @@ CYCLE_S = 0.002
 REST = (0.0,) * 6
 
 
-class Motion:
+class UrMotion:
     """Speeds and stops; each call returns whether the robot took it.
 
     Parameters

@@ -17,7 +17,7 @@ import rtde_control
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_motion import Motion
+from tactile_resonance.drivers.ur_motion import UrMotion
 from tactile_resonance.processes import take_priority
 
 # The library watches the robot in a thread that wakes for every state; commands need no more than this, and at
@@ -42,11 +42,11 @@ class Session:
     ----------
     config : UrArmConfig
     control : rtde_control.RTDEControlInterface
-    motion : Motion
+    motion : UrMotion
     """
 
     control: rtde_control.RTDEControlInterface
-    motion: Motion
+    motion: UrMotion
 
     def __init__(self, config: UrArmConfig, clock: SimulatedClock | None) -> None:
         self.config, self._clock = config, clock
@@ -114,7 +114,7 @@ class Session:
         if not control.setWatchdog(config.watchdog_hz):
             raise ArmError(ArmFault.COMMAND_REFUSED, "setWatchdog was refused")
         self._limit_time()
-        self.motion = Motion(control)
+        self.motion = UrMotion(control)
         self.motion.feed()
 
     def _settle(self) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock, Demand, SimulatedClock, WallClock
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_client_process import ClientProcess
-from tactile_resonance.drivers.ur_exchange import NOTHING, Command
+from tactile_resonance.drivers.ur_exchange import NOTHING, UrCommand
 
 # In simulated time, between two looks at an arm that is not connected.
 AWAY_S = 0.002
@@ -97,7 +97,7 @@ class ArmTime:
             self.led.ask_ns()  # answered after the ports were received
             self._named_ports = ports
 
-    def send(self, client: ClientProcess, command: Command, until_ns: int, demand: Demand) -> None:
+    def send(self, client: ClientProcess, command: UrCommand, until_ns: int, demand: Demand) -> None:
         """Send a command, and up to which time [ns] the bench may go on after it."""
         with self._speaking:
             self._until_ns, self._said_s = until_ns, time.monotonic()
@@ -109,7 +109,7 @@ class ArmTime:
         """Make a wait that does not demand time demand it: something needs it now. From any thread."""
         with contextlib.suppress(ArmError), self._speaking:
             self._hurried = True  # the loop may be about to send that it needs no time
-            client.send(Command(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
+            client.send(UrCommand(NOTHING, until_ns=self._until_ns, demand=int(Demand.FAST)))
 
     def look_again(self) -> None:
         """Wait a moment of this machine's time, and ask for the bench's, which the arm does not hold."""

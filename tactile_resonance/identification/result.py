@@ -32,6 +32,50 @@ class PolesStatus(Enum):
     TRUTH = "truth"
 
 
+@dataclass(frozen=True, eq=False)
+class MainMode:
+    """The mode that is meant where one is asked for: see `Poles.main`.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio; NaN where no pole was found.
+    covariance, noise : (2, 2) float
+        Of the estimate: of `Poles.best_covariance`, and from noise alone; NaN where unknown.
+    pole_rad_s : complex
+        With positive imaginary part.
+    drift, drift_std : (2,) float
+        What f0 [Hz/s] and damping ratio [1/s] change by, and its deviation; NaN where no change shows.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+    noise: FloatArray
+    pole_rad_s: complex
+    drift: FloatArray
+    drift_std: FloatArray
+
+    @property
+    def f0_hz(self) -> float:
+        """Undamped natural frequency."""
+        return float(self.estimate[0])
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio."""
+        return float(self.estimate[1])
+
+    @property
+    def std(self) -> FloatArray:
+        """(2,) standard deviations of f0 [Hz] and damping ratio; NaN where unknown."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pole."""
+        return bool(np.isfinite(self.estimate[0]))
+
+
 @dataclass(frozen=True)
 class Poles:
     """Poles of the identified model, one entry per complex pair inside the band.
@@ -114,6 +158,37 @@ class Poles:
     method: str = ""
     status: PolesStatus = PolesStatus.FAILED
     message: str = ""
+
+    @property
+    def best_covariance(self) -> FloatArray:
+        """(n, 2, 2) of (f0_hz, damping_ratio): in total where known, else from noise; NaN where neither is."""
+        best = np.full((self.f0_hz.size, 2, 2), np.nan)
+        for known in (self.covariance, self.total_covariance):
+            if known is not None:
+                finite = np.all(np.isfinite(known), axis=(1, 2))
+                best[finite] = known[finite]
+        return best
+
+    @property
+    def main(self) -> MainMode:
+        """The mode with the highest peak, ``|residue| / |Re pole|``; all NaN where no pole was found."""
+        nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+        if not self.f0_hz.size:
+            return MainMode(nothing, unknown, unknown, complex("nan+nanj"), nothing, nothing)
+        k = int(np.argmax(np.abs(self.residues) / np.abs(self.poles_rad_s.real)))
+        drift, drift_std = nothing, nothing
+        f0_drift, damping_drift = self.f0_drift_hz_per_s, self.damping_drift_per_s
+        if f0_drift is not None and damping_drift is not None and self.drift_covariance is not None:
+            drift = np.array([f0_drift[k], damping_drift[k]])
+            drift_std = np.sqrt(np.diag(self.drift_covariance[k]))
+        return MainMode(
+            estimate=np.array([self.f0_hz[k], self.damping_ratio[k]]),
+            covariance=self.best_covariance[k],
+            noise=unknown if self.covariance is None else self.covariance[k],
+            pole_rad_s=complex(self.poles_rad_s[k]),
+            drift=drift,
+            drift_std=drift_std,
+        )
 
 
 STATUSES = tuple(PolesStatus)

@@ -10,8 +10,8 @@ import time
 from rosgraph_msgs.msg import Clock
 
 from tactile_resonance.clock import ClockLostError, SimulatedClock, time_address
-from tactile_resonance.nodes.conversions import time_message
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.simulation.bench_time import BenchTime
 from tactile_resonance.simulation.robot.reactor import Reactor
 

@@ -12,16 +12,13 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.clock import ClockLostError, SimulatedClock
-from tactile_resonance.drivers.acquisition import Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.conversions import (
-    excitation_to_message,
-    record_from_message,
-    time_from_message,
-)
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.record import BetweenSamples, InputKind
+from tactile_resonance.recording.messages import record_from_message, time_from_message
 from tactile_resonance.srv import Play
 
 ANSWER_TIMEOUT_S = 10.0
@@ -102,7 +99,7 @@ class BenchDevice:
         if (clock := self._clock) is not None:
             clock.interrupt()
 
-    def read_block(self, timeout_s: float) -> Block:
+    def read_block(self, timeout_s: float) -> AcquiredBlock:
         """Next block of what is armed; blocks of what was stopped before are passed over."""
         if self._armed is not None and self._clock is not None:
             self._wait_for_time(self._clock, self._armed)
@@ -123,7 +120,7 @@ class BenchDevice:
             raise DeviceError(f"device: block {self._next_index} lost, got {message.block_index}")
         self._next_index += 1
         record = record_from_message(message)
-        return Block(record.block_index, record.origin.time_ns, record.actuator, record.sensor)
+        return AcquiredBlock(record.block_index, record.origin.time_ns, record.actuator, record.sensor)
 
     def stop(self) -> None:
         """Silence the bench, where there is one."""

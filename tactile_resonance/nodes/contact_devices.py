@@ -23,7 +23,7 @@ from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.nodes.twist_arm import TwistArm
 from tactile_resonance.processes import may_take_priority, take_priority
-from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.sensor import read_sensor
 
 PARAMETERS = (
     Parameter(

@@ -23,7 +23,6 @@ from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
-from tactile_resonance.nodes.contact_messages import contact_goal, feedback_message, result_message
 from tactile_resonance.nodes.contact_parameters import (
     contact_parameters,
     limits_of_launch,
@@ -36,6 +35,7 @@ from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.stop_input import StopInput
@@ -261,7 +261,7 @@ class ContactNode(ManagedNode):
             result.cause, result.message = "stopped", "contact_node was stopped"
             goal.abort()
             return result
-        result = result_message(outcome)
+        result = contact_result(outcome)
         if goal.is_cancel_requested:
             goal.canceled()
         elif outcome.reached:
@@ -308,7 +308,7 @@ class ContactNode(ManagedNode):
         self._forces.look()
         if self._goal is not None:
             controller = thread.controller
-            feedback = feedback_message(controller.state.value, controller.estimate)
+            feedback = contact_feedback(controller.state.value, controller.estimate)
             self._goal.publish_feedback(feedback)
 
     def _look(self) -> None:

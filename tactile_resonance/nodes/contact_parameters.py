@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import inspect
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -14,25 +12,30 @@ import numpy as np
 from rclpy.node import Node
 
 from tactile_resonance.contact.parameters import (
-    LIMIT_RANGES,
-    RANGES,
     STRICTER_ABOVE,
     STRICTER_BELOW,
     ContactParameters,
     Limits,
     Workspace,
+    ranges_of,
     read_contact,
 )
 from tactile_resonance.fields import numbers, require
 from tactile_resonance.nodes.parameters import Parameter
 
-_GROUPS = {"contact": (ContactParameters, RANGES), "limits": (Limits, LIMIT_RANGES)}
+_GROUPS = {"contact": ContactParameters, "limits": Limits}
 # The control loop's period is that of the running loop.
 _READ_ONLY = frozenset({"contact.period_s"})
 _LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
+_CORNERS = "Opposite corners of the box in which the tip may be, in the base [m]."
 _AT_MOST = frozenset(
     {
-        *(f"{g}.{n}" for g, (_, ranges) in _GROUPS.items() for n in ranges if n in STRICTER_BELOW),
+        *(
+            f"{g}.{n}"
+            for g, kind in _GROUPS.items()
+            for n in ranges_of(kind)
+            if n in STRICTER_BELOW
+        ),
         _HIGH,
     }
 )
@@ -42,24 +45,19 @@ _AT_LEAST = frozenset({*(f"limits.{name}" for name in STRICTER_ABOVE), _LOW})
 def contact_parameters() -> tuple[Parameter, ...]:
     """One parameter for each number and corner, the defaults from ``config/contact.yaml``."""
     made = []
-    for (group, (kind, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        descriptions = _descriptions(kind)
-        for name, (low, high) in ranges.items():
+    for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
+        for name, accepted in ranges_of(kind).items():
             full = f"{group}.{name}"
+            limits = (accepted.low, accepted.high)
             made.append(
                 Parameter(
-                    full,
-                    getattr(defaults, name),
-                    descriptions[name],
-                    low,
-                    high,
+                    *(full, getattr(defaults, name), accepted.description, *limits),
                     read_only=full in _READ_ONLY,
                 )
             )
-    box, descriptions = _defaults()[1].workspace, _descriptions(Workspace)
-    for full, corner in ((_LOW, "low_m"), (_HIGH, "high_m")):
-        made.append(Parameter(full, list(getattr(box, corner)), descriptions[corner]))
-    return tuple(made)
+    box = _defaults()[1].workspace
+    corners = ((_LOW, box.low_m), (_HIGH, box.high_m))
+    return (*made, *(Parameter(full, list(corner), _CORNERS) for full, corner in corners))
 
 
 def limits_of_launch(node: Node) -> dict[str, Any]:
@@ -96,8 +94,9 @@ def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limi
         return changed.get(full, node.get_parameter(full).value)
 
     read = []
-    for (group, (_, ranges)), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        read.append(replace(defaults, **{name: value(f"{group}.{name}") for name in ranges}))
+    for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
+        given = {name: value(f"{group}.{name}") for name in ranges_of(kind)}
+        read.append(replace(defaults, **given))
     parameters, limits = read
     corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
     limits = replace(limits, workspace=Workspace(*corners))
@@ -109,13 +108,3 @@ def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limi
 def _defaults() -> tuple[ContactParameters, Limits]:
     """Of the file, read once: in a contact parsing would hold up the control loop."""
     return read_contact()
-
-
-def _descriptions(kind: type) -> dict[str, str]:
-    """What the class's docstring says of each attribute."""
-    text = (inspect.getdoc(kind) or "").split("Attributes\n----------\n", 1)[1]
-    descriptions = {}
-    for names, body in re.findall(r"^(\S.*?) : .*\n((?:    .*\n?)+)", text + "\n", re.MULTILINE):
-        for name in names.split(", "):
-            descriptions[name] = " ".join(body.split())
-    return descriptions

@@ -9,12 +9,12 @@ from typing import Protocol
 
 from geometry_msgs.msg import PoseStamped
 
-from tactile_resonance.nodes.conversions import contact_from_message, time_message
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.record import Contact
-from tactile_resonance.recording.from_messages import spread_from_message
+from tactile_resonance.recording.messages import contact_from_message, spread_from_message
 from tactile_resonance.srv import ForceOver
 
 PARAMETER = Parameter(

@@ -11,9 +11,9 @@ from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.nodes.contact_messages import pose_message, state_message, wrench_message
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import contact_state, tip_pose, wrench_message
 from tactile_resonance.nodes.running import STREAM, RCLError
 from tactile_resonance.nodes.stop_input import StopInput
 
@@ -75,11 +75,13 @@ class ContactTopics:
     def _publish(self, wrenches: list[WrenchSample], cycle: Cycle, thread: ContactThread) -> None:
         ros_ns = thread.clock.ros_ns
         if cycle.arm is not None and self._pose.get_subscription_count():
-            self._pose.publish(pose_message(cycle.arm, ros_ns, self._base_frame))
+            arm = cycle.arm
+            pose = (arm.position_m, arm.rotation_rad)
+            self._pose.publish(tip_pose(ros_ns(arm.time_ns), self._base_frame, *pose))
         if wrenches and self._wrench.get_subscription_count():
             self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
-        state = state_message(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
+        state = contact_state(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
         if cycle.state is State.HOLD:
             state.message = controller.motion
         state.cycles, state.overruns = loop.cycles, loop.overruns

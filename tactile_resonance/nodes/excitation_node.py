@@ -11,12 +11,17 @@ from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import AcquisitionDevice, Block, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import (
+    AcquiredBlock,
+    AcquisitionDevice,
+    DeviceError,
+    DeviceInfo,
+)
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
-from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
 from tactile_resonance.record import Contact, Origin, Record
@@ -215,7 +220,7 @@ class ExcitationNode(ManagedNode):
         finally:
             self._device.stop()
 
-    def _read_block(self, timeout_s: float) -> Block:
+    def _read_block(self, timeout_s: float) -> AcquiredBlock:
         # in simulated time a block takes as long as it takes
         if not self.time_server:
             self._read_by_s = time.monotonic() + timeout_s + HUNG_S
@@ -224,7 +229,7 @@ class ExcitationNode(ManagedNode):
         finally:
             self._read_by_s = float("inf")
 
-    def _record(self, block: Block, excitation: Excitation, info: DeviceInfo) -> Record:
+    def _record(self, block: AcquiredBlock, excitation: Excitation, info: DeviceInfo) -> Record:
         last_period = block.index == excitation.periods - 1
         last_realisation = excitation.realisation == excitation.realisations - 1
         return Record(

@@ -19,21 +19,16 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
 from tactile_resonance.nodes.bench_player import BenchPlayer, bench_record
-from tactile_resonance.nodes.conversions import (
-    excitation_from_message,
-    pose_to_message,
-    record_to_message,
-    time_message,
-    truth_to_response,
-)
 from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.messages import pose_to_message, record_to_message, time_message
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
 from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, run_node
 from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.truth_topic import TruthTopic
+from tactile_resonance.nodes.truth_topic import TruthTopic, truth_to_response
 from tactile_resonance.record import Contact
+from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun

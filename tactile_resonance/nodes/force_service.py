@@ -7,16 +7,15 @@ import math
 import time
 from collections.abc import Callable
 
-from geometry_msgs.msg import PoseStamped
 from rclpy.task import Future
 
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.force_over import ForceRecord
 from tactile_resonance.contact.goal import TARED, State
 from tactile_resonance.contact.loop import Cycle
-from tactile_resonance.nodes.contact_messages import place_tip
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import tip_pose
+from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.srv import ForceOver
 
 WAIT_S = 0.2
@@ -106,9 +105,8 @@ class ForceService:
         if self._state is State.IDLE and over.reason:
             response.reason = "no contact was under way"
         if not math.isnan(over.position_m[0]):
-            pose = PoseStamped()
-            pose.header.stamp = time_message(clock.ros_ns((start_ns + end_ns) // 2))
-            pose.header.frame_id = self._base_frame
-            place_tip(pose, over.position_m, over.rotation_rad)
-            response.tip_pose = pose
+            middle_ns = clock.ros_ns((start_ns + end_ns) // 2)
+            response.tip_pose = tip_pose(
+                middle_ns, self._base_frame, over.position_m, over.rotation_rad
+            )
         return response

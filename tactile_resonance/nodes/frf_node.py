@@ -9,15 +9,12 @@ from tactile_resonance import msg
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.conversions import (
-    excitation_from_message,
-    frf_to_message,
-    record_from_message,
-)
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import frf_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
 from tactile_resonance.record import Record
+from tactile_resonance.recording.messages import excitation_from_message, record_from_message
 
 MOST_WAITING = 64
 

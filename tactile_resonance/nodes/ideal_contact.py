@@ -23,11 +23,12 @@ from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.goal import State
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.stop_input import StopInput
+from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.srv import ForceOver
 
 CONTACT_S = 0.5

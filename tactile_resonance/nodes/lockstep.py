@@ -15,8 +15,8 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from tactile_resonance.clock import Demand
-from tactile_resonance.nodes.conversions import time_from_message
 from tactile_resonance.nodes.running import PLACES
+from tactile_resonance.recording.messages import time_from_message
 
 POLL_S = 0.1
 LOST_S = 1.0

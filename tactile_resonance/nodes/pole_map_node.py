@@ -13,11 +13,11 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
-from tactile_resonance.nodes.conversions import poles_from_message
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.map_messages import (
     cloud_message,
     header_message,
@@ -27,7 +27,7 @@ from tactile_resonance.scan.map_messages import (
     surface_message,
 )
 from tactile_resonance.scan.messages import to_cdr
-from tactile_resonance.scan.point_result import Kind, Outcome, from_message
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, from_message
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
     MapPoint,
@@ -181,10 +181,10 @@ class PoleMapNode(ManagedNode):
         """The latest result of a point of tissue that is not discarded replaces what was there before."""
         self.health.saw("point_result")
         result = from_message(message)
-        if result.kind is not Kind.TISSUE or result.outcome is Outcome.DISCARDED:
+        if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
             return
         now = self._map.without(result.position_m, result.frame_id)
-        if result.outcome is not Outcome.SKIPPED and message.poles:
+        if result.outcome is not PointOutcome.SKIPPED and message.poles:
             point = self._point(message.poles[0], result.contact_age_s)
             if point is not None:
                 now = now.with_point(accepted_point(result, point))

@@ -9,14 +9,11 @@ from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_f
 from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.nodes.conversions import (
-    frf_from_message,
-    origin_from_message,
-    poles_to_message,
-)
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, RESULTS, run_node
+from tactile_resonance.recording.messages import origin_from_message
 
 PARAMETERS = (
     Parameter("band_low_hz", 200.0, "Lower end of the band of the fit [Hz].", 0.0, 1e6),

@@ -31,68 +31,39 @@ RCLError = rclpy_implementation.RCLError
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """This machine's clock, for timers that must go on while simulated time stands."""
 
+
+def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
-RESULTS = QoSProfile(
-    depth=256, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
-)
+RESULTS = _qos(256)
 # Static metadata and maps: late readers get the last one.
-LATCHED = QoSProfile(
-    depth=1,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED = _qos(1, latched=True)
 # Excitations: late readers get those of the measurement under way, however many realisations it has.
-EXCITATIONS = QoSProfile(
-    depth=64,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+EXCITATIONS = _qos(64, latched=True)
 # Truths: one with each block, and those of two blocks may leave the bench together.
-TRUTHS = QoSProfile(
-    depth=64,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+TRUTHS = _qos(64, latched=True)
 # Poles: small, and a map that is started or restarted in mid-scan gets those it missed.
-POLES = QoSProfile(
-    depth=1024,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+POLES = _qos(1024, latched=True)
 # What became of the points: late readers get all of a scan.
-POINT_RESULTS = QoSProfile(
-    depth=4096,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+POINT_RESULTS = _qos(4096, latched=True)
 # Poses and wrenches: the newest counts.
-STREAM = QoSProfile(
-    depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-NEWEST = QoSProfile(
-    depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+STREAM = _qos(5, reliable=False)
+NEWEST = _qos(1, reliable=False)
 # Where the tip is put, by those who put it there: the bench must hear it before it plays.
-PLACES = QoSProfile(
-    depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
-)
+PLACES = _qos(5)
 # To a controller: only the newest counts, and it must arrive.
-COMMANDS = QoSProfile(
-    depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE
-)
-# Of a recording: two seconds of what is published at 50 Hz may wait.
-SERIES = QoSProfile(
-    depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+COMMANDS = _qos(1)
+# Of a recording, and from a sensor of another driver: what is published at 50 Hz may wait two seconds.
+SERIES = _qos(100, reliable=False)
 # Signs of life.
-BEATS = QoSProfile(
-    depth=10, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+BEATS = _qos(10, reliable=False)
 
 
 STDERR = 2  # its descriptor

@@ -52,7 +52,7 @@ QUIET = (
 """Phases in which no point is under way."""
 
 
-class ScanGoal(ScanClient):
+class ScanRequest(ScanClient):
     """A node of that name with the goal's fields as parameters."""
 
     def __init__(self) -> None:
@@ -100,7 +100,7 @@ def main() -> None:
     """Console script: 0 where every point of the plan is finished."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with ScanGoal() as client:
+        with ScanRequest() as client:
             outcome = client.run()
         sys.exit(0 if outcome.ending is Ending.COMPLETE else 1)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import queue
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,19 +13,17 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 
 from tactile_resonance import msg
-from tactile_resonance.action import Measure
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.nodes.conversions import poles_from_message, pose_to_message
-from tactile_resonance.nodes.excitation_design import GRIDS
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
+from tactile_resonance.nodes.goals import POLL_S, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.measure_client import MeasureClient
+from tactile_resonance.nodes.messages import pose_to_message
 from tactile_resonance.nodes.node_watch import Instances, NodeWatch
 from tactile_resonance.nodes.running import PLACES
-from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.hands import (
     Check,
     Measured,
@@ -36,20 +33,17 @@ from tactile_resonance.scan.hands import (
     Recording,
     ScanEnded,
     Stopped,
+    Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, Touch
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 
-DEVICE_BACK_WITHIN_S = 60.0
-RESULTS_WITHIN_S = 10.0
-"""All results of a measurement come within this after its last block, on the machine's clock; in simulated time
-a slow machine may take as long as a node may be silent."""
-NOT_READY_POLL_S = 0.2
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
-"""A place is received within this, on the machine's clock; in simulated time as `RESULTS_WITHIN_S`."""
+"""A place is received within this, on the machine's clock; in simulated time for as long as a node may
+be silent."""
 DISCOVERED_WITHIN_S = 10.0
 NOT_MOVED = "the tip is not moved (parameter contact is none)"
 RECORDERS = 1  # of the subscribers of tcp_pose: the scan's own
@@ -92,9 +86,7 @@ class NodeHands:
         self._time = scan_time
         self.free_air = with_robot
         self._tell_waiting = tell_waiting
-        client = GoalClient(node, Measure, "measure")
-        node.resources.callback(client.destroy)
-        self._measure = Goals(client, "measure")
+        self._measure = MeasureClient(node, scan_time)
         self._tip: TipContact | None = None
         if with_robot:
             self._tip = TipContact(node, scan_time, self._end_if_hung)
@@ -115,7 +107,7 @@ class NodeHands:
 
     def _listen(self) -> None:
         self._waited_for = ""
-        self._recorder = ScanRecorder(self._node)
+        self._measure.listen()
         topics = STREAM_TOPICS
         if self._tip is not None:
             self._tip.listen()
@@ -178,37 +170,29 @@ class NodeHands:
         check: Check,
     ) -> Measured:
         """Measure until it is enough or the design's end; all messages go into the recording."""
-        # its own id: another measurement may be under way, begun by a scan that was killed
-        recording.measurement_id = time.time_ns() // 1000
-        goal = Measure.Goal(
-            measurement_id=recording.measurement_id,
-            label=label,
-            grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
-            level_v=0.0 if design.silent else design.level_v,
-            silent=design.silent,
-            f_min_hz=design.f_min_hz,
-            f_max_hz=design.f_max_hz,
-            periods=design.periods,
-            realisations=design.realisations,
-            seed=seed,
-        )
-        self._recorder.record_into(recording, goal.measurement_id)
-        try:
-            with self._nodes.doubted_after(NodeAway):
-                seen = self._record(goal, enough, check)
-        finally:
-            self._recorder.stop()
-        if not seen:
-            raise PointFailed("measurement: it ended before its first block")
-        measured = self._measured(seen[-1])
-        origin = measured.origin
         touching = self._tip is not None and self._tip.touching
-        if touching and np.isnan(origin.contact.force_n):
-            reason = self._recorder.force_reason or "no record states why"
+
+        def enough_of(message: msg.Poles, blocks: int) -> bool:
+            return enough(self._measured(message), blocks)
+
+        with self._nodes.doubted_after(NodeAway):
+            if self._is_stopped():
+                raise Stopped
+            if missing := self.missing():
+                raise NodeAway(missing, "node away")
+            poll = self._poll_of([*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])])
+            held = (lambda: None) if self._tip is None else self._tip.check
+            last = self._measure.measure(
+                *(design, label, seed, enough_of, recording, check, poll, held)
+            )
+        if last is None:
+            raise PointFailed("measurement: it ended before its first block")
+        measured = self._measured(last)
+        contact, reason = measured.origin.contact, self._measure.force_reason
+        if touching and math.isnan(contact.force_n):
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
-        if origin.contact.position_m is None:
+        if contact.position_m is None:
             # a node that has just come up may not have discovered the one that knows it
-            reason = self._recorder.force_reason or "no record states why"
             text = f"measurement: the place of the tip is unknown: {reason}"
             raise PointDisturbed(text, "place unknown")
         return measured
@@ -227,68 +211,6 @@ class NodeHands:
         touched_ns = None if self._tip is None else self._tip.touched_ns
         age_s = math.nan if touched_ns is None else (origin.time_ns - touched_ns) * 1e-9
         return Measured(poles, origin, age_s)
-
-    def _record(
-        self, goal: Measure.Goal, enough: Callable[[Measured, int], bool], check: Check
-    ) -> list[msg.Poles]:
-        """The poles of a measurement, all of whose messages have come."""
-        if self._is_stopped():
-            raise Stopped
-        if missing := self.missing():
-            raise NodeAway(missing, "node away")
-        touching = self._tip is not None and self._tip.touching
-        poll = self._poll_of([*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])])
-        seen: list[msg.Poles] = []
-        stopping = [False]
-        news_s = [time.monotonic()]
-
-        def take_poles() -> None:
-            for message in self._new_poles():
-                seen.append(message)
-                news_s[0] = time.monotonic()
-                if stopping[0]:
-                    continue
-                if enough(self._measured(message), len(seen)):
-                    stopping[0] = True
-                    handle.cancel_goal_async()
-                else:
-                    self._time.go()
-
-        def each_poll() -> None:
-            take_poles()
-            poll()
-            if self._tip is not None:
-                self._tip.check()
-            if self._time.simulated and time.monotonic() - news_s[0] > self._time.silent_s:
-                raise PointDisturbed("no poles of a block came", "messages lost")
-
-        deadline = time.monotonic() + DEVICE_BACK_WITHIN_S
-        while True:
-            # once before the measurement and once after each block: every block that is handed over ends it
-            self._time.go()
-            handle = self._measure.send(goal, check, poll)
-            result = self._measure.follow(handle, check, each_poll)
-            if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
-                break
-            time.sleep(NOT_READY_POLL_S)
-        if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
-            raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
-        self._wait_for_results(result, check, poll)
-        take_poles()
-        return seen
-
-    def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
-        """Until every block's record, FRF and poles are in the recording, and all excitations."""
-        deadline = time.monotonic() + self._patience_s(RESULTS_WITHIN_S)
-        while missing := self._recorder.missing(result.blocks):
-            if time.monotonic() > deadline:
-                raise PointDisturbed(missing, "messages lost")
-            try:
-                poll()
-            except NodeAway as error:
-                raise NodeAway(f"{error}; {missing}", error.kind) from error
-            check()
-            time.sleep(POLL_S)
 
     def _poll_of(self, topics: list[str]) -> Poll:
         """Raises `NodeAway` where a node behind these topics is not at work any more."""
@@ -314,14 +236,6 @@ class NodeHands:
         if self._time.simulated and (problem := self._nodes.hung()):
             raise ScanEnded(f"{problem}; the run can be resumed")
 
-    def _new_poles(self) -> list[msg.Poles]:
-        messages = []
-        while True:
-            try:
-                messages.append(self._recorder.poles.get_nowait())
-            except queue.Empty:
-                return messages
-
     def _pose_of(self, point: ScanPoint) -> PoseStamped:
         """The point on the surface, in the robot's base."""
         turn = self.frame_in_base.rotation
@@ -343,8 +257,4 @@ class NodeHands:
             check()
             time.sleep(POLL_S)
         self._pose.publish(pose)
-        self._pose.wait_for_all_acked(Duration(seconds=self._patience_s(PLACED_WITHIN_S)))
-
-    def _patience_s(self, real_s: float) -> float:
-        """Longest wait for nodes at work: in simulated time for as long as one may be silent."""
-        return self._time.silent_s if self._time.simulated else real_s
+        self._pose.wait_for_all_acked(Duration(seconds=self._time.patience_s(PLACED_WITHIN_S)))

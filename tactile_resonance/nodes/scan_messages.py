@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goal, feedback and result of the action `scan`, from and to messages."""
+"""Goals, feedback and results of the actions `scan` and `calibrate_table`, from and to messages."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from tactile_resonance.action import Scan
+from tactile_resonance.action import CalibrateTable, Scan
+from tactile_resonance.identification.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
 from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import SensorHealth
+from tactile_resonance.scan.table_calibration import CalibrationRequest, TableCalibration
+from tactile_resonance.scan.table_file import NOT_ESTIMATED
+
+CALIBRATION_OPTIONS = (
+    *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
+    *("heading_rad", "sensor", "file"),
+)
 
 
-def goal_of(message: Scan.Goal) -> ScanGoal:
+def scan_goal(message: Scan.Goal) -> ScanGoal:
     """What a message asks for, not checked yet."""
     poses = tuple(
         (p.position.x, p.position.y, p.position.z)
@@ -28,7 +34,7 @@ def goal_of(message: Scan.Goal) -> ScanGoal:
     return ScanGoal(poses=poses, frame_id=message.poses.header.frame_id, **fields)
 
 
-def feedback_message(progress: Progress, run_directory: str) -> Scan.Feedback:
+def scan_feedback(progress: Progress, run_directory: str) -> Scan.Feedback:
     """Where a scan is, with the poles so far."""
     feedback = Scan.Feedback(
         run_directory=run_directory,
@@ -41,25 +47,13 @@ def feedback_message(progress: Progress, run_directory: str) -> Scan.Feedback:
         time_left_s=float(progress.time_left_s),
         repeats=progress.repeats,
     )
-    nan = math.nan
-    feedback.f0_hz = feedback.f0_std_hz = feedback.damping_ratio = feedback.damping_ratio_std = nan
-    poles = progress.poles
-    if poles is not None and poles.f0_hz.size:
-        feedback.f0_hz, feedback.damping_ratio = (
-            float(poles.f0_hz[0]),
-            float(poles.damping_ratio[0]),
-        )
-        covariance = (
-            poles.total_covariance if poles.total_covariance is not None else poles.covariance
-        )
-        if covariance is not None:
-            feedback.f0_std_hz, feedback.damping_ratio_std = np.sqrt(
-                np.diag(covariance[0])
-            ).tolist()
+    mode = Poles().main if progress.poles is None else progress.poles.main
+    feedback.f0_hz, feedback.damping_ratio = mode.estimate.tolist()
+    feedback.f0_std_hz, feedback.damping_ratio_std = mode.std.tolist()
     return feedback
 
 
-def fill_result(result: Scan.Result, summary: Summary) -> None:
+def fill_scan_result(result: Scan.Result, summary: Summary) -> None:
     """Write how a scan ended."""
     result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
     for name in (
@@ -69,3 +63,37 @@ def fill_result(result: Scan.Result, summary: Summary) -> None:
         setattr(result, name, getattr(summary, name))
     result.sensor_drifted = summary.health is SensorHealth.DRIFTED
     result.sensor_health = summary.health_sentence
+
+
+def calibration_request(message: CalibrateTable.Goal) -> CalibrationRequest:
+    """What a goal asks for; ValueError where it is wrong."""
+    given = {name: value for name in CALIBRATION_OPTIONS if (value := getattr(message, name))}
+    points = tuple((point.x, point.y, point.z) for point in message.points)
+    return CalibrationRequest(points, **given)
+
+
+def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:
+    """Result without a table: no figure of it is known."""
+    nan = math.nan
+    return CalibrateTable.Result(
+        outcome=outcome,
+        message=message,
+        table_in_base=[nan] * 6,
+        height_m=nan,
+        tilt_x_rad=nan,
+        tilt_y_rad=nan,
+        covariance=[nan] * 9,
+        reduced_chi_square=nan,
+    )
+
+
+def fill_calibration_result(result: CalibrateTable.Result, made: TableCalibration) -> None:
+    """Write a table that was found."""
+    result.outcome = result.DONE
+    result.message = f"{made}. {', '.join(NOT_ESTIMATED)}: as they were known"
+    result.table_in_base = made.table_in_base.vector
+    result.height_m, result.tilt_x_rad, result.tilt_y_rad = made.correction.tolist()
+    result.covariance = made.covariance.ravel()
+    result.residuals_m = made.residuals_m.tolist()
+    result.std_m = made.std_m.tolist()
+    result.reduced_chi_square = made.reduced_chi_square

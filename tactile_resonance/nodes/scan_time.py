@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
 
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.nodes.node_watch import SILENT_S
@@ -37,17 +38,26 @@ class ScanTime:
         self._clock: SimulatedClock | None = None
         self._offset_ns = self._last_ns = 0  # a bench that is started anew begins its time anew
 
-    def begin(self) -> None:
+    @contextlib.contextmanager
+    def conducted(self) -> Iterator[None]:
         """Conduct; a bench that cannot be reached now is tried again by `go`."""
         if self.simulated:
             with contextlib.suppress(ClockLostError):
                 self._join()
+        try:
+            yield
+        finally:
+            self._end()
 
-    def end(self) -> None:
+    def _end(self) -> None:
         """Conduct no more: time goes on at the pace of real time."""
         if self._clock is not None:
             self._clock.close()
             self._clock = None
+
+    def patience_s(self, real_s: float) -> float:
+        """Longest wait for nodes at work: in simulated time for as long as one may be silent [s]."""
+        return self.silent_s if self.simulated else real_s
 
     def now_s(self) -> float:
         """Time for durations [s]; never goes back."""
@@ -57,7 +67,7 @@ class ScanTime:
             try:
                 self._last_ns = self._clock.ask_ns() + self._offset_ns
             except ClockLostError:
-                self.end()
+                self._end()
         return self._last_ns * 1e-9
 
     def go(self) -> None:
@@ -70,7 +80,7 @@ class ScanTime:
             assert self._clock is not None
             self._clock.go()
             return
-        self.end()
+        self._end()
 
     def seed(self, *integers: int) -> None:
         """Let the noise of the bench follow from integers, three at most, from now on."""
@@ -78,7 +88,7 @@ class ScanTime:
             try:
                 self._clock.seed(*integers)
             except ClockLostError:
-                self.end()
+                self._end()
 
     def _join(self) -> None:
         clock = self._clock = SimulatedClock(self._server, "scan_node", conducts=True)

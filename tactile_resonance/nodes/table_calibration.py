@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goal, work and result of the action `calibrate_table`."""
+"""The work of the action `calibrate_table`."""
 
 from __future__ import annotations
 
@@ -12,31 +12,17 @@ from typing import BinaryIO
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance.action import CalibrateTable
-from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.scan_hands import NodeHands
+from tactile_resonance.nodes.scan_messages import fill_calibration_result, no_table
 from tactile_resonance.scan.goal import Frames
-from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.scan.table_calibration import (
     CalibrationRequest,
-    TableCalibration,
     calibrate_table,
 )
-from tactile_resonance.scan.table_file import NOT_ESTIMATED, as_text
-from tactile_resonance.simulation.parameters import read_sensor
-
-OPTIONS = (
-    *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
-    *("heading_rad", "sensor", "file"),
-)
-
-
-def request_of(message: CalibrateTable.Goal) -> CalibrationRequest:
-    """What a goal asks for; ValueError where it is wrong."""
-    given = {name: value for name in OPTIONS if (value := getattr(message, name))}
-    points = tuple((point.x, point.y, point.z) for point in message.points)
-    return CalibrationRequest(points, **given)
+from tactile_resonance.scan.table_file import as_text
+from tactile_resonance.sensor import sensor_named
 
 
 def calibrate(
@@ -62,7 +48,7 @@ def calibrate(
     who : str
         Made it, for the file.
     """
-    radius_m = read_sensor(share_path(f"config/sensors/{request.sensor}.yaml")).tip.radius_m
+    radius_m = sensor_named(request.sensor).tip.radius_m
     feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
 
     def touch(point: ScanPoint) -> Touch:
@@ -85,7 +71,7 @@ def calibrate(
         result.outcome, result.message = result.REFUSED, str(error)
         return result
     else:
-        _fill(result, made)
+        fill_calibration_result(result, made)
         if file is None:
             return result
         known = {
@@ -119,29 +105,3 @@ def _new_file(name: str) -> BinaryIO:
     except OSError as error:
         accepted = f"a new file in a folder that can be written ({error.strerror})"
         raise ValueError(f"file: got {name!r}; accepted is {accepted}") from error
-
-
-def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:
-    """Result without a table: no figure of it is known."""
-    nan = math.nan
-    return CalibrateTable.Result(
-        outcome=outcome,
-        message=message,
-        table_in_base=[nan] * 6,
-        height_m=nan,
-        tilt_x_rad=nan,
-        tilt_y_rad=nan,
-        covariance=[nan] * 9,
-        reduced_chi_square=nan,
-    )
-
-
-def _fill(result: CalibrateTable.Result, made: TableCalibration) -> None:
-    result.outcome = result.DONE
-    result.message = f"{made}. {', '.join(NOT_ESTIMATED)}: as they were known"
-    result.table_in_base = made.table_in_base.vector
-    result.height_m, result.tilt_x_rad, result.tilt_y_rad = made.correction.tolist()
-    result.covariance = made.covariance.ravel()
-    result.residuals_m = made.residuals_m.tolist()
-    result.std_m = made.std_m.tolist()
-    result.reduced_chi_square = made.reduced_chi_square

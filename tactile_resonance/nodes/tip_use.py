@@ -8,13 +8,12 @@ import time
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 
-from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.nodes.goals import POLL_S
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.simulation.parameters import read_sensor
+from tactile_resonance.sensor import sensor_named
 
 SERVICE = "contact_node/get_parameters"
 ANSWERED_WITHIN_S = 5.0
@@ -48,7 +47,7 @@ class TipUseClient:
         if len(told) != len(NAMES) or None in told:
             return None
         values = dict(zip((name.rpartition(".")[2] for name in NAMES), told, strict=True))
-        described = read_sensor(share_path(f"config/sensors/{sensor}.yaml"))
+        described = sensor_named(sensor)
         ball, beam = described.tip.radius_m, described.beam.free_length_m
         return TipUse(
             TipGeometry(ball, beam, **{name: values[name] for name in GEOMETRY}),

@@ -8,19 +8,16 @@ from collections import deque
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import ForceConfig
-from tactile_resonance.nodes.conversions import time_from_message
 from tactile_resonance.nodes.lockstep import Arrivals
+from tactile_resonance.nodes.running import SERIES
+from tactile_resonance.recording.messages import time_from_message
 
-SENSOR = QoSProfile(
-    depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
-)
 EARLIEST_S = 0.005
 LATEST_S = 0.5
 FIRST_WITHIN_S = 2.0
@@ -73,7 +70,7 @@ class TopicWrench:
                 WrenchStamped,
                 self._config.topic,
                 self._on_wrench,
-                SENSOR,
+                SERIES,
                 callback_group=MutuallyExclusiveCallbackGroup(),
             )
 

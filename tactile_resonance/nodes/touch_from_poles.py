@@ -6,13 +6,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.nodes.conversions import poles_from_message
+from tactile_resonance.recording.messages import poles_from_message
 
+FloatArray = npt.NDArray[np.float64]
 IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
 FORGOTTEN_NS = 1_000_000_000
 """So long after the tip left the tissue a record may still show it: stamps err, and the bench plays ahead."""
@@ -63,19 +65,21 @@ class TouchFromPoles:
         began_ns = 2 * origin.time_ns - now_ns - FORGOTTEN_NS
         if state in IN_AIR:
             if message.final and began_ns > self._air_ns:
-                self._touch.add_air(*_strongest(poles))
+                self._touch.add_air(*_pole(poles))
             return False
         if state is not State.APPROACH or not self._touch.ready or began_ns < self._clear_ns:
             return False
-        return self._touch.touched(*_strongest(poles)) and self._tell()
+        return self._touch.touched(*_pole(poles)) and self._tell()
 
 
-def _strongest(poles: Poles) -> tuple[list[float], np.ndarray]:
-    """f0 [Hz] and damping ratio (2,) of the strongest mode, and their covariance (2, 2)."""
-    # of one period the noise is known from the residuals of the fit only
-    covariance = poles.total_covariance if poles.covariance is None else poles.covariance
-    if covariance is None:
+def _pole(poles: Poles) -> tuple[FloatArray, FloatArray]:
+    """f0 [Hz] and damping ratio (2,), and their covariance (2, 2) from noise.
+
+    What the model lacks is the same in air and in the approach, noise is not. Where the noise is unknown, after
+    one period, all that is known counts.
+    """
+    mode = poles.main
+    covariance = mode.noise if np.all(np.isfinite(mode.noise)) else mode.covariance
+    if not np.all(np.isfinite(covariance)):
         raise ValueError(f"covariance: unknown ({poles.message or poles.status.name.lower()})")
-    strongest = int(np.argmax(np.abs(poles.residues)))
-    pole = [float(poles.f0_hz[strongest]), float(poles.damping_ratio[strongest])]
-    return pole, covariance[strongest]
+    return mode.estimate, covariance

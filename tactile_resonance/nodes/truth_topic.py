@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `bench/truth`: the exact modes of the simulated sensor as its tip is."""
+"""What the simulated bench knows: the exact modes of its sensor as the tip is, on topic and service."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from geometry_msgs.msg import PoseStamped
 from tactile_resonance import msg
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles, PolesStatus
-from tactile_resonance.nodes.conversions import (
-    contact_from_message,
-    poles_to_message,
-    time_from_message,
-)
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.running import TRUTHS
 from tactile_resonance.record import Origin
+from tactile_resonance.recording.messages import (
+    contact_from_message,
+    fill,
+    fill_complex,
+    time_from_message,
+)
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_tip import BenchTip
 from tactile_resonance.simulation.bimorph import CoupledBimorph
+from tactile_resonance.simulation.truth import Truth
+from tactile_resonance.srv import Truth as TruthService
 
 
 class TruthTopic:
@@ -90,3 +94,22 @@ class TruthTopic:
             ),
         )
         self._publisher.publish(poles_to_message(truth, origin))
+
+
+def truth_to_response(truth: Truth, response: TruthService.Response) -> None:
+    """Fill the answer of `bench/get_truth`."""
+    response.success = True
+    response.feedthrough = truth.feedthrough
+    if truth.tissue is not None:
+        response.tissue = truth.tissue.name
+        response.force_n = truth.force_n
+        response.contact_radius_m = truth.contact_radius_m
+        response.indentation_m = truth.indentation_m
+        response.relaxation_modulus_1s_pa = truth.tissue.relaxation_modulus_1s_pa
+    fill_complex(response, "pole_", truth.poles_rad_s, "_rad_s")
+    fill_complex(response, "residue_", truth.residues_rad_s, "_rad_s")
+    fill(response.f0_hz, [mode.f0_hz for mode in truth.modes])
+    fill(response.damping_ratio, [mode.damping_ratio for mode in truth.modes])
+    fill_complex(response, "response_", truth.response)
+    if truth.contact_stiffness_n_per_m is not None:
+        fill_complex(response, "stiffness_", truth.contact_stiffness_n_per_m, "_n_per_m")

@@ -7,7 +7,6 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 
@@ -17,55 +16,26 @@ from tactile_resonance.contact.interfaces import ArmError, ArmFault, Cell, LoopC
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import (
     ZERO,
-    Six,
-    Turn,
-    Vector,
     cross,
     difference,
     rotated,
-    scaled,
-    transposed,
     turn_from_quaternion,
     turn_product,
     vector,
     vector_from_turn,
 )
 from tactile_resonance.drivers.twist_config import TwistConfig
-from tactile_resonance.nodes.conversions import time_from_message, time_message
+from tactile_resonance.drivers.twist_motion import REST, Following, ToolPose, towards, velocity_of
 from tactile_resonance.nodes.listener import Listener
 from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
+from tactile_resonance.recording.messages import time_from_message
 
-REST: Six = (*ZERO, *ZERO)
-VELOCITY_OVER_NS = 7_000_000
-"""A velocity is the difference of two poses at least so far apart [ns]."""
-FOLLOWED_NS = 1_000_000_000
-"""Over so long the way of the tip is compared with what was commanded [ns]."""
 COMMANDS_END_NS = 200_000_000
 """Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""
-TURN_LEVER_M = 0.1
-"""Turns the limit of acceleration [m/s2] into one of rotation [rad/s2]."""
-
-
-class _Tool(NamedTuple):
-    """One pose of the tool, and the tip that it carries."""
-
-    time_ns: int
-    tool_m: Vector
-    tip_m: Vector
-    turn: Turn  # of the tip
-
-
-class _Way(NamedTuple):
-    """Where the tip has been and should have been, at one cycle."""
-
-    time_ns: int
-    tip_m: Vector
-    commanded_m: Vector
-    path_m: float  # length of the commanded way
-    slack_m: float  # what of it was commanded within `follow_s`
 
 
 class TwistArm:
@@ -106,7 +76,7 @@ class TwistArm:
         self._twist = REST  # of the tip, after the limit of acceleration
         self._commanded_ns: int | None = None  # when the last command was given
         self._moving = False
-        self._forget_way()
+        self._following = Following(config)
         own = self.listener.node
         node.resources.callback(self.listener.close)
         self._publisher = own.create_publisher(TwistStamped, config.command_topic, COMMANDS)
@@ -122,7 +92,7 @@ class TwistArm:
             self._fault = None
             self._tools = _no_tools()  # the listener's thread may be looking at the old ones
             self._twist, self._moving, self._commanded_ns = REST, False, None
-        self._forget_way()
+        self._following.forget()
 
     def state(self) -> ArmSample:
         """Newest state, without waiting.
@@ -151,15 +121,17 @@ class TwistArm:
                 raise ArmError(ArmFault.STALE, text)  # nothing is under way that it could end
             self._fail(ArmFault.STALE, text)
         if self._moving:
-            self._check_followed(now_ns, newest.tip_m)
+            commanded_m_s = vector(self._twist[:3])
+            if text := self._following.contradiction(now_ns, newest.tip_m, commanded_m_s):
+                self._fail(ArmFault.NOT_FOLLOWED, text)
         else:  # how hard it slows down is its controller's
-            self._forget_way()
+            self._following.forget()
         return ArmSample(
             time_ns=newest.time_ns,
             robot_time_s=newest.time_ns * 1e-9,
             position_m=newest.tip_m,
             rotation_rad=vector_from_turn(newest.turn),
-            velocity=_velocity(tools),
+            velocity=velocity_of(tools),
         )
 
     recent = state
@@ -185,7 +157,7 @@ class TwistArm:
                 raise self._fault
             since_s = 0.0 if self._commanded_ns is None else (now_ns - self._commanded_ns) * 1e-9
             step = acceleration_m_s2 * (since_s if self._moving else period_s)
-            self._twist, self._moving = _towards(self._twist, wanted, step), True
+            self._twist, self._moving = towards(self._twist, wanted, step), True
             self._commanded_ns = now_ns
         self._send()
 
@@ -238,47 +210,6 @@ class TwistArm:
             self._twist, self._moving = REST, False
         self._send()
 
-    def _check_followed(self, now_ns: int, tip_m: Vector) -> None:
-        """Whether the tip is where it was commanded to be within `follow_s`, give or take `follow_m`."""
-        config, velocity = self.config, self._way_m_s
-        self._way_m_s = vector(self._twist[:3])
-        if not self._ways:
-            self._ways.append(_Way(now_ns, tip_m, ZERO, 0.0, 0.0))
-            return
-        last = self._ways[-1]
-        step_s = (now_ns - last.time_ns) * 1e-9
-        if step_s <= 0:
-            return
-        x, y, z = scaled(step_s, velocity)
-        a, b, c = last.commanded_m
-        path_m = last.path_m + math.hypot(x, y, z)
-        oldest_ns = now_ns - 1e9 * config.follow_s
-        while (
-            self._ways[self._lag_from].time_ns < oldest_ns and self._lag_from < len(self._ways) - 1
-        ):
-            self._lag_from += 1
-        slack_m = path_m - self._ways[self._lag_from].path_m
-        newest = _Way(now_ns, tip_m, (a + x, b + y, c + z), path_m, slack_m)
-        self._ways.append(newest)
-        while self._ways[1].time_ns < now_ns - FOLLOWED_NS:
-            self._ways.popleft()
-            self._lag_from -= 1
-        first = self._ways[0]
-        gone_m = difference(tip_m, first.tip_m)
-        off_m = math.dist(gone_m, difference(newest.commanded_m, first.commanded_m))
-        allowed_m = config.follow_m + slack_m + first.slack_m
-        if off_m > allowed_m:
-            self._fail(
-                ArmFault.NOT_FOLLOWED,
-                f"the tip is {1e3 * off_m:.2f} mm from where it was commanded to be, accepted are "
-                f"{1e3 * allowed_m:.2f} mm: is the controller active, and the only one?",
-            )
-
-    def _forget_way(self) -> None:
-        self._ways: deque[_Way] = deque()
-        self._lag_from = 0  # the oldest of `follow_s`
-        self._way_m_s = ZERO  # commanded since the last cycle
-
     # topics
 
     def _on_pose(self, message: PoseStamped) -> None:
@@ -315,7 +246,7 @@ class TwistArm:
         turn = turn_from_quaternion(x, y, z, w)
         a, b, c = rotated(turn, self._offset_m)
         tip_m = (place.x + a, place.y + b, place.z + c)
-        tool = _Tool(
+        tool = ToolPose(
             time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn)
         )
         tools.append(tool)
@@ -347,31 +278,5 @@ class TwistArm:
                 return
 
 
-def _no_tools() -> deque[_Tool]:
+def _no_tools() -> deque[ToolPose]:
     return deque(maxlen=64)
-
-
-def _velocity(tools: Sequence[_Tool]) -> Six:
-    """Velocity and angular velocity of the tip, from the newest pose and one far enough before it."""
-    newest = tools[-1]
-    before = newest
-    for before in reversed(tools):
-        if newest.time_ns - before.time_ns >= VELOCITY_OVER_NS:
-            break
-    seconds = (newest.time_ns - before.time_ns) * 1e-9
-    if seconds <= 0:
-        return REST
-    x, y, z = scaled(1 / seconds, difference(newest.tip_m, before.tip_m))
-    turned = vector_from_turn(turn_product(newest.turn, transposed(before.turn)))
-    return x, y, z, *scaled(1 / seconds, turned)
-
-
-def _towards(now: Six, wanted: Six, step: float) -> Six:
-    """Twist nearer to what is wanted, by a change of velocity of `step` [m/s] at most."""
-    change = tuple(b - a for a, b in zip(now, wanted, strict=True))
-    largest = max(math.hypot(*change[:3]), TURN_LEVER_M * math.hypot(*change[3:]))
-    if largest <= step:
-        return wanted
-    share = step / largest
-    a, b, c, d, e, f = (a + share * d for a, d in zip(now, change, strict=True))
-    return a, b, c, d, e, f

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tactile_resonance.scan.bench_truth import PointTruth, deviation, deviations
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
 
 _HEAD = "point  x [mm]  y [mm]  force [mN]  f0 [Hz]   +- std   damping   +- std   tissue                  "
 _TRUTH_HEAD = "true f0   dev  true damping   dev"
@@ -21,7 +21,7 @@ def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]
     lines = [head.rstrip(), "-" * len(head.rstrip())]
     for result in results:
         start = f"{result.index + 1:5d}  {1e3 * result.x_m:6.2f}  {1e3 * result.y_m:6.2f}  "
-        if result.outcome is not Outcome.DONE:
+        if result.outcome is not PointOutcome.DONE:
             lines.append(f"{start}{result.outcome.name.lower()}: {result.reason}")
             continue
         line = (

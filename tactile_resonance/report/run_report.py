@@ -16,7 +16,7 @@ import yaml
 from tactile_resonance.report.drawing import SIMULATED
 from tactile_resonance.report.point_table import table_notes
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.references import SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent
@@ -103,7 +103,7 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
         parts += ["<h2>Surface, found by touch</h2>", _touches(run.facts["surface"])]
     parts += ["<h2>Points</h2>", _table(run.latest)]
     parts += [f"<p>{html.escape(line)}</p>" for line in table_notes(run.latest, truths)]
-    measured = [result for result in run.latest if result.outcome is Outcome.DONE]
+    measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     parts += [f"<h2>Against free air{' and the truth of the simulation' if truths else ''}</h2>"]
     parts += [_air_table(measured, truths)]
     skipped = run.facts.get("skipped", [])
@@ -128,8 +128,8 @@ def summary(run: RunContent) -> list[str]:
     """Sentences: how far it has come, what was found, what ending early saved."""
     done = Counter(result.outcome for result in run.latest)
     lines = [
-        f"{len(run.latest)} of {len(run.points)} points finished: {done[Outcome.DONE]} with poles, "
-        f"{done[Outcome.FAILED]} failed, {done[Outcome.SKIPPED]} skipped."
+        f"{len(run.latest)} of {len(run.points)} points finished: {done[PointOutcome.DONE]} with poles, "
+        f"{done[PointOutcome.FAILED]} failed, {done[PointOutcome.SKIPPED]} skipped."
     ]
     found = [r for r in run.latest if np.isfinite(r.f0_hz)]
     if found:
@@ -196,7 +196,7 @@ def _cell(kind: str, name: str, text: str) -> str:
 def _table(results: Sequence[PointResult]) -> str:
     rows = ["<tr>" + "".join(_cell("th", name, name) for name, _ in _COLUMNS) + "</tr>"]
     for result in results:
-        css = "" if result.outcome is Outcome.DONE else ' class="failed"'
+        css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
         rows.append(
             f"<tr{css}>" + "".join(_cell("td", n, show(result)) for n, show in _COLUMNS) + "</tr>"
         )

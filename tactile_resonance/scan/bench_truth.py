@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.result import PolesStatus
-from tactile_resonance.recording.from_messages import poles_from_message
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
-from tactile_resonance.scan.point_result import POLES_TYPE, Outcome, PointResult
+from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
 from tactile_resonance.scan.recorded import file_of
 from tactile_resonance.scan.run_content import RunContent
 
@@ -50,7 +50,7 @@ def truths_of(run: RunContent) -> dict[int, PointTruth]:
     """
     found = {}
     for result in run.latest:
-        if result.simulated and result.outcome is Outcome.DONE:
+        if result.simulated and result.outcome is PointOutcome.DONE:
             truth = _truth_of(run, result)
             if truth is not None:
                 found[result.index] = truth

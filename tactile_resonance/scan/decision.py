@@ -108,8 +108,8 @@ class Decision:
 
 def decide(
     estimate: npt.ArrayLike,
-    noise: npt.ArrayLike | None,
-    total: npt.ArrayLike | None,
+    covariance: npt.ArrayLike,
+    noise: npt.ArrayLike,
     blocks: int,
     wanted: Precise | Separate | None,
     limits: BlockLimits,
@@ -121,8 +121,8 @@ def decide(
     ----------
     estimate : (2,) float
         f0 [Hz] and damping ratio from all blocks so far; NaN where there is none yet.
-    noise, total : (2, 2) float or None
-        Their covariances, as in `Poles`.
+    covariance, noise : (2, 2) float
+        Of the estimate, as of `Poles.main`: the best one known, and what of it is noise; NaN where unknown.
     blocks : int
         Measured so far, 1 or above.
     wanted : Precise, Separate or None
@@ -131,17 +131,15 @@ def decide(
     block_s : float
         Duration of one block [s].
     """
-    covariance = _first_known(total, noise)
-    x = np.asarray(estimate, float)
+    x, best = np.asarray(estimate, float), np.asarray(covariance, float)
     verdict, reason, called = Verdict.CONTINUE, "fewer blocks than asked for at least", ""
     if blocks >= limits.least and wanted is not None:
-        if covariance is None or not np.all(np.isfinite(x)):
+        if not (np.all(np.isfinite(best)) and np.all(np.isfinite(x))):
             reason = "no pole with a covariance yet"
         elif isinstance(wanted, Separate):
-            verdict, reason, called = _separated(x, covariance, wanted)
+            verdict, reason, called = _separated(x, best, wanted)
         else:
-            noise_part = _first_known(noise, None)
-            verdict, reason = _precise(covariance, noise_part, blocks, wanted, limits)
+            verdict, reason = _precise(best, np.asarray(noise, float), blocks, wanted, limits)
     elif wanted is None:
         reason = "no precision asked for"
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
@@ -180,7 +178,7 @@ def _separated(
 
 def _precise(
     covariance: FloatArray,
-    noise: FloatArray | None,
+    noise: FloatArray,
     blocks: int,
     wanted: Precise,
     limits: BlockLimits,
@@ -194,7 +192,7 @@ def _precise(
             continue
         text = f"std of {name} {std:.2g} {unit}".rstrip() + f", {asked:.2g} asked for"
         missing.append(text)
-        falling = covariance[k, k] if noise is None else min(noise[k, k], covariance[k, k])
+        falling = np.fmin(noise[k, k], covariance[k, k])  # all of it where its noise is unknown
         staying = covariance[k, k] - falling
         last = math.sqrt(staying + falling * blocks / limits.most)
         if last > HOPELESS_FACTOR * asked:
@@ -204,12 +202,3 @@ def _precise(
     if hopeless and blocks < limits.most:
         return Verdict.HOPELESS, "; ".join(hopeless)
     return Verdict.CONTINUE, "; ".join(missing)
-
-
-def _first_known(*covariances: npt.ArrayLike | None) -> FloatArray | None:
-    for covariance in covariances:
-        if covariance is not None:
-            known = np.asarray(covariance, float)
-            if np.all(np.isfinite(known)):
-                return known
-    return None

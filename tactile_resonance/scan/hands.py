@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
@@ -102,6 +103,25 @@ class Measured:
         return replace(self, origin=replace(self.origin, contact=contact))
 
 
+@dataclass(frozen=True)
+class Touch:
+    """One touch from above.
+
+    Attributes
+    ----------
+    ball_m : (3,) tuple
+        Centre of the ball at the first touch, in the scan's frame [m].
+    std_m : float
+        Standard deviation of its height [m].
+    force_n : float
+        That was reached [N].
+    """
+
+    ball_m: tuple[float, float, float]
+    std_m: float
+    force_n: float
+
+
 class Hands(Protocol):
     """Robot and sensor, as a scan uses them.
 
@@ -111,10 +131,14 @@ class Hands(Protocol):
     Attributes
     ----------
     free_air : bool
-        Whether the tip is in free air between points, so that references can be taken there.
+        Whether the tip is in free air between points, so that references can be taken there: the tip is moved
+        and forces are measured.
+    frame_in_base : Pose
+        Frame of the scan's points in the robot's base, to be set before a scan.
     """
 
     free_air: bool
+    frame_in_base: Pose
 
     def now_s(self) -> float:
         """Time by which limits and durations of a scan count [s]: simulated, where the bench's is."""
@@ -134,6 +158,10 @@ class Hands(Protocol):
 
     def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
+        ...
+
+    def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
+        """Touch a point of the surface as it is expected and draw back; return where the ball met it."""
         ...
 
     def measure(

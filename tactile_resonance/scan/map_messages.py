@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.recording.from_messages import POLES_STATUS
+from tactile_resonance.recording.messages import POLES_STATUS
 from tactile_resonance.scan.colour_scale import colours, shares
 from tactile_resonance.scan.mesh import grid_faces
 from tactile_resonance.scan.messages import make_message, message_types

@@ -85,6 +85,8 @@ class MeasurementDesign:
         Each of as many periods.
     lines : int
         Excited.
+    samples : int
+        Of each channel in a block.
     block_s : float
         Duration of a block [s].
     skipped : tuple of Skipped
@@ -99,6 +101,7 @@ class MeasurementDesign:
     periods: int
     realisations: int
     lines: int
+    samples: int
     block_s: float
     skipped: tuple[Skipped, ...]
     silent: bool = False
@@ -151,6 +154,7 @@ def design_measurement(scene: ScanScene, offered: SensorRange | None = None) -> 
         periods=scene.blocks.most,
         realisations=realisations,
         lines=lines,
+        samples=offered.samples_per_period,
         block_s=offered.period_s,
         skipped=tuple(skipped),
     )

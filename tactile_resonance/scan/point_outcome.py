@@ -10,8 +10,7 @@ import numpy as np
 
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.main_mode import main_mode
-from tactile_resonance.scan.point_result import NAN, Outcome, PointResult
+from tactile_resonance.scan.point_result import NAN, PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import MapPoint, map_point
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -59,14 +58,14 @@ def measured_result(
         nominal=scene.nominal_contact,
         age_s=measured.contact_age_s,
     )
-    mode = main_mode(poles)
+    mode = poles.main
     std = found.std
     relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
     blank = unmeasured_result(
         point,
         attempt,
         scene,
-        Outcome.FAILED if found.failed else Outcome.DONE,
+        PointOutcome.FAILED if found.failed else PointOutcome.DONE,
         poles.message,
         time_ns=time_ns,
         duration_s=duration_s,
@@ -127,7 +126,7 @@ def unmeasured_result(
     point: ScanPoint,
     attempt: int,
     scene: ScanScene,
-    outcome: Outcome,
+    outcome: PointOutcome,
     reason: str,
     *,
     time_ns: int,

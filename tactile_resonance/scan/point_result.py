@@ -22,7 +22,7 @@ RESULTS_DEPTH = 4096  # of the nodes that publish them
 NAN = float("nan")
 
 
-class Outcome(IntEnum):
+class PointOutcome(IntEnum):
     """What came of a point; the numbers are those of the message."""
 
     DONE = 0
@@ -31,7 +31,7 @@ class Outcome(IntEnum):
     DISCARDED = 3
 
 
-class Kind(str, Enum):
+class PointKind(str, Enum):
     """What was measured."""
 
     TISSUE = "tissue"
@@ -48,7 +48,7 @@ class PointResult:
     index: int
     attempt: int = 0
     label: str = ""
-    outcome: Outcome = Outcome.DONE
+    outcome: PointOutcome = PointOutcome.DONE
     reason: str = ""
     x_m: float = NAN
     y_m: float = NAN
@@ -101,7 +101,7 @@ class PointResult:
     repeats: int = 0
     disturbances: str = ""
     notes: str = ""
-    kind: Kind = Kind.TISSUE
+    kind: PointKind = PointKind.TISSUE
     time_ns: int = 0
     frame_id: str = ""
 
@@ -157,8 +157,8 @@ def from_message(message: Any) -> PointResult:
     return PointResult(
         **{
             **content,
-            "outcome": Outcome(message.outcome),
-            "kind": Kind(message.kind or Kind.TISSUE),
+            "outcome": PointOutcome(message.outcome),
+            "kind": PointKind(message.kind or PointKind.TISSUE),
         },
         time_ns=stamp.sec * 10**9 + stamp.nanosec,
         frame_id=message.header.frame_id,
@@ -176,8 +176,8 @@ def as_csv(results: Iterable[PointResult]) -> str:
 
 
 def _write(value: object) -> str:
-    if isinstance(value, Outcome):
+    if isinstance(value, PointOutcome):
         return value.name.lower()
-    if isinstance(value, Kind):
+    if isinstance(value, PointKind):
         return value.value
     return repr(float(value)) if isinstance(value, float) else str(value)

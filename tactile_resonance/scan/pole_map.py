@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
-from tactile_resonance.scan.main_mode import main_mode
-from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import (
     ContactLoad,
@@ -139,7 +138,7 @@ def map_point(
         raise ValueError(
             f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
         )
-    mode = main_mode(poles)
+    mode = poles.main
     name, probability, reason, referred = "", float("nan"), "", None
     if classes and mode.found:
         pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
@@ -169,14 +168,14 @@ def map_point(
 def accepted_point(result: PointResult, point: MapPoint) -> MapPoint:
     """Point of a result and of the poles that came with it; without a pole where the result says it failed."""
     point = replace(point, place_m=result.position_m, place_frame=result.frame_id)
-    if result.outcome is Outcome.DONE:
+    if result.outcome is PointOutcome.DONE:
         return point
     return replace(point, estimate=np.full(2, np.nan), reason=result.reason)
 
 
 def point_of_result(result: PointResult) -> MapPoint:
     """Point of a finished scan point, from a run."""
-    failed = result.outcome is not Outcome.DONE or np.isnan(result.f0_hz)
+    failed = result.outcome is not PointOutcome.DONE or np.isnan(result.f0_hz)
     names = {status.value: status for status in PolesStatus}
     return MapPoint(
         position_m=result.position_m,
@@ -234,10 +233,10 @@ class PoleMap:
 
     def with_result(self, result: PointResult) -> PoleMap:
         """The same after one attempt at a point of a scan; one in free air or discarded changes nothing."""
-        if result.kind is not Kind.TISSUE or result.outcome is Outcome.DISCARDED:
+        if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
             return self
         now = self.without(result.position_m)
-        return now if result.outcome is Outcome.SKIPPED else now.with_point(point_of_result(result))
+        return now if result.outcome is PointOutcome.SKIPPED else now.with_point(point_of_result(result))
 
     def without(self, place_m: FloatArray, frame: str = "") -> PoleMap:
         """The same with nothing at a place (3,) [m]."""

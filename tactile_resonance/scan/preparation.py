@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.scan.hands import PointFailed, ScanEnded
+from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.scan.normal_search import find_normals
 from tactile_resonance.scan.plan import Plan, clear_plan, make_plan, plan_with
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import Plane, TouchRequest
-from tactile_resonance.scan.surface_search import Touch, find_surface
+from tactile_resonance.scan.surface_search import find_surface
 
 UNCHECKED = Skipped(
     "the check that the housing is clear of the surface",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
-from tactile_resonance.recording.from_messages import excitation_from_message, record_from_message
+from tactile_resonance.recording.messages import excitation_from_message, record_from_message
 from tactile_resonance.recording.store import StoredMeasurement, gaps_of
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import (

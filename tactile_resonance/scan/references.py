@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.recording.from_messages import poles_from_message
-from tactile_resonance.scan.main_mode import main_mode
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
 from tactile_resonance.scan.run_content import RECORDING, RunContent
@@ -76,7 +75,7 @@ class SensorHealth(str, Enum):
 
 def reference_of(poles: Poles) -> AirReference | None:
     """Reference of poles measured in air; None where there is no pole."""
-    mode = main_mode(poles)
+    mode = poles.main
     return AirReference(mode.estimate, mode.covariance) if mode.found else None
 
 

@@ -30,6 +30,7 @@ from rosbags.interfaces import Qos
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.bag_metadata import write_bag_metadata
+from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import FileContent, PointFileWriter, offered_qos
 from tactile_resonance.scan.point_result import (
@@ -300,14 +301,14 @@ class PointRecording(_FileRecording):
         return self._keep(result, result)
 
 
-def expected_bytes(points: int, blocks: int, samples_per_block: int, lines: int) -> int:
-    """What a run may take on disk, generously [bytes].
+def expected_bytes(points: int, design: MeasurementDesign) -> int:
+    """What a run of so many points may take on disk, generously [bytes].
 
-    Two channels of floating point samples per block, an FRF of so many lines after each of them, and
+    Two channels of floating point samples per block, an FRF of all lines after each of them, and
     a megabyte a point for poses and wrenches.
     """
-    block = 2 * 8 * samples_per_block + 16 * 8 * lines + 10_000
-    return points * (blocks * block + 1_000_000)
+    block = 2 * 8 * design.samples + 16 * 8 * design.lines + 10_000
+    return points * (design.periods * design.realisations * block + 1_000_000)
 
 
 def _other_definitions(content: RunContent) -> list[str]:

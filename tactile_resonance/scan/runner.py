@@ -28,10 +28,9 @@ from tactile_resonance.scan.hands import (
     Recording,
     ScanEnded,
 )
-from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
-from tactile_resonance.scan.point_result import NAN, Kind, Outcome, PointResult
+from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.progress import Phase, Progress, Summary
 from tactile_resonance.scan.references import (
     AFTER,
@@ -128,7 +127,7 @@ class ScanRunner:
             return self._run.content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
-                result = self._unmeasured(point, recording, Outcome.SKIPPED, SKIPPED, 0.0)
+                result = self._unmeasured(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
                 self._publish(recording.finish(result))
             return self._next()
         return point
@@ -168,7 +167,7 @@ class ScanRunner:
                 raise PointFailed(f"time_limits.point_s: {scene.time_limits.point_s:g} s are over")
 
         with self._run.begin_point(point.index) as recording:
-            measured, outcome, reason = None, Outcome.FAILED, ""
+            measured, outcome, reason = None, PointOutcome.FAILED, ""
             # a point that is repeated on request has phases and noise of its own
             seed = self._seed + point.index + recording.attempt * ATTEMPT_SEEDS
             self._hands.begin(self._seed, point.index, recording.attempt)
@@ -190,17 +189,17 @@ class ScanRunner:
             except PointDisturbed as error:
                 reason = str(error)
                 if self._disturbed[point.index].again(error):
-                    outcome = Outcome.DISCARDED
+                    outcome = PointOutcome.DISCARDED
             except PointFailed as error:
                 reason = str(error)
             except Interrupted:
-                outcome, reason = Outcome.SKIPPED, SKIPPED
+                outcome, reason = PointOutcome.SKIPPED, SKIPPED
                 if self._controls.take() is not Request.SKIP:  # cancelled or to be repeated
-                    outcome, reason = Outcome.DISCARDED, LEFT
+                    outcome, reason = PointOutcome.DISCARDED, LEFT
             except ScanEnded as error:
                 self._discard(point, recording, str(error))
                 raise
-            if outcome is Outcome.DISCARDED:
+            if outcome is PointOutcome.DISCARDED:
                 self._hands.retract()
                 self._discard(point, recording, reason)
                 return
@@ -232,13 +231,13 @@ class ScanRunner:
             )
             self._publish(recording.finish(result))
         self._durations_s.append(duration_s)
-        if result.outcome is Outcome.FAILED and scene.on_failure is OnFailure.STOP:
+        if result.outcome is PointOutcome.FAILED and scene.on_failure is OnFailure.STOP:
             raise ScanEnded(
                 f"point {point.index + 1} failed and on_failure is stop: {result.reason}"
             )
 
     def _decide(self, measured: Measured, blocks: int) -> Decision:
-        mode = main_mode(measured.poles)
+        mode = measured.poles.main
         block_s = self._plan.measurement.block_s
         wanted, limits = self._scene.precision, self._scene.blocks
         if isinstance(wanted, Separate):
@@ -248,11 +247,13 @@ class ScanRunner:
             at = refer_to_nominal(
                 mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
             )
-            decision = decide(at.compared, None, at.covariance, blocks, wanted, limits, block_s)
+            decision = decide(
+                *(at.compared, at.covariance, at.covariance, blocks, wanted, limits, block_s)
+            )
             if np.isnan(at.compared).any() and at.note:
                 return replace(decision, reason=at.note)
             return decision
-        return decide(mode.estimate, mode.noise, mode.total, blocks, wanted, limits, block_s)
+        return decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan.
@@ -297,7 +298,7 @@ class ScanRunner:
                     if isinstance(error, PointDisturbed) and disturbed.again(error):
                         self._discard(point, recording, str(error))
                         continue
-                    failed = self._unmeasured(point, recording, Outcome.FAILED, str(error))
+                    failed = self._unmeasured(point, recording, PointOutcome.FAILED, str(error))
                     self._publish(recording.message_of(failed))
                     return
                 except (Interrupted, ScanEnded) as error:
@@ -306,7 +307,7 @@ class ScanRunner:
                 duration_s = self._hands.now_s() - begun_s
                 if silent:
                     result = self._unmeasured(
-                        point, recording, Outcome.SKIPPED, NOTHING_PLAYED, duration_s
+                        point, recording, PointOutcome.SKIPPED, NOTHING_PLAYED, duration_s
                     )
                     result = replace(result, simulated=measured.origin.simulated)
                 else:
@@ -320,7 +321,7 @@ class ScanRunner:
                         duration_s=duration_s,
                     )
                 result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
-                result = replace(result, kind=Kind.AIR)
+                result = replace(result, kind=PointKind.AIR)
                 self._publish(recording.finish(result))
                 return
 
@@ -328,7 +329,7 @@ class ScanRunner:
         self,
         point: ScanPoint,
         recording: Recording,
-        outcome: Outcome,
+        outcome: PointOutcome,
         reason: str,
         duration_s: float = NAN,
     ) -> PointResult:
@@ -342,12 +343,12 @@ class ScanRunner:
             time_ns=time.time_ns(),
             duration_s=duration_s,
         )
-        kind = Kind.AIR if point.index >= len(self._plan.points) else Kind.TISSUE
+        kind = PointKind.AIR if point.index >= len(self._plan.points) else PointKind.TISSUE
         return replace(result, kind=kind, measurement_id=recording.measurement_id)
 
     def _discard(self, point: ScanPoint, recording: Recording, reason: str) -> None:
         """Tell that nothing is kept of an attempt."""
-        result = self._unmeasured(point, recording, Outcome.DISCARDED, reason)
+        result = self._unmeasured(point, recording, PointOutcome.DISCARDED, reason)
         self._publish(recording.message_of(result))
 
     def _say(
@@ -375,15 +376,15 @@ class ScanRunner:
 
     def _summary(self, message: str) -> Summary:
         latest = self._run.content.latest
-        count = {o: sum(result.outcome is o for result in latest) for o in Outcome}
+        count = {o: sum(result.outcome is o for result in latest) for o in PointOutcome}
         complete = self._run.content.next_point is None
         health, sentence = sensor_health(self._run.content, self._scene.drift_limits)
         return Summary(
             complete=complete,
             message=message or ("complete" if complete else "ended early"),
-            done=count[Outcome.DONE],
-            failed=count[Outcome.FAILED],
-            skipped=count[Outcome.SKIPPED],
+            done=count[PointOutcome.DONE],
+            failed=count[PointOutcome.FAILED],
+            skipped=count[PointOutcome.SKIPPED],
             blocks=sum(result.blocks for result in latest),
             blocks_saved=sum(result.blocks_saved for result in latest),
             saved_s=float(np.nansum([result.saved_s for result in latest])),

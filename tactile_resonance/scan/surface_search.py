@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.scan.hands import PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.surface import TouchRequest
@@ -26,25 +26,6 @@ LEAST_TOUCH_STD_M = 2e-5
 # Less than the height from which a contact comes down: each step begins where the one before found nothing. A
 # contact that searches less than that finds the surface early and is refused.
 SEARCH_STEP_M = 2e-3
-
-
-@dataclass(frozen=True)
-class Touch:
-    """One touch from above.
-
-    Attributes
-    ----------
-    ball_m : (3,) tuple
-        Centre of the ball at the first touch, in the scan's frame [m].
-    std_m : float
-        Standard deviation of its height [m].
-    force_n : float
-        That was reached [N].
-    """
-
-    ball_m: tuple[float, float, float]
-    std_m: float
-    force_n: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, require
+from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import SensorUse
 from tactile_resonance.scan.surface import TouchRequest, check_search
 from tactile_resonance.scan.surface_search import (
     LEAST_TOUCH_STD_M,
     FoundSurface,
-    Touch,
     find_surface,
     fit_touches,
 )

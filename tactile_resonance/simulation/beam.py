@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from tactile_resonance.simulation.parameters import (
+from tactile_resonance.sensor import (
     BeamParameters,
     ElectricParameters,
     SensorParameters,

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
-from tactile_resonance.simulation.contact import ContactParameters, hertz_contact
+from tactile_resonance.simulation.contact import HertzParameters, hertz_contact
 from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.parameters import SensorParameters, read_sensor
 from tactile_resonance.simulation.tissue import Tissue
 
 DEFAULT_EFFECTS = BenchEffects()
@@ -32,7 +32,7 @@ class SimulatedBench:
     """
 
     sensor: SensorParameters
-    contact: ContactParameters
+    contact: HertzParameters
 
     @classmethod
     def from_configuration(cls) -> SimulatedBench:

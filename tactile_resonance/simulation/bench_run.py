@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.acquisition import (
     BenchEffects,
     Block,
@@ -22,7 +23,6 @@ from tactile_resonance.simulation.bimorph import CoupledBimorph
 from tactile_resonance.simulation.lines import Lines, PeriodicExcitation
 from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
 from tactile_resonance.simulation.nonlinear import NonlinearStream
-from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.response import ResponseStream, steady_state
 from tactile_resonance.simulation.truth import Truth, truth_of
 from tactile_resonance.simulation.varying import VaryingStream

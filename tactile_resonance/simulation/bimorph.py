@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import BeamModes, sensor_modes
-from tactile_resonance.simulation.contact import Contact
+from tactile_resonance.simulation.contact import HertzContact
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray, PoleResidueModel
-from tactile_resonance.simulation.parameters import SensorParameters
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class CoupledBimorph:
     input_resistance_ohm : float
     feedthrough : float
         gamma, the limit of G at infinite frequency.
-    contact : Contact or None
+    contact : HertzContact or None
     """
 
     beam: BeamModes
     input_resistance_ohm: float
     feedthrough: float
-    contact: Contact | None
+    contact: HertzContact | None
 
     @cached_property
     def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -224,7 +224,7 @@ class CoupledBimorph:
         return min(self.modes, key=lambda mode: abs(mode.f0_hz - frequency_hz))
 
 
-def couple(sensor: SensorParameters, contact: Contact | None) -> CoupledBimorph:
+def couple(sensor: SensorParameters, contact: HertzContact | None) -> CoupledBimorph:
     """Return the linear sensor in air (`contact` None) or on tissue."""
     electric = sensor.electric
     return CoupledBimorph(

@@ -17,7 +17,7 @@ from tactile_resonance.simulation.tissue import ComplexArray, FloatArray, Tissue
 
 
 @dataclass(frozen=True)
-class ContactParameters:
+class HertzParameters:
     """How the tip touches: preload [N] and what all tissues have in common."""
 
     force_n: float
@@ -37,7 +37,7 @@ class ContactParameters:
 
 
 @dataclass(frozen=True)
-class Contact:
+class HertzContact:
     """A tip resting on tissue, as the vibrating beam sees it.
 
     Attributes
@@ -79,11 +79,11 @@ class Contact:
 def hertz_contact(
     tissue: Tissue,
     tip_radius_m: float,
-    parameters: ContactParameters,
+    parameters: HertzParameters,
     *,
     force_n: float | None = None,
     hold_time_s: float = 1.0,
-) -> Contact:
+) -> HertzContact:
     """Return the contact at a preload.
 
     Parameters
@@ -91,7 +91,7 @@ def hertz_contact(
     tissue : Tissue
     tip_radius_m : float
         Radius R of the ball [m].
-    parameters : ContactParameters
+    parameters : HertzParameters
     force_n : float, optional
         Preload [N] in place of that of `parameters`.
     hold_time_s : float
@@ -119,11 +119,11 @@ def hertz_contact(
 def contact_of_radius(
     tissue: Tissue,
     radius_m: float,
-    parameters: ContactParameters,
+    parameters: HertzParameters,
     *,
     force_n: float,
     indentation_m: float,
-) -> Contact:
+) -> HertzContact:
     """Return the contact of a given contact radius [m], however it came about.
 
     Force and indentation are carried along: a small vibration sees the radius alone.
@@ -137,7 +137,7 @@ def contact_of_radius(
         wave_speed = np.sqrt(np.abs(modulus) / (2 * (1 + nu) * density))
         damping = float(2 * density * wave_speed * np.pi * radius_m**2)
         mass = 1.257 * density * radius_m**3
-    return Contact(
+    return HertzContact(
         tissue=tissue,
         force_n=force_n,
         contact_radius_m=radius_m,

@@ -18,7 +18,7 @@ from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
-from tactile_resonance.simulation.surfaces import Surface, relative_radius_m
+from tactile_resonance.simulation.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters
@@ -51,7 +51,7 @@ class Tip:
     adhesion_j_per_m2: float = 0.0
     meets: Callable[[Indenter], Ball] | None = None
 
-    def on(self, tissue: Tissue, surface: Surface) -> TipOnTissue:
+    def on(self, tissue: Tissue, surface: PlantSurface) -> TipOnTissue:
         """Return the tip at rest over a tissue with that surface."""
         radius_m = relative_radius_m(self.radius_m, surface)
         soft = Indenter(
@@ -71,7 +71,7 @@ class ContactBench:
     ----------
     tissue : Tissue
         Everywhere under the surface.
-    surface : Surface
+    surface : PlantSurface
         What takes its place later must be curved alike.
     start : Pose
         Of the tip.
@@ -99,7 +99,7 @@ class ContactBench:
     def __init__(
         self,
         tissue: Tissue,
-        surface: Surface,
+        surface: PlantSurface,
         start: Pose,
         *,
         tip: Tip | None = None,

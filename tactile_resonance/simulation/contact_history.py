@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.contact import (
-    Contact,
-    ContactParameters,
+    HertzContact,
+    HertzParameters,
     contact_of_radius,
     hertz_contact,
 )
 from tactile_resonance.simulation.indentation import indent
 from tactile_resonance.simulation.modal import ComplexArray, FloatArray
-from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.tissue import Tissue
 
 
@@ -32,7 +32,7 @@ class ContactHistory:
     Attributes
     ----------
     tissue : Tissue
-    parameters : ContactParameters
+    parameters : HertzParameters
     time_s : (T,) array
         Ascending [s]; before the first and after the last the contact stays as it is there.
     contact_radius_m : (T,) array
@@ -41,7 +41,7 @@ class ContactHistory:
     """
 
     tissue: Tissue
-    parameters: ContactParameters
+    parameters: HertzParameters
     time_s: FloatArray
     contact_radius_m: FloatArray
     force_n: FloatArray
@@ -63,7 +63,7 @@ class ContactHistory:
         cls,
         tissue: Tissue,
         tip_radius_m: float,
-        parameters: ContactParameters,
+        parameters: HertzParameters,
         *,
         force_n: float | None = None,
         since_s: float = 1.0,
@@ -92,7 +92,7 @@ class ContactHistory:
         cls,
         tissue: Tissue,
         tip_radius_m: float,
-        parameters: ContactParameters,
+        parameters: HertzParameters,
         time_s: ArrayLike,
         depth_m: ArrayLike,
         *,
@@ -121,7 +121,7 @@ class ContactHistory:
             test.depth_m[keep],
         )
 
-    def contact_at(self, time_s: float) -> Contact:
+    def contact_at(self, time_s: float) -> HertzContact:
         """Return the contact at one time."""
         radius, force, depth = (
             float(np.interp(time_s, self.time_s, values))

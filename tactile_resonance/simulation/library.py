@@ -21,7 +21,7 @@ from tactile_resonance.fields import (
     require,
     section,
 )
-from tactile_resonance.simulation.contact import ContactParameters
+from tactile_resonance.simulation.contact import HertzParameters
 from tactile_resonance.simulation.tissue import Tissue
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values
@@ -31,7 +31,7 @@ GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond 
 class TissueLibrary:
     """Tissues by name, and the contact they share."""
 
-    contact: ContactParameters
+    contact: HertzParameters
     tissues: Mapping[str, Tissue]
 
     def __getitem__(self, name: str) -> Tissue:
@@ -90,7 +90,7 @@ def read_tissues(path: Path | None = None) -> TissueLibrary:
     content = read_yaml(path)
     known_keys(content, {"contact", "prony", "tissues"}, where)
     contact = read_dataclass(
-        ContactParameters, section(content, "contact", where), f"{where}: contact"
+        HertzParameters, section(content, "contact", where), f"{where}: contact"
     )
     prony = section(content, "prony", where)
     known_keys(prony, {"fast_times_s", "slow_times_s"}, f"{where}: prony")

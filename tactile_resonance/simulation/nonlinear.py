@@ -16,9 +16,9 @@ import numpy as np
 import scipy.fft
 
 from tactile_resonance.fields import require
+from tactile_resonance.sensor import NonlinearParameters
 from tactile_resonance.simulation.lines import Lines, sample_period
 from tactile_resonance.simulation.modal import FloatArray, PoleResidueModel
-from tactile_resonance.simulation.parameters import NonlinearParameters
 from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.volterra import WindowKernel
 

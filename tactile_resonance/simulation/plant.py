@@ -35,7 +35,7 @@ from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Ball
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import Surface
+from tactile_resonance.simulation.surfaces import PlantSurface
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
@@ -125,7 +125,7 @@ class Plant:
 
     Parameters
     ----------
-    surface : Surface
+    surface : PlantSurface
         May be exchanged while the plant runs (``plant.surface = ...``).
     tissue_at : callable
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
@@ -165,7 +165,7 @@ class Plant:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: PlantSurface,
         tissue_at: Callable[[FloatArray], Tissue | None],
         tip: Callable[[Tissue], TipOnTissue],
         *,

@@ -25,7 +25,7 @@ MOST_STEPS = 250
 
 
 @dataclass(frozen=True, slots=True)
-class _Step:
+class _PlantStep:
     time_s: float
     tip_m: Vector
     normal_force_n: float
@@ -43,13 +43,13 @@ class PlantHistory:
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
-        self._steps: deque[_Step] = deque(maxlen=KEEP_STEPS)
+        self._steps: deque[_PlantStep] = deque(maxlen=KEEP_STEPS)
 
     def step(self) -> None:
         """Note what is true now; to be called after each step of the plant."""
         plant = self._plant
         self._steps.append(
-            _Step(
+            _PlantStep(
                 plant.time_s,
                 plant.tip_m,
                 plant.normal_force_n,
@@ -95,6 +95,6 @@ class PlantHistory:
             for name in ("time_s", "tip_m", "normal_force_n")
         }
 
-    def _since(self, after_s: float) -> list[_Step]:
+    def _since(self, after_s: float) -> list[_PlantStep]:
         """Steps after a time, oldest first."""
         return list(takewhile(lambda step: step.time_s > after_s, reversed(self._steps)))[::-1]

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_dataclass, require
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.parameters import SensorParameters
 from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
 from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import Plane
+from tactile_resonance.simulation.surfaces import FlatSurface
 from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -43,7 +43,7 @@ class BenchSetup:
     tissue : str
         Name in the library.
     surface_height_m, tilt_rad, azimuth_rad : float
-        Of the undisturbed surface in the robot's base; see `Plane.tilted`.
+        Of the undisturbed surface in the robot's base; see `FlatSurface.tilted`.
     rigid_tip : bool
         The ball on the robot itself; else at the end of the sensor's beam.
     mount : Mount
@@ -80,9 +80,9 @@ class LaidScene:
     scene: PhantomScene
     table: Pose
 
-    def surface(self) -> Plane:
+    def surface(self) -> FlatSurface:
         """The undisturbed surface in the base."""
-        return Plane(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+        return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
 
     def on_table(self, position_m: FloatArray) -> FloatArray:
         """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
@@ -130,7 +130,7 @@ class Tabletop:
         self.plant = Plant(
             laid.surface()
             if laid
-            else Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
+            else FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
             self._tissue_at,
             tip,
             tip_radius_m=radius_m,
@@ -145,7 +145,7 @@ class Tabletop:
             tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
             azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
         )
-        self.plant.surface = Plane.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        self.plant.surface = FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
         return {}
 
     def move_surface(self, fields: dict) -> dict:

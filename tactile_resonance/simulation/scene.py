@@ -19,11 +19,11 @@ from tactile_resonance.fields import (
     require,
     section,
 )
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.materials import Material, mixture, read_material, read_tissue
 from tactile_resonance.simulation.modal import FloatArray
-from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.shapes import SHAPES, Shape, read_shape
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue

@@ -17,7 +17,7 @@ from tactile_resonance.fields import require
 FloatArray = NDArray[np.float64]
 
 
-class Surface(Protocol):
+class PlantSurface(Protocol):
     """The undisturbed surface of what lies on the table."""
 
     @property
@@ -31,14 +31,14 @@ class Surface(Protocol):
 
 
 @dataclass(frozen=True)
-class Plane:
+class FlatSurface:
     """A flat surface through a point; `normal` points out of the tissue and has length 1."""
 
     point_m: FloatArray
     normal: FloatArray
 
     @classmethod
-    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Plane:
+    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> FlatSurface:
         """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
         sine = math.sin(tilt_rad)
         normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
@@ -60,7 +60,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Sphere:
+class RoundSurface:
     """A sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
 
     Heights are radial, so that a ball of radius r is pressed in by r less the height of its centre, exactly,
@@ -106,7 +106,7 @@ class Sphere:
         return sign * (away - self.radius_m), normal
 
 
-def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
+def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:
     """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
 
     ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact

@@ -16,10 +16,10 @@ from tactile_resonance.contact.held_motion import HeldMotion
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.obstacles import Clinging, OnBone
-from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 

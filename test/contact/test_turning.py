@@ -21,7 +21,7 @@ from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.turning import MARGIN_M, PASSED_RAD, TurningWay
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.surfaces import Plane, Sphere
+from tactile_resonance.simulation.surfaces import FlatSurface, RoundSurface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT
@@ -109,7 +109,7 @@ class Travel:
     """A bench with nothing to be touched, its controller, and where the tip was in each period."""
 
     def __init__(self, start, limits=LIMITS, tip=TIP, surface=None):
-        surface = Plane.tilted(-0.5) if surface is None else surface
+        surface = FlatSurface.tilted(-0.5) if surface is None else surface
         self.bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M))
         self.controller = ContactController(QUICK, limits, tip)
         rig = self.bench
@@ -185,7 +185,7 @@ def test_points_of_a_sphere_follow_each_other(angle_deg, hollow):
     second = touch_pose(
         centre + (-radius if hollow else radius) * normal, normal, [1, 0, 0], RADIUS_M
     )
-    made = Travel(raised(first, 2.5e-3), surface=Sphere(centre, radius, hollow))
+    made = Travel(raised(first, 2.5e-3), surface=RoundSurface(centre, radius, hollow))
     for touch in (first, second, first):
         result = made.loop.make(ContactGoal(touch, AIM))
         assert result.reached, result.message

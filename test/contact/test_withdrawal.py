@@ -12,7 +12,7 @@ from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.obstacles import Clinging
 from tactile_resonance.simulation.plant import RigidTip
-from tactile_resonance.simulation.surfaces import Plane
+from tactile_resonance.simulation.surfaces import FlatSurface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import RADIUS_M, SOFT, contact, started, stiffer
@@ -114,7 +114,7 @@ def test_surface_above_the_standoff_is_left_before_the_tip_is_idle():
 
     def rise():
         up_m = min(3e-3, (made.bench.clock.time_ns - began_ns) * 4e-12)  # 4 mm/s
-        made.bench.plant.surface = Plane(plane.point_m + [0, 0, up_m], plane.normal)
+        made.bench.plant.surface = FlatSurface(plane.point_m + [0, 0, up_m], plane.normal)
 
     began_ns = made.bench.clock.time_ns
     made.bench.clock.on_step.insert(0, rise)

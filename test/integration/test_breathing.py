@@ -14,7 +14,7 @@ from robot_at_hand import own_host
 from benchmarks.load_case import Load, demonstrate
 from tactile_resonance.scan.bench_truth import deviations, truths_of
 from tactile_resonance.scan.point_file import read_messages
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 
 HOST = own_host(19)
@@ -44,7 +44,7 @@ class Breathed:
 
     @property
     def done(self):
-        return [r for r in self.run.latest if r.outcome is Outcome.DONE]
+        return [r for r in self.run.latest if r.outcome is PointOutcome.DONE]
 
     def records(self, index):
         """Those of a point, whether they count or not."""
@@ -65,7 +65,7 @@ def breathe(folder, motion, blocks, more=""):
     assert len(run.latest) == len(run.points) == 3
     for result in run.latest:
         named = result.reason.startswith(("contact: ", "gate: ", "time_limits."))
-        assert result.outcome is Outcome.DONE or named, result.reason
+        assert result.outcome is PointOutcome.DONE or named, result.reason
     # where there are poles they are those of a contact that moves, as far off as they say
     off = deviations(found.done, found.truths)
     assert np.abs(off).max() < 4

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.processes import NodeProcesses
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 
@@ -63,10 +63,10 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
     assert [point.position_m for point in run.points] == [(0.003 * k, 0.0, 0.0) for k in range(6)]
     # the second is repeated in a pause, the fourth skipped, the fifth cancelled
     assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)]
-    outcomes = [*[Outcome.DONE] * 4, Outcome.SKIPPED]
+    outcomes = [*[PointOutcome.DONE] * 4, PointOutcome.SKIPPED]
     assert [result.outcome for result in run.results] == outcomes
     assert [line[:14] for line in told] == [f"poses, point {k}" for k in (1, 2, 2, 3)]
-    done = [result for result in run.results if result.outcome is Outcome.DONE]
+    done = [result for result in run.results if result.outcome is PointOutcome.DONE]
     for result in done:
         # the force of the goal, not of the bench's scene, at exactly the place of the pose
         assert result.force_n == pytest.approx(0.012, abs=1e-12)

@@ -21,7 +21,7 @@ from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, POINT_RESULTS, POLES, RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
-from tactile_resonance.scan.point_result import Kind, Outcome
+from tactile_resonance.scan.point_result import PointKind, PointOutcome
 from tactile_resonance.scan.run_content import read_run
 
 STREAM = ("excitation_node", "frf_node", "poles_node", "pole_map_node")
@@ -125,13 +125,13 @@ def test_the_map_of_a_scan_holds_the_accepted_points_of_tissue(scanned):
 def test_a_late_reader_of_results_knows_what_counts(scanned):
     run, _, told, poles = scanned
     assert [(m.kind, m.index, m.outcome) for m in told] == [
-        (Kind.AIR.value, 4, Outcome.DONE),
-        (Kind.TISSUE.value, 0, Outcome.DONE),
-        (Kind.TISSUE.value, 1, Outcome.DISCARDED),
-        (Kind.TISSUE.value, 1, Outcome.DONE),
-        (Kind.TISSUE.value, 2, Outcome.FAILED),
-        (Kind.TISSUE.value, 3, Outcome.DONE),
-        (Kind.AIR.value, 5, Outcome.DONE),
+        (PointKind.AIR.value, 4, PointOutcome.DONE),
+        (PointKind.TISSUE.value, 0, PointOutcome.DONE),
+        (PointKind.TISSUE.value, 1, PointOutcome.DISCARDED),
+        (PointKind.TISSUE.value, 1, PointOutcome.DONE),
+        (PointKind.TISSUE.value, 2, PointOutcome.FAILED),
+        (PointKind.TISSUE.value, 3, PointOutcome.DONE),
+        (PointKind.AIR.value, 5, PointOutcome.DONE),
     ]
     assert told[2].reason == "left on request"
     assert "nothing to touch there" in told[4].reason
@@ -139,14 +139,14 @@ def test_a_late_reader_of_results_knows_what_counts(scanned):
     assert {m.measurement_id for m in told} - {0} == {m.measurement_id for m in poles}
     last = {message.measurement_id: message for message in poles}
     for message in told:
-        if message.outcome == Outcome.DONE:
+        if message.outcome == PointOutcome.DONE:
             (own,) = message.poles
             assert str(own) == str(last[message.measurement_id])  # NaN is equal to NaN
             assert message.f0_hz == message.poles[0].f0_hz[0]
             assert len(message.poles[0].total_covariance or message.poles[0].covariance) == 4
     assert told[4].poles == []
     assert [
-        m.measurement_id for m in told if m.index in ACCEPTED and m.outcome == Outcome.DONE
+        m.measurement_id for m in told if m.index in ACCEPTED and m.outcome == PointOutcome.DONE
     ] == [read_run(run).latest[k].measurement_id for k in ACCEPTED]
 
 

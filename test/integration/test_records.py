@@ -14,7 +14,7 @@ from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.client import HANGS_S, NodeClient
-from tactile_resonance.nodes.conversions import pose_to_message, record_to_message
+from tactile_resonance.nodes.messages import pose_to_message, record_to_message
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.record import Contact

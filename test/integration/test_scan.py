@@ -22,7 +22,7 @@ from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.silent_reference import read_silent
 from tactile_resonance.simulation.bench import SimulatedBench
@@ -113,11 +113,11 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     assert counts["/point_result"] == 3 + 3
     # a late reader gets those of the node that was killed too
     assert [(r.kind, r.index, r.outcome) for r in told] == [
-        ("air", 3, Outcome.SKIPPED),
-        *[("air", 3, Outcome.DONE), *[("tissue", k, Outcome.DONE) for k in range(3)]],
-        ("air", 4, Outcome.DONE),
+        ("air", 3, PointOutcome.SKIPPED),
+        *[("air", 3, PointOutcome.DONE), *[("tissue", k, PointOutcome.DONE) for k in range(3)]],
+        ("air", 4, PointOutcome.DONE),
     ]
-    assert max(r.f0_hz for r in told if r.kind == "air" and r.outcome == Outcome.DONE) < min(
+    assert max(r.f0_hz for r in told if r.kind == "air" and r.outcome == PointOutcome.DONE) < min(
         r.f0_hz for r in told if r.kind == "tissue"
     )
     assert counts["/wrench"] > 100

@@ -13,14 +13,14 @@ from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
 from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
-from tactile_resonance.nodes.conversions import (
+from tactile_resonance.nodes.messages import frf_from_message
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
+from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.recording.messages import (
     excitation_from_message,
-    frf_from_message,
     poles_from_message,
     record_from_message,
 )
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
-from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 

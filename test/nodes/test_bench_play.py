@@ -15,8 +15,8 @@ from tactile_resonance.srv import Play
 
 from tactile_resonance import msg
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.nodes.conversions import excitation_to_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
+from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS, initialised
 from tactile_resonance.processes import free_domain_id
 

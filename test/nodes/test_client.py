@@ -24,8 +24,9 @@ from tactile_resonance.msg import PointResult
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goal_conduct, scan_node
 from tactile_resonance.nodes.frames import Found
+from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
-from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
+from tactile_resonance.nodes.scan_node import ScanNode
 from tactile_resonance.processes import free_domain_id
 from test.spinning import spin_until
 

@@ -17,7 +17,13 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.parameters import LIMIT_RANGES, RANGES, Workspace, read_contact
+from tactile_resonance.contact.parameters import (
+    ContactParameters,
+    Limits,
+    Workspace,
+    ranges_of,
+    read_contact,
+)
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.running import initialised
@@ -66,7 +72,7 @@ def test_a_limit_that_protects_the_tissue_is_made_stricter_and_never_laxer(launc
     node = launch()
     limit = node.get_parameter(full(name)).value
     short = name.removeprefix("contact.")
-    above = min({**RANGES, **LIMIT_RANGES}[short][1], 2 * limit)
+    above = min((ranges_of(ContactParameters) | ranges_of(Limits))[short].high, 2 * limit)
     below = limit - 1 if isinstance(limit, int) else 0.9 * limit
     if name in ("near_speed_m_s", "contact_speed_m_s"):
         below = limit  # the parameters ask for it

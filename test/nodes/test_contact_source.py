@@ -22,11 +22,12 @@ from tactile_resonance.srv import ForceOver
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.nodes import contact_source
 from tactile_resonance.nodes.contact_source import ANSWER_WITHIN_S
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import PLACES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact
+from tactile_resonance.recording.messages import time_from_message
 
 START_NS, END_NS = 1_700_000_000_123_456_789, 1_700_000_000_523_456_789
 WITHIN_S = 60.0

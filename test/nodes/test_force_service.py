@@ -20,11 +20,12 @@ from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.nodes import force_service
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.recording.messages import time_from_message
 
 MS = 1_000_000
 BEGAN_NS = 3_600_000 * MS  # of a loop's clock that has run for an hour

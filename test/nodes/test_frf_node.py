@@ -11,12 +11,12 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.nodes.conversions import (
+from tactile_resonance.nodes.frf_node import FrfNode
+from tactile_resonance.nodes.messages import (
     excitation_to_message,
     frf_from_message,
     record_to_message,
 )
-from tactile_resonance.nodes.frf_node import FrfNode
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record

@@ -26,11 +26,12 @@ from tactile_resonance.srv import ForceOver
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes import goal_thread, ideal_contact
-from tactile_resonance.nodes.conversions import time_from_message, time_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.ideal_contact import CONTACT_S, MOST_STAYS, Stay, Stays
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import STREAM, initialised
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_tip import BenchTip
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE

@@ -21,13 +21,13 @@ from tactile_resonance import msg
 from tactile_resonance.configuration import share_path
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes import pole_map_node
-from tactile_resonance.nodes.conversions import poles_to_message
+from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.pole_map_node import PoleMapNode
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB, shares
-from tactile_resonance.scan.point_result import Kind, Outcome
+from tactile_resonance.scan.point_result import PointKind, PointOutcome
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
@@ -60,7 +60,7 @@ def poles(key, x, f0_hz, damping=0.0336, frame="table", status=PolesStatus.OK, p
     return poles_to_message(result, Origin(measurement_id=key, simulated=True, contact=contact))
 
 
-def point_result(key, x, f0_hz, outcome=Outcome.DONE, kind=Kind.TISSUE, **values):
+def point_result(key, x, f0_hz, outcome=PointOutcome.DONE, kind=PointKind.TISSUE, **values):
     """Result of a point planned at x [m] on the surface, 2 mm below the tip."""
     message = msg.PointResult(
         outcome=int(outcome), kind=kind.value, measurement_id=key, x_m=x, y_m=0.001, z_m=-0.002
@@ -448,12 +448,12 @@ def test_only_what_a_scan_accepts_is_on_the_map(scanned):
     others = scanned.user.create_publisher(msg.Poles, "poles", POLES)
     others.publish(poles(9, 0.1, 300.0))
     for message in (
-        point_result(1, 0.0, 246.6, kind=Kind.AIR),
-        point_result(2, 0.004, 300.0, Outcome.DISCARDED),
-        point_result(3, 0.008, 300.0, Outcome.SKIPPED),
-        point_result(4, 0.012, 300.0, Outcome.FAILED),
+        point_result(1, 0.0, 246.6, kind=PointKind.AIR),
+        point_result(2, 0.004, 300.0, PointOutcome.DISCARDED),
+        point_result(3, 0.008, 300.0, PointOutcome.SKIPPED),
+        point_result(4, 0.012, 300.0, PointOutcome.FAILED),
         point_result(
-            5, 0.016, None, Outcome.FAILED
+            5, 0.016, None, PointOutcome.FAILED
         ),  # before it had poles: where the tip was nobody knows
         point_result(6, 0.020, 256.0),
     ):
@@ -471,11 +471,11 @@ def test_only_what_a_scan_accepts_is_on_the_map(scanned):
 @pytest.mark.parametrize(
     ("outcome", "f0_hz", "left"),
     [
-        (Outcome.DONE, 251.0, [255.0, 251.0]),
-        (Outcome.FAILED, 251.0, [255.0]),
-        (Outcome.FAILED, None, [255.0]),
-        (Outcome.SKIPPED, None, [255.0]),
-        (Outcome.DISCARDED, 251.0, [250.0, 255.0]),
+        (PointOutcome.DONE, 251.0, [255.0, 251.0]),
+        (PointOutcome.FAILED, 251.0, [255.0]),
+        (PointOutcome.FAILED, None, [255.0]),
+        (PointOutcome.SKIPPED, None, [255.0]),
+        (PointOutcome.DISCARDED, 251.0, [250.0, 255.0]),
     ],
 )
 def test_a_point_that_is_repeated_replaces_its_former_result(scanned, outcome, f0_hz, left):

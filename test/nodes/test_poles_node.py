@@ -16,12 +16,12 @@ from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.nodes.conversions import (
+from tactile_resonance.nodes.frf_node import FrfNode
+from tactile_resonance.nodes.messages import (
     excitation_to_message,
     frf_to_message,
     record_to_message,
 )
-from tactile_resonance.nodes.frf_node import FrfNode
 from tactile_resonance.nodes.poles_node import PolesNode
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id

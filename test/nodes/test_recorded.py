@@ -18,15 +18,15 @@ from tactile_resonance import msg
 from tactile_resonance.cli import main
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.multisine import Grid, design_multisine
-from tactile_resonance.nodes.conversions import excitation_to_message, record_to_message
 from tactile_resonance.nodes.devices import PARAMETERS, make_device
+from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import declare
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
-from tactile_resonance.recording import from_messages
+from tactile_resonance.recording import messages
 from tactile_resonance.recording.store_recording import recording_of
-from tactile_resonance.scan.point_result import Kind, PointResult
+from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.recorded import EXCITATION, RECORD, read_recorded
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -106,7 +106,7 @@ def run(tmp_path_factory):
                 recording.write(
                     "/left/record", RECORD, time_ns, serialize_message(record_to_message(record))
                 )
-            recording.finish(PointResult(2, kind=Kind.AIR, measurement_id=13))
+            recording.finish(PointResult(2, kind=PointKind.AIR, measurement_id=13))
     return folder
 
 
@@ -164,9 +164,9 @@ def test_analyze_reads_a_run(run, tmp_path, capsys):
 
 
 def test_numbers_of_the_core_are_the_constants_of_the_messages():
-    for grid, number in from_messages.GRIDS.items():
+    for grid, number in messages.GRIDS.items():
         assert number == getattr(msg.Excitation, f"GRID_{grid.name}")
-    for kind, number in from_messages.INPUT_KINDS.items():
+    for kind, number in messages.INPUT_KINDS.items():
         assert number == getattr(msg.Record, f"INPUT_{kind.name}")
-    for between, number in from_messages.BETWEEN_SAMPLES.items():
+    for between, number in messages.BETWEEN_SAMPLES.items():
         assert number == getattr(msg.Record, between.name)

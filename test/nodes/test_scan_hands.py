@@ -15,9 +15,9 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.nodes.conversions import poles_to_message
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
@@ -84,7 +84,8 @@ def test_a_measurement_at_an_unknown_place_is_disturbed_one_without_poles_has_fa
     hands = alone.start(Scanning).hands
     design = design_measurement(ScanScene("a", 0.01, (PLACE_M,)))
     came = []
-    monkeypatch.setattr(hands, "_record", lambda goal, enough, check: came)
+    monkeypatch.setattr(hands._measure, "measure", lambda *_: came[-1] if came else None)
+    monkeypatch.setattr(hands, "missing", lambda: None)
 
     def measure():
         recording = SimpleNamespace()
@@ -102,7 +103,7 @@ def test_a_measurement_at_an_unknown_place_is_disturbed_one_without_poles_has_fa
         assert measure().origin.contact.position_m == PLACE_M
         assert math.isnan(measure().contact_age_s)  # nobody touched anything
         # since the first touch, in the middle of what the poles rest on
-        hands._tip = SimpleNamespace(touched_ns=5_000_000_000, touching=True)
+        hands._tip = SimpleNamespace(touched_ns=5_000_000_000, touching=True, stopped=False, check=print)
         pressing = replace(there, time_ns=6_500_000_000)
         pressing = replace(pressing, contact=replace(there.contact, force_n=0.01, force_std_n=0.0))
         came.append(poles_to_message(Poles(), pressing))

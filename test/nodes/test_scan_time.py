@@ -51,17 +51,16 @@ def test_while_a_scan_conducts_each_go_lets_one_block_pass():
     assert scan.simulated
     assert scan.silent_s == 60.0
     with device() as clock:
-        scan.begin()
-        assert stands(scan)
-        begun_ns = clock.ask_ns()
-        for n in (1, 2, 3):
-            scan.go()
-            clock.hold(begun_ns + n * BLOCK_NS, Demand.FAST)
-            clock.wait_told(patience())
+        with scan.conducted():
             assert stands(scan)
-            assert round(scan.now_s() * 1e9) == begun_ns + n * BLOCK_NS
-        clock.free()
-        scan.end()
+            begun_ns = clock.ask_ns()
+            for n in (1, 2, 3):
+                scan.go()
+                clock.hold(begun_ns + n * BLOCK_NS, Demand.FAST)
+                clock.wait_told(patience())
+                assert stands(scan)
+                assert round(scan.now_s() * 1e9) == begun_ns + n * BLOCK_NS
+            clock.free()
         begun_ns, begun_s = clock.ask_ns(), time.monotonic()
         while clock.ask_ns() == begun_ns:  # nobody conducts: at its own pace
             assert time.monotonic() < begun_s + 60.0
@@ -69,19 +68,18 @@ def test_while_a_scan_conducts_each_go_lets_one_block_pass():
 
 def test_time_of_a_scan_never_goes_back_though_a_bench_begins_anew():
     scan = ScanTime(SERVER, 60.0)
-    scan.begin()  # no bench yet: tried again by `go`
-    assert scan.now_s() == 0.0
-    last_s = 0.0
-    for _ in range(2):
-        with device() as clock:
+    with scan.conducted():  # no bench yet: tried again by `go`
+        assert scan.now_s() == 0.0
+        last_s = 0.0
+        for _ in range(2):
+            with device() as clock:
+                scan.go()
+                clock.wait_until(clock.ask_ns() + BLOCK_NS, Demand.FAST)
+                now_s = scan.now_s()
+                assert now_s >= last_s + BLOCK_NS * 1e-9
+                last_s = now_s
+            assert scan.now_s() == last_s  # the bench has ended
             scan.go()
-            clock.wait_until(clock.ask_ns() + BLOCK_NS, Demand.FAST)
-            now_s = scan.now_s()
-            assert now_s >= last_s + BLOCK_NS * 1e-9
-            last_s = now_s
-        assert scan.now_s() == last_s  # the bench has ended
-        scan.go()
-    scan.end()
 
 
 def test_a_port_in_use_is_refused_and_free_again_once_closed():
@@ -92,10 +90,9 @@ def test_a_port_in_use_is_refused_and_free_again_once_closed():
 
 def test_on_the_wall_clock_a_scan_has_this_machines_time():
     scan = ScanTime("", 60.0)
-    scan.begin()
-    scan.go()
-    scan.seed(1)
-    assert scan.silent_s == SILENT_S
-    before_s = time.monotonic()
-    assert before_s <= scan.now_s() <= time.monotonic()
-    scan.end()
+    with scan.conducted():
+        scan.go()
+        scan.seed(1)
+        assert scan.silent_s == SILENT_S
+        before_s = time.monotonic()
+        assert before_s <= scan.now_s() <= time.monotonic()

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import TipContact, _failure
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
 from tactile_resonance.scan.scene import Hold

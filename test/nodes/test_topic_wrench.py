@@ -22,7 +22,7 @@ from spinning import spin_until
 from tactile_resonance.contact.cell_checks import samples_until_stuck
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, FIRST_WITHIN_S, LATEST_S, TopicWrench
 from tactile_resonance.processes import free_domain_id

@@ -9,7 +9,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
-from tactile_resonance.nodes.conversions import time_message
+from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 SECOND_NS = 10**9

@@ -2,7 +2,7 @@
 """A bench without robot and nodes, whose poles have a known spread and whose time is told, and scans on it."""
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -43,6 +43,7 @@ class Bench:
     force_n: float = 0.01
     rms_n: object = None  # of the force over the blocks so far, from the number of the measurement and of these
     measurements: int = 0
+    beside: Poles | None = None  # another mode, of lower frequency, reported before the main one
 
     def now_s(self):
         return self.time_s
@@ -85,6 +86,8 @@ class Bench:
                 covariance=covariance[None],
                 total_covariance=covariance[None],
             )
+            if self.beside is not None:
+                poles = joined(self.beside, poles)
             if self.on_measure is not None and label != "air":
                 self.on_measure(self, blocks)
             if self.rms_n is not None and label != "air":
@@ -100,6 +103,14 @@ class Bench:
     def retract(self):
         self.holding = False
         return self.zero_moved_n
+
+
+def joined(first, second):
+    names = [each.name for each in fields(Poles) if each.name.endswith("covariance")]
+    names += ["poles_rad_s", "f0_hz", "damping_ratio", "residues"]
+    pairs = {name: (getattr(first, name), getattr(second, name)) for name in names}
+    known = {name: pair for name, pair in pairs.items() if pair[1] is not None}
+    return replace(second, **{name: np.concatenate(pair) for name, pair in known.items()})
 
 
 def note(text):

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 import numpy as np
 
 from tactile_resonance.scan.messages import make_message, to_cdr
-from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.scan_point import ScanPoint
 
 POLES = "tactile_resonance/msg/Poles"
@@ -21,8 +21,8 @@ VALUES = {
     "float": float,
     "str": str,
     "bool": {"True": True, "False": False}.__getitem__,
-    "Kind": Kind,
-    "Outcome": lambda text: Outcome[text.upper()],
+    "PointKind": PointKind,
+    "PointOutcome": lambda text: PointOutcome[text.upper()],
 }
 
 

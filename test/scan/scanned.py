@@ -7,11 +7,11 @@ from tactile_resonance.identification.joint_records import identify_poles_from_r
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide
-from tactile_resonance.scan.facts import run_facts
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_outcome import measured_result
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.run_start import run_facts
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
@@ -25,7 +25,7 @@ def begin(path, folder):
     """A run of a scene file, nothing measured yet."""
     scene = read_scan_scene(path)
     plan = make_plan(scene)
-    needed = expected_bytes(len(plan.points), scene.blocks.most, 20_000, plan.measurement.lines)
+    needed = expected_bytes(len(plan.points), plan.measurement)
     return RunDirectory.create(folder, path.read_text(), plan.points, run_facts(plan, 1), needed)
 
 
@@ -67,11 +67,10 @@ def measure(scene, phantoms, design, bench, point, attempt):
             harmonics=excitation.harmonics,
             band_hz=band,
         )
-        known = poles.f0_hz.size == 1
         decision = decide(
-            [poles.f0_hz[0], poles.damping_ratio[0]] if known else [np.nan] * 2,
-            poles.covariance[0] if known and poles.covariance is not None else None,
-            poles.total_covariance[0] if known and poles.total_covariance is not None else None,
+            poles.main.estimate,
+            poles.main.covariance,
+            poles.main.noise,
             len(u),
             scene.precision,
             scene.blocks,

@@ -12,7 +12,7 @@ from tactile_resonance.scan.bench_truth import deviations, truths_of
 from tactile_resonance.scan.map_messages import header_message
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_result import TYPE as RESULT
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -59,7 +59,7 @@ def run(tmp_path):
             poles(recording, "/poles", 0, 8, 400_000_000, 251.0)
             recording.finish(result(1, measurement_id=8))
         with run.begin_point(2) as recording:
-            recording.finish(result(2, outcome=Outcome.FAILED, reason="contact: surface_missing"))
+            recording.finish(result(2, outcome=PointOutcome.FAILED, reason="contact: surface_missing"))
     return read_run(tmp_path / "run")
 
 

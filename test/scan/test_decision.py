@@ -38,7 +38,7 @@ def run(rng, wanted, mean, limits=LIMITS):
     factor = np.linalg.cholesky(BLOCK)
     for blocks in range(1, limits.most + 1):
         total += mean + factor @ rng.standard_normal(2)
-        decision = decide(total / blocks, BLOCK / blocks, None, blocks, wanted, limits, 0.4)
+        decision = decide(total / blocks, BLOCK / blocks, BLOCK / blocks, blocks, wanted, limits, 0.4)
         if decision.stop:
             return decision
     raise AssertionError("unreachable")
@@ -92,7 +92,7 @@ def test_likelihood_ratio_of_all_blocks_is_the_sum_over_blocks():
 def test_what_is_neither_ends_it():
     wanted = Separate(*point_classes(3.0), probability=0.99)
     far = wanted.first.mean + [1.0, 0.0]
-    decision = decide(far, BLOCK, None, 3, wanted, BlockLimits(), 0.4)
+    decision = decide(far, BLOCK, BLOCK, 3, wanted, BlockLimits(), 0.4)
     assert decision.verdict is Verdict.NEITHER
     assert decision.called == ""
 
@@ -101,7 +101,7 @@ def precise(blocks, noise_std, floor=0.0, **wanted):
     noise = np.diag([noise_std**2, (noise_std / 100) ** 2])
     total = noise + np.diag([floor**2, 0])
     wanted = Precise(**(wanted or {"f0_std_hz": 0.01}))
-    return decide([250.0, 0.03], noise, total, blocks, wanted, BlockLimits(3, 8), 0.4)
+    return decide([250.0, 0.03], total, noise, blocks, wanted, BlockLimits(3, 8), 0.4)
 
 
 def test_stops_at_the_block_where_it_is_precise_enough():
@@ -130,8 +130,9 @@ def test_gives_up_what_no_block_will_bring():
 
 
 def test_without_poles_or_precision_it_goes_on_to_the_most_blocks():
+    unknown = np.full((2, 2), np.nan)
     for wanted in (None, Precise(f0_std_hz=0.01), Separate(*point_classes(3), probability=0.99)):
         for n, verdict in ((3, Verdict.CONTINUE), (8, Verdict.MOST_BLOCKS)):
-            decision = decide([np.nan] * 2, None, None, n, wanted, BlockLimits(), 0.4)
+            decision = decide([np.nan] * 2, unknown, unknown, n, wanted, BlockLimits(), 0.4)
             assert decision.verdict is verdict
             assert decision.blocks_saved == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tactile_resonance.scan.point_file import read_messages
-from tactile_resonance.scan.point_result import Outcome
+from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.scene import Gate, read_scan_scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -32,7 +32,7 @@ def test_a_measurement_that_the_force_disturbs_is_begun_again_in_the_same_contac
     assert [entry[3] for entry in measured] == [1, 3, 4]
     seeds = [entry[2] for entry in measured]
     assert len(set(seeds)) == 3  # phases and simulated noise of its own
-    assert (result.outcome, result.attempt, result.blocks) == (Outcome.DONE, 0, 4)
+    assert (result.outcome, result.attempt, result.blocks) == (PointOutcome.DONE, 0, 4)
     assert result.measurement_id == 1000 + seeds[-1]
     assert result.force_rms_n == 1e-4
     assert result.gate == (
@@ -49,19 +49,19 @@ def test_a_force_that_is_never_quiet_fails_the_point_with_the_figures(tmp_path):
     summary, run, _ = scan(tmp_path / "run", scene(2, gate=GATE), bench)
     first, second = run.latest
     assert (summary.done, summary.failed) == (1, 1)
-    assert first.outcome is Outcome.FAILED
+    assert first.outcome is PointOutcome.FAILED
     assert first.reason == (
         "gate: the force was never quiet: measurements left out: 4, with a force of 10.00 (rms 0.40), "
         "10.00 (rms 0.50), 10.00 (rms 0.60), 10.00 (rms 0.70) mN; accepted is rms up to 0.3 mN"
     )
     assert math.isnan(first.f0_hz)
-    assert (second.outcome, second.gate) == (Outcome.DONE, "")
+    assert (second.outcome, second.gate) == (PointOutcome.DONE, "")
     assert not bench.holding
 
 
 def test_a_quiet_force_that_is_not_the_one_asked_for_is_left_out_too(tmp_path):
     bench = Bench(rms_n=lambda number, blocks: 1e-4, force_n=0.0093)
-    for limit_n, outcome in ((5e-4, Outcome.FAILED), (8e-4, Outcome.DONE)):
+    for limit_n, outcome in ((5e-4, PointOutcome.FAILED), (8e-4, PointOutcome.DONE)):
         made = scene(1, gate=Gate(3e-4, limit_n, measurements=2))
         _, run, _ = scan(tmp_path / outcome.name, made, bench)
         (result,) = run.latest
@@ -73,13 +73,13 @@ def test_without_a_gate_every_measurement_counts(tmp_path):
     bench = Bench(rms_n=lambda number, blocks: 9e-4)
     _, run, _ = scan(tmp_path / "run", scene(1), bench)
     (result,) = run.latest
-    assert (result.outcome, result.blocks, result.force_rms_n) == (Outcome.DONE, 4, 9e-4)
+    assert (result.outcome, result.blocks, result.force_rms_n) == (PointOutcome.DONE, 4, 9e-4)
 
 
 def test_a_gate_needs_a_force_whose_motion_is_known(tmp_path):
     _, run, _ = scan(tmp_path / "run", scene(1, gate=GATE), Bench())
     (result,) = run.latest
-    assert result.outcome is Outcome.FAILED
+    assert result.outcome is PointOutcome.FAILED
     assert result.reason == "gate: how the force moved is unknown: too few forces were measured"
 
 

@@ -10,7 +10,7 @@ from tactile_resonance.report.map_recording import write_map_recording
 from tactile_resonance.scan.map_messages import POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
-from tactile_resonance.scan.point_result import Kind, Outcome, PointResult
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -20,7 +20,7 @@ TIP = Rotation.from_rotvec([0.1, 0.2, -0.3])
 START_NS = 1_700_000_000_000_000_000
 
 
-def result_of(index, attempt=0, outcome=Outcome.DONE, f0_hz=250.0, **more):
+def result_of(index, attempt=0, outcome=PointOutcome.DONE, f0_hz=250.0, **more):
     return PointResult(
         index=index,
         attempt=attempt,
@@ -43,10 +43,10 @@ def result_of(index, attempt=0, outcome=Outcome.DONE, f0_hz=250.0, **more):
 
 ATTEMPTS = (
     result_of(0),
-    result_of(1, outcome=Outcome.DISCARDED, f0_hz=999.0),
+    result_of(1, outcome=PointOutcome.DISCARDED, f0_hz=999.0),
     result_of(1, attempt=1, f0_hz=251.0),
-    result_of(2, outcome=Outcome.FAILED, f0_hz=np.nan),
-    result_of(3, outcome=Outcome.SKIPPED, f0_hz=np.nan),
+    result_of(2, outcome=PointOutcome.FAILED, f0_hz=np.nan),
+    result_of(3, outcome=PointOutcome.SKIPPED, f0_hz=np.nan),
 )
 
 
@@ -72,7 +72,7 @@ def folder(tmp_path):
                 )
                 recording.finish(result)
         with run.begin_reference("air-after") as recording:
-            recording.finish(result_of(4, kind=Kind.AIR, f0_hz=246.6))
+            recording.finish(result_of(4, kind=PointKind.AIR, f0_hz=246.6))
     return tmp_path / "run"
 
 

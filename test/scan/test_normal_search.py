@@ -15,15 +15,14 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.normal_search import find_normals, normal_of_touches, places_around
 from tactile_resonance.scan.plan import make_plan, plan_with, tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
-from tactile_resonance.scan.surface_search import Touch
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
-from tactile_resonance.simulation.surfaces import Sphere
+from tactile_resonance.simulation.surfaces import RoundSurface
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT
@@ -241,7 +240,7 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
     true = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     # the ball touches level with the point, its centre straight above it; a level normal is expected there
     centre = np.array([0, 0, RADIUS_M]) + (7.5e-3 if hollow else -12.5e-3) * true
-    surface = Sphere(centre, 10e-3, hollow)
+    surface = RoundSurface(centre, 10e-3, hollow)
     told = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(told.position_m + [0, 0, 3e-3], told.rotation_rad)
     bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M), seed=5)

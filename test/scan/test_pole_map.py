@@ -15,10 +15,9 @@ from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.main_mode import main_mode
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, measured_result
-from tactile_resonance.scan.point_result import Outcome, PointResult, as_csv
+from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
 from tactile_resonance.scan.pole_map import (
     EllipseScale,
     MapPoint,
@@ -60,7 +59,7 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
         "drift_covariance": np.array([np.diag([0.01, 1e-9]), np.diag([0.04, 4e-10])]),
     }
     modes = poles((250.0, 280.0), residues=[1.0, 2.0], **drift)
-    mode = main_mode(modes)
+    mode = modes.main
     assert mode.estimate[0] == 280.0
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
@@ -77,7 +76,7 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
     assert result.f0_drift_std_hz_per_s == pytest.approx(0.2)
     assert result.damping_drift_std_per_s == pytest.approx(2e-5)
-    constant = main_mode(poles((250.0, 280.0), residues=[1.0, 2.0]))
+    constant = poles((250.0, 280.0), residues=[1.0, 2.0]).main
     assert np.isnan([*constant.drift, *constant.drift_std]).all()
 
 
@@ -288,6 +287,6 @@ def test_a_run_s_results_make_the_same_point():
     np.testing.assert_allclose(again.covariance, point.covariance)
     np.testing.assert_allclose(again.position_m, point.position_m)
     assert again.status is PolesStatus.MODEL_ERROR
-    failed = point_of_result(replace(result, outcome=Outcome.FAILED, reason="contact lost"))
+    failed = point_of_result(replace(result, outcome=PointOutcome.FAILED, reason="contact lost"))
     assert failed.failed
     assert failed.reason == "contact lost"

@@ -7,12 +7,11 @@ import pytest
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.scan.hands import PointFailed, ScanEnded
+from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.preparation import UNCHECKED, prepare
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import HeightField, NormalRequest, Plane, TouchRequest
-from tactile_resonance.scan.surface_search import Touch
 
 RADIUS_M = 2.5e-3
 USE = TipUse(TipGeometry(), ContactParameters(), Limits(depth_m=4e-3))

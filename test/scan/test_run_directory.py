@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,16 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_file import offered_qos
-from tactile_resonance.scan.point_result import COLUMNS, Kind, Outcome, as_csv
+from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome, as_csv
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.scene import Output
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import scene
 from run_tables import (
     POLES,
     RECORD,
@@ -50,7 +54,7 @@ def test_a_run_is_read_back_by_an_independent_reader(tmp_path):
             record_point(run, index, messages=2 + index)
         with run.begin_reference("air-before") as reference:
             reference.write("/excitation", RECORD, START_NS - 10**9, record_cdr(9))
-            reference.finish(result(3, kind=Kind.AIR, time_ns=START_NS - 10**9))
+            reference.finish(result(3, kind=PointKind.AIR, time_ns=START_NS - 10**9))
     with AnyReader([tmp_path / "run" / "recording"]) as reader:
         counts = {topic: info.msgcount for topic, info in reader.topics.items()}
         assert counts == {"/record": 2 + 3 + 4, "/point_result": 4, "/excitation": 1}
@@ -101,7 +105,7 @@ def test_type_hashes_are_those_of_the_ros_build():
 def test_a_row_a_message_and_a_file_say_the_same(tmp_path):
     given = [
         result(0, reason='a "quoted", text', f0_hz=1 / 3),
-        result(1, outcome=Outcome.FAILED, f0_hz=float("nan"), notes="tip wet", simulated=True),
+        result(1, outcome=PointOutcome.FAILED, f0_hz=float("nan"), notes="tip wet", simulated=True),
     ]
     with create(tmp_path / "run") as run:
         for r in given:
@@ -135,7 +139,7 @@ def test_replays_offer_what_the_nodes_offered(tmp_path):
             reference.write("/poles", POLES, START_NS, poles, offered_qos(1024, latched=True))
             wrench = offered_qos(5, reliable=False)
             reference.write("/wrench", RECORD, START_NS, record_cdr(0), wrench)
-            reference.finish(result(4, kind=Kind.AIR))
+            reference.finish(result(4, kind=PointKind.AIR))
         record_point(run, 0)
     path = tmp_path / "run" / "recording"
     content = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
@@ -168,12 +172,12 @@ def test_replays_offer_what_the_nodes_offered(tmp_path):
 
 def test_an_attempt_more_replaces_the_row_and_keeps_the_file(tmp_path):
     with create(tmp_path / "run") as run:
-        record_point(run, 0, outcome=Outcome.FAILED, reason="contact lost")
+        record_point(run, 0, outcome=PointOutcome.FAILED, reason="contact lost")
         record_point(run, 1)
         record_point(run, 0)
         assert [(r.index, r.attempt, r.outcome) for r in run.content.latest] == [
-            (0, 1, Outcome.DONE),
-            (1, 0, Outcome.DONE),
+            (0, 1, PointOutcome.DONE),
+            (1, 0, PointOutcome.DONE),
         ]
         assert run.content.next_point.index == 2
     names = sorted(path.name for path in (tmp_path / "run" / "recording").glob("*.mcap"))
@@ -319,7 +323,10 @@ def record_until_killed(path, after_s):
 
 
 def test_expected_bytes_bounds_what_a_run_takes(tmp_path):
-    samples, blocks, lines = 20_000, 3, 4000
+    samples, blocks = 20_000, 3
+    design = design_measurement(scene(outputs=(Output.POLES, Output.FRF)))
+    design = replace(design, periods=blocks)
+    assert (design.samples, design.lines) == (samples, 3997)
     with create(tmp_path / "run", 2) as run:
         for index in range(2):
             with run.begin_point(index) as recording:
@@ -327,4 +334,4 @@ def test_expected_bytes_bounds_what_a_run_takes(tmp_path):
                     recording.write("/record", RECORD, START_NS, record_cdr(index, samples))
                 recording.finish(result(index))
     taken = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*") if path.is_file())
-    assert 2 * blocks * 4 * samples < taken < expected_bytes(2, blocks, samples, lines)
+    assert 2 * blocks * 4 * samples < taken < expected_bytes(2, design)

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.record import Origin
+from tactile_resonance.report.point_table import point_table
+from tactile_resonance.report.run_report import pole_map_of
 from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.scan.controls import Controls, Request
-from tactile_resonance.scan.decision import Separate, Verdict
-from tactile_resonance.scan.hands import Measured
+from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
-from tactile_resonance.scan.point_result import Outcome
-from tactile_resonance.scan.references import SensorHealth
+from tactile_resonance.scan.point_result import PointOutcome
+from tactile_resonance.scan.references import SensorHealth, reference_of
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
@@ -78,22 +78,51 @@ def test_a_silent_record_is_taken_before_all_else_where_the_scene_asks_for_it(tm
     assert len([entry for entry in bench.log if entry[1] == "silent"]) == 1
 
 
-def test_precision_is_that_of_the_mode_that_is_reported(tmp_path):
-    """A precise weak mode beside it says nothing of the main one."""
-    bench = Bench()
-    made, run = begin(tmp_path / "run", scene(1))
-    runner = ScanRunner(scene(1), made, run, bench, Controls(), print)
-    poles = Poles(
+@pytest.mark.parametrize("weak_std_hz", [1e-4, 1.0])
+def test_of_two_modes_the_main_one_ends_the_measurement_and_is_on_the_map(tmp_path, weak_std_hz):
+    """Whether the weak mode beside it is known far better or far worse makes no difference to anything."""
+    weak = Poles(
+        poles_rad_s=np.array([-50 + 1400j]),
+        f0_hz=np.array([222.0]),
+        damping_ratio=np.array([0.036]),
+        residues=np.array([1 + 0j]),
+        covariance=np.diag([weak_std_hz**2, 1e-12])[None],
+        total_covariance=np.diag([weak_std_hz**2, 1e-12])[None],
+    )
+    summary, run, told = scan(tmp_path / "run", scene(3), Bench(beside=weak))
+    assert summary.complete
+    blocks = 4  # 0.02 Hz of one, 0.01 Hz asked for
+    for result in run.latest:
+        assert (result.verdict, result.blocks) == ("precision reached", blocks)
+        assert (result.f0_hz, result.damping_ratio) == (254.0, 0.03)
+        assert result.f0_std_hz == pytest.approx(SPREAD_HZ / np.sqrt(blocks))
+        assert (result.pole_real_rad_s, result.pole_imag_rad_s) == (-50.0, 1600.0)
+    np.testing.assert_array_equal(pole_map_of(run).f0_hz, 254.0)
+    std_hz = [point.std[0] for point in pole_map_of(run).points]
+    np.testing.assert_allclose(std_hz, SPREAD_HZ / np.sqrt(blocks))
+    measured = [p.poles.main for p in told if p.poles is not None]
+    assert {mode.f0_hz for mode in measured} == {254.0}
+    references = [reference_of(p.poles) for p in told if p.poles is not None]
+    assert {reference.estimate[0] for reference in references} == {254.0}
+    assert "254.000" in point_table(run.latest, {})
+
+
+def test_the_best_covariance_is_the_total_one_where_it_is_known():
+    noise, total = np.diag([1.0, 1e-6]), np.diag([4.0, 1e-6])
+    modes = Poles(
         poles_rad_s=np.array([-50 + 1400j, -50 + 1500j]),
         f0_hz=np.array([222.0, 240.0]),
         damping_ratio=np.array([0.03, 0.03]),
-        residues=np.array([1 + 0j, 100 + 0j]),
-        covariance=np.array([np.diag([1e-6, 1e-12]), np.diag([4.0, 1e-6])]),
+        residues=np.array([1 + 0j, 2 + 0j]),
+        covariance=np.array([noise, noise]),
+        total_covariance=np.array([total, np.full((2, 2), np.nan)]),
     )
-    with run:
-        decision = runner._decide(Measured(poles, Origin()), 2)
-    assert decision.verdict is not Verdict.PRECISE
-    assert decision.reason.startswith("std of f0 2 Hz")
+    np.testing.assert_array_equal(modes.best_covariance, [total, noise])
+    np.testing.assert_array_equal(modes.main.covariance, noise)
+    unknown = replace(modes, covariance=None, total_covariance=None)
+    assert np.isnan(unknown.best_covariance).all()
+    assert unknown.main.found
+    assert not Poles().main.found
 
 
 def pressed_scene():
@@ -190,9 +219,9 @@ def test_skip_repeat_and_cancel(tmp_path):
     # 0 is left for good; 1 is left, done again; 3 is left when the scan is cancelled
     assert touched == [0, 1, 1, 2, 3]
     assert [result.outcome for result in run.latest] == [
-        Outcome.SKIPPED,
-        Outcome.DONE,
-        Outcome.DONE,
+        PointOutcome.SKIPPED,
+        PointOutcome.DONE,
+        PointOutcome.DONE,
     ]
     assert run.next_point.index == 3
     assert not bench.holding
@@ -208,7 +237,7 @@ def test_skip_repeat_and_cancel(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("request_", "first"), [(Request.SKIP, Outcome.SKIPPED), (Request.REPEAT, Outcome.DONE)]
+    ("request_", "first"), [(Request.SKIP, PointOutcome.SKIPPED), (Request.REPEAT, PointOutcome.DONE)]
 )
 def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
     tmp_path, request_, first
@@ -225,7 +254,7 @@ def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
     summary, run, _ = scan(tmp_path / "run", scene(2), Asked(), controls)
     assert not asked
     assert summary.complete
-    assert [result.outcome for result in run.latest] == [first, Outcome.DONE]
+    assert [result.outcome for result in run.latest] == [first, PointOutcome.DONE]
     assert len([file for file in run.files if file.name.startswith("reference-")]) == 2
 
 

@@ -19,7 +19,7 @@ from tactile_resonance.scan.hands import (
     ScanEnded,
 )
 from tactile_resonance.scan.messages import message_types
-from tactile_resonance.scan.point_result import TYPE, Kind, Outcome, from_message
+from tactile_resonance.scan.point_result import TYPE, PointKind, PointOutcome, from_message
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.scene import OnFailure, TimeLimits
 
@@ -31,7 +31,7 @@ def test_a_point_that_fails_is_kept_with_its_reason_and_the_scan_goes_on(tmp_pat
     summary, run, _ = scan(tmp_path / "run", scene(), Bench(failing=(1,)))
     assert (summary.complete, summary.done, summary.failed) == (True, 3, 1)
     failed = run.latest[1]
-    assert failed.outcome is Outcome.FAILED
+    assert failed.outcome is PointOutcome.FAILED
     assert failed.reason == "contact: surface_missing: nothing there"
     assert np.isnan(failed.f0_hz)
 
@@ -114,13 +114,13 @@ def test_every_attempt_is_told_with_what_became_of_it(tmp_path):
         runner.ScanRunner(made, plan, run, bench, controls, lambda _: None, 1, publish).run()
     told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in cdrs]
     assert [(r.kind, r.index, r.attempt, r.outcome, r.measurement_id) for r in told] == [
-        (Kind.AIR, 5, 0, Outcome.DONE, 1006),
-        (Kind.TISSUE, 0, 0, Outcome.DONE, 1001),
-        (Kind.TISSUE, 1, 0, Outcome.DISCARDED, 1002),
-        (Kind.TISSUE, 1, 0, Outcome.DONE, 1002),
-        (Kind.TISSUE, 2, 0, Outcome.SKIPPED, 1003),
-        (Kind.TISSUE, 3, 0, Outcome.FAILED, 0),
-        (Kind.TISSUE, 4, 0, Outcome.DISCARDED, 1005),
+        (PointKind.AIR, 5, 0, PointOutcome.DONE, 1006),
+        (PointKind.TISSUE, 0, 0, PointOutcome.DONE, 1001),
+        (PointKind.TISSUE, 1, 0, PointOutcome.DISCARDED, 1002),
+        (PointKind.TISSUE, 1, 0, PointOutcome.DONE, 1002),
+        (PointKind.TISSUE, 2, 0, PointOutcome.SKIPPED, 1003),
+        (PointKind.TISSUE, 3, 0, PointOutcome.FAILED, 0),
+        (PointKind.TISSUE, 4, 0, PointOutcome.DISCARDED, 1005),
     ]
     assert [r.reason for r in told] == [
         *("", "", "contact: force_stale: 11 ms", "", "skipped on request"),
@@ -129,7 +129,7 @@ def test_every_attempt_is_told_with_what_became_of_it(tmp_path):
     assert np.isfinite([r.f0_hz for r in told]).tolist() == [True, True, False, True, *[False] * 3]
     # what counts is on disk before it is told, and told again of a run that is gone on with
     assert on_disk == [1, 2, 2, 3, 4, 5, 5]
-    kept = [cdr for cdr, r in zip(cdrs, told, strict=True) if r.outcome is not Outcome.DISCARDED]
+    kept = [cdr for cdr, r in zip(cdrs, told, strict=True) if r.outcome is not PointOutcome.DISCARDED]
     assert list(recorded_results(run.content)) == kept
 
 
@@ -150,9 +150,9 @@ def test_a_reference_that_fails_is_told_and_so_is_one_that_ends_the_scan(tmp_pat
         ).run()
     told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in told]
     assert [(r.kind, r.index, r.outcome, r.reason, r.measurement_id) for r in told] == [
-        (Kind.AIR, 1, Outcome.DISCARDED, "frf: lost", 7),
-        (Kind.AIR, 1, Outcome.FAILED, "no poles", 8),
-        (Kind.TISSUE, 0, Outcome.DISCARDED, "no node", 9),
+        (PointKind.AIR, 1, PointOutcome.DISCARDED, "frf: lost", 7),
+        (PointKind.AIR, 1, PointOutcome.FAILED, "no poles", 8),
+        (PointKind.TISSUE, 0, PointOutcome.DISCARDED, "no node", 9),
     ]
 
 
@@ -204,7 +204,7 @@ def test_a_scan_whose_node_stays_away_ends_with_its_name_and_can_go_on(tmp_path,
     summary, run, _ = scan(tmp_path / "run", scene(), Leaving(on_measure=leave, left=0))
     assert not summary.complete
     assert "/frf_node is not active" in summary.message
-    assert [result.outcome for result in run.latest] == [Outcome.DONE] * 2
+    assert [result.outcome for result in run.latest] == [PointOutcome.DONE] * 2
     assert run.next_point.index == 2
 
 

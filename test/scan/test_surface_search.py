@@ -11,11 +11,11 @@ import yaml
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
-from tactile_resonance.scan.hands import PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest
-from tactile_resonance.scan.surface_search import Touch, find_surface, fit_touches
+from tactile_resonance.scan.surface_search import find_surface, fit_touches
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import RADIUS_M, contact

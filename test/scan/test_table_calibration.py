@@ -16,7 +16,8 @@ from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, Touch
+from tactile_resonance.scan.hands import Touch
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 from tactile_resonance.scan.table_calibration import (
     CalibrationRequest,
     calibrate_table,

@@ -12,7 +12,7 @@ import pytest
 from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
 from tactile_resonance.report.run_report import pole_map_of
-from tactile_resonance.scan.point_result import Outcome, PointResult
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -40,7 +40,7 @@ def run_folder(tmp_path_factory):
 def test_every_point_is_right_as_far_as_it_says(run_folder):
     results = read_run(run_folder).latest
     assert [r.index for r in results] == list(range(25))
-    assert all(r.outcome is Outcome.DONE for r in results)
+    assert all(r.outcome is PointOutcome.DONE for r in results)
     errors = np.array([r.estimate - true_poles(SCENE, r.position_m) for r in results])
     covariances = np.array([r.covariance for r in results])
     distance2 = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
@@ -142,8 +142,8 @@ def test_report_of_a_run_with_failures_and_gaps(tmp_path, capsys):
         assert not (folder / "pole_map.png").exists()
         go_on(SCENE, run, 2)
         for index, outcome, reason in (
-            (2, Outcome.FAILED, "contact <lost>"),
-            (3, Outcome.SKIPPED, "on request"),
+            (2, PointOutcome.FAILED, "contact <lost>"),
+            (3, PointOutcome.SKIPPED, "on request"),
         ):
             with run.begin_point(index) as recording:
                 x_m, y_m, z_m = run.content.points[index].position_m

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import TissueLibrary, read_tissues
-from tactile_resonance.simulation.parameters import SensorParameters, read_sensor
 
 
 @pytest.fixture(scope="session")

@@ -7,9 +7,9 @@ import yaml
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.materials import Uniform
-from tactile_resonance.simulation.parameters import read_sensor
 from tactile_resonance.simulation.scene import PhantomScene, Region, read_scene
 from tactile_resonance.simulation.shapes import Box, HalfSpace, Sphere
 from tactile_resonance.simulation.surface_motion import SurfaceMotion

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from tactile_resonance.sensor import NonlinearParameters
 from tactile_resonance.simulation.lines import Lines, sample_period
 from tactile_resonance.simulation.modal import PoleResidueModel
 from tactile_resonance.simulation.nonlinear import (
@@ -14,7 +15,6 @@ from tactile_resonance.simulation.nonlinear import (
     NonlinearStream,
     nonlinear_steady_state,
 )
-from tactile_resonance.simulation.parameters import NonlinearParameters
 from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.volterra import WindowKernel
 

@@ -12,7 +12,7 @@ from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Ta
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import Plane
+from tactile_resonance.simulation.surfaces import FlatSurface
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU, MODULUS_PA = 2.5e-3, 0.49, 10e3
@@ -70,7 +70,7 @@ def test_phases_follow_from_the_seed():
 def test_a_tip_that_stands_is_pressed_as_the_tissue_rises():
     """Hertz at the depth that place and motion make, on a surface that is tilted."""
     tilt, depth_m = 0.2, 3e-4
-    surface = Plane.tilted(0.1, tilt)
+    surface = FlatSurface.tilted(0.1, tilt)
     tissue = Tissue("elastic", MODULUS_PA, (), ())
 
     def tip(found):

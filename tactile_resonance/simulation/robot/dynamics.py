@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.simulation.robot.ft_sensor import Payload
+from tactile_resonance.simulation.robot.ft_sensor import ToolPayload
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import Six
 
@@ -31,7 +31,7 @@ LINK_CENTRE_M = np.array(
 )
 
 
-def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: Payload) -> Six:
+def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: ToolPayload) -> Six:
     """Return the torques [N m] that hold links and payload against gravity.
 
     Parameters
@@ -39,17 +39,17 @@ def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: Payload) -> 
     posture : Posture
     gravity_m_s2 : Vector
         Acceleration of free fall in the base.
-    payload : Payload
+    payload : ToolPayload
     """
     return tuple((_momentum_per_speed(posture, payload) @ np.negative(gravity_m_s2)).tolist())
 
 
-def momentum(posture: Posture, qd: Six, payload: Payload) -> float:
+def momentum(posture: Posture, qd: Six, payload: ToolPayload) -> float:
     """Return the norm of the linear momentum of links and payload [kg m/s]."""
     return float(np.linalg.norm(np.array(qd) @ _momentum_per_speed(posture, payload)))
 
 
-def _momentum_per_speed(posture: Posture, payload: Payload) -> FloatArray:
+def _momentum_per_speed(posture: Posture, payload: ToolPayload) -> FloatArray:
     """Return the linear momentum that a unit speed of each joint carries, shape (6, 3)."""
     frames = posture.frames()
     turn = np.array([frame[0] for frame in frames]).reshape(7, 3, 3)

@@ -46,7 +46,7 @@ class FtSpecification:
 
 
 @dataclass(frozen=True)
-class Payload:
+class ToolPayload:
     """A mass on the flange.
 
     Attributes

@@ -17,7 +17,7 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
     FtSpecification,
-    Payload,
+    ToolPayload,
 )
 from tactile_resonance.simulation.robot.joints import Joints
 from tactile_resonance.simulation.robot.kinematics import Posture
@@ -70,7 +70,7 @@ class MachineConfig:
         Joint angles at power-up [rad].
     tip_in_flange : (6,) array
         True pose of the tip in the flange; the program does not know it unless it sets its TCP so.
-    tool : Payload
+    tool : ToolPayload
         True mass on the flange; the controller compensates the payload that the program sets.
     limits : MotionLimits
     tracking : TrackingParameters
@@ -85,7 +85,7 @@ class MachineConfig:
         default_factory=lambda: np.array([0.0, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0])
     )
     tip_in_flange: FloatArray = field(default_factory=lambda: np.zeros(6))
-    tool: Payload = field(default_factory=Payload)
+    tool: ToolPayload = field(default_factory=ToolPayload)
     limits: MotionLimits = field(default_factory=MotionLimits)
     tracking: TrackingParameters = field(default_factory=TrackingParameters)
     ft: FtSpecification = field(default_factory=FtSpecification)
@@ -118,7 +118,7 @@ class Machine:
     joints : Joints
     sensor : FtSensor
     force_mode : ForceMode
-    payload : Payload
+    payload : ToolPayload
         As the program set it.
     gravity_m_s2 : Vector
         Acceleration of free fall in the base.
@@ -265,7 +265,7 @@ class Machine:
         weight = self.payload.weight(turn, self.gravity_m_s2)
         measured = None
         if self.external is not None:
-            own = Payload(self.external.mass_kg, self.external.cog_m)
+            own = ToolPayload(self.external.mass_kg, self.external.cog_m)
             weight = difference(weight, own.weight(turn, self.gravity_m_s2))
             measured = moved_wrench(self.external_wrench, (NO_TURN, self.external.offset_m))
         self.sensor.step(wrench, weight, measured)

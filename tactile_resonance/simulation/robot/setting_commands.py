@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from tactile_resonance.simulation.robot import motion
 from tactile_resonance.simulation.robot.compliance import ForceTask
-from tactile_resonance.simulation.robot.ft_sensor import Payload
+from tactile_resonance.simulation.robot.ft_sensor import ToolPayload
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.machine import ExternalSensor, Machine
 from tactile_resonance.simulation.robot.poses import (
@@ -72,7 +72,7 @@ class SettingCommands:
             raise ScriptError(f"set_payload: mass {mass:g}; accepted is 0 kg or above")
         if not any(cog):  # the client's program keeps the centre of gravity then
             cog = self._machine.payload.cog_m
-        self._machine.payload = Payload(mass, cog, inertia)
+        self._machine.payload = ToolPayload(mass, cog, inertia)
 
     def set_tcp(self) -> None:
         """Set the TCP in the flange."""

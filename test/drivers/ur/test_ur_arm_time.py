@@ -28,8 +28,8 @@ from arms import (
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Command, Exchange
-from tactile_resonance.drivers.ur_motion import Motion
+from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Exchange, UrCommand
+from tactile_resonance.drivers.ur_motion import UrMotion
 from tactile_resonance.simulation.tracking import TrackingParameters
 
 
@@ -87,11 +87,11 @@ def test_the_bench_is_told_how_many_packets_are_on_their_way():
         page.truncate(SIZE)
         client = Client(theirs, Exchange(page.fileno()))
         client._clock = SimpleNamespace(hold=lambda *said: held.append(said))
-        client._session = SimpleNamespace(motion=Motion(control), config=UrArmConfig("127.0.0.1"))
+        client._session = SimpleNamespace(motion=UrMotion(control), config=UrArmConfig("127.0.0.1"))
         ends_ns = [CYCLE_NS * n for n in range(1, 4)]
-        client._obey(Command(SPEED, 1, ends_ns[0], Demand.FAST, tuple(UP), 0.5))
-        client._obey(Command(NOTHING, 0, ends_ns[1], Demand.NONE))
-        client._obey(Command(SPEED, 2, ends_ns[2], Demand.FAST, tuple(DOWN), 0.5))
+        client._obey(UrCommand(SPEED, 1, ends_ns[0], Demand.FAST, tuple(UP), 0.5))
+        client._obey(UrCommand(NOTHING, 0, ends_ns[1], Demand.NONE))
+        client._obey(UrCommand(SPEED, 2, ends_ns[2], Demand.FAST, tuple(DOWN), 0.5))
     assert held == [
         (ends_ns[0], Demand.FAST, 1), (ends_ns[1], Demand.NONE, 1), (ends_ns[2], Demand.FAST, 2)
     ]  # fmt: skip

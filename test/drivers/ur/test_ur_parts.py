@@ -17,11 +17,11 @@ from tactile_resonance.drivers.ur_exchange import (
     SIZE,
     SPEED,
     STOP,
-    Command,
     Exchange,
     Seen,
+    UrCommand,
 )
-from tactile_resonance.drivers.ur_motion import REST, Motion
+from tactile_resonance.drivers.ur_motion import REST, UrMotion
 from tactile_resonance.drivers.ur_safety import motion_fault
 from tactile_resonance.drivers.ur_states import StateReader
 from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
@@ -41,14 +41,14 @@ def exchanges():
 @pytest.mark.parametrize(
     "command",
     [
-        Command(SPEED, 7, 1 << 61, 2, (0.1, -0.2, 0.3, -1e-300, 5.0, 6.0), 0.5),
-        Command(STOP, 8, acceleration=2.0),
-        Command(NOTHING, until_ns=1_000_000_000, demand=1),
+        UrCommand(SPEED, 7, 1 << 61, 2, (0.1, -0.2, 0.3, -1e-300, 5.0, 6.0), 0.5),
+        UrCommand(STOP, 8, acceleration=2.0),
+        UrCommand(NOTHING, until_ns=1_000_000_000, demand=1),
     ],
 )
 def test_commands_arrive_as_they_were_said(command):
     data = command.pack()
-    assert Command.unpack(data) == command
+    assert UrCommand.unpack(data) == command
     assert (
         data[:1] == command.kind
     )  # by which the client passes over velocities that were overtaken
@@ -225,7 +225,7 @@ class Control:
 
 def test_the_watchdog_is_fed_with_the_newest_velocity_and_never_with_an_older_one():
     control = Control()
-    motion = Motion(control)
+    motion = UrMotion(control)
     twist = (0.0, 0.0, -0.005, 0.0, 0.0, 0.0)
     assert motion.feed()
     assert not motion.commanded

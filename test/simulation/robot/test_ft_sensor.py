@@ -14,7 +14,7 @@ from tactile_resonance.simulation.robot.ft_sensor import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
     FtSpecification,
-    Payload,
+    ToolPayload,
 )
 from tactile_resonance.simulation.robot.machine import MachineConfig
 from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, moved_wrench
@@ -22,7 +22,7 @@ from tactile_resonance.simulation.robot.poses import ORIGIN, ZERO, moved_wrench
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import floats, matrix_from_pose, transform
 
-TOOL = Payload(0.5, (0.01, -0.02, 0.06))
+TOOL = ToolPayload(0.5, (0.01, -0.02, 0.06))
 
 
 def assert_deviation(samples: np.ndarray, sigma: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from tactile_resonance.simulation.robot.dynamics import (
     gravity_torque,
     momentum,
 )
-from tactile_resonance.simulation.robot.ft_sensor import Payload
+from tactile_resonance.simulation.robot.ft_sensor import ToolPayload
 from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import pose_from_transform, transform_from_pose
 
@@ -211,7 +211,7 @@ def test_poses_and_transforms_are_inverse_to_each_other(postures):
 
 
 def test_gravity_torque_is_the_gradient_of_potential_energy(postures):
-    payload = Payload(1.3, (0.01, -0.02, 0.06))
+    payload = ToolPayload(1.3, (0.01, -0.02, 0.06))
     gravity = np.array([0.0, 1.0, -9.7])
 
     def energy(q):
@@ -236,4 +236,4 @@ def test_momentum_of_an_arm_that_turns_about_its_base():
     for mass, centre, frame in zip(LINK_MASS_KG, LINK_CENTRE_M, posture.frames()[1:], strict=True):
         first_moment += mass * (matrix(frame) @ [*centre, 1.0])[:2]
     expected = 0.5 * np.linalg.norm(first_moment)
-    assert momentum(posture, (0.5, 0, 0, 0, 0, 0), Payload()) == pytest.approx(expected)
+    assert momentum(posture, (0.5, 0, 0, 0, 0, 0), ToolPayload()) == pytest.approx(expected)

@@ -12,7 +12,7 @@ from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.plant import Plant, RigidTip
 from tactile_resonance.simulation.robot.machine import MachineConfig
 from tactile_resonance.simulation.robot.safety import SafetyMode
-from tactile_resonance.simulation.surfaces import Plane
+from tactile_resonance.simulation.surfaces import FlatSurface
 from tactile_resonance.simulation.tissue import Tissue
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -34,7 +34,7 @@ def hertz(depth_m: float) -> float:
 def plant() -> Plant:
     rubber = Tissue("rubber", MODULUS_PA, (), ())
     return Plant(
-        Plane.tilted(TOUCH_Z - RADIUS_M),
+        FlatSurface.tilted(TOUCH_Z - RADIUS_M),
         lambda _: rubber,
         lambda tissue: RigidTip(Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=POISSON)),
         tip_radius_m=RADIUS_M,

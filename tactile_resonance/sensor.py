@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated sensor, read from ``config/sensors/bimorph.yaml``.
+"""The sensor, read from ``config/sensors/bimorph.yaml``: its geometry, and what it is simulated by.
 
 Sources and honesty marks of the default values stand beside them in that file.
 """
@@ -131,6 +131,11 @@ class SensorParameters:
     electric: ElectricParameters
     nonlinear: NonlinearParameters
     acquisition: AcquisitionParameters
+
+
+def sensor_named(name: str) -> SensorParameters:
+    """Parameters of a sensor of ``config/sensors``."""
+    return read_sensor(share_path(f"config/sensors/{name}.yaml"))
 
 
 def read_sensor(path: Path | None = None) -> SensorParameters:

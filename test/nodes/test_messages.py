@@ -15,7 +15,7 @@ from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
 from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
 from tactile_resonance.identification.result import Poles, PolesStatus  # noqa: E402
 from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
-from tactile_resonance.nodes import conversions  # noqa: E402
+from tactile_resonance.nodes import messages  # noqa: E402
 from tactile_resonance.record import (  # noqa: E402
     BetweenSamples,
     Channel,
@@ -24,6 +24,7 @@ from tactile_resonance.record import (  # noqa: E402
     Origin,
     Record,
 )
+from tactile_resonance.recording import messages as stored  # noqa: E402
 
 RNG = np.random.default_rng(0)
 CONTACT = Contact(
@@ -71,11 +72,11 @@ def test_excitation():
         excitation_id=9,
         label="x",
     )
-    message = conversions.excitation_to_message(excitation, 1_500_000_000, "tip")
+    message = messages.excitation_to_message(excitation, 1_500_000_000, "tip")
     assert message.header.frame_id == "tip"
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1, 500_000_000)
     assert message.level_v == excitation.level_v
-    assert_equal(conversions.excitation_from_message(through_the_wire(message)), excitation)
+    assert_equal(stored.excitation_from_message(through_the_wire(message)), excitation)
 
 
 @pytest.mark.parametrize(
@@ -100,18 +101,18 @@ def test_record(channel):
         anti_alias_filter="none",
         origin=ORIGIN,
     )
-    message = through_the_wire(conversions.record_to_message(record))
+    message = through_the_wire(messages.record_to_message(record))
     assert message.simulated
-    assert_equal(conversions.record_from_message(message), record)
+    assert_equal(stored.record_from_message(message), record)
 
 
 def test_record_with_two_or_no_representations_is_refused():
-    message = conversions.record_to_message(
+    message = messages.record_to_message(
         Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4)
     )
     message.sensor_v = []
     with pytest.raises(ValueError, match="sensor: 0 counts and 0 voltages"):
-        conversions.record_from_message(message)
+        stored.record_from_message(message)
 
 
 def complex_normal(*shape):
@@ -139,9 +140,9 @@ def test_frf(complete):
         status=FrfStatus.SUSPECT,
         message="why",
     )
-    message = through_the_wire(conversions.frf_to_message(frf, ORIGIN, 1.5, True))
+    message = through_the_wire(messages.frf_to_message(frf, ORIGIN, 1.5, True))
     assert (message.level_v, message.saturated) == (1.5, True)
-    back, origin = conversions.frf_from_message(message)
+    back, origin = messages.frf_from_message(message)
     assert_equal(back, frf)
     assert_equal(origin, ORIGIN)
 
@@ -166,39 +167,39 @@ def test_poles(modes):
         status=PolesStatus.MODEL_ERROR,
         message="why",
     )
-    message = through_the_wire(conversions.poles_to_message(poles, ORIGIN))
-    back, origin = conversions.poles_from_message(message)
+    message = through_the_wire(messages.poles_to_message(poles, ORIGIN))
+    back, origin = stored.poles_from_message(message)
     assert_equal(back, poles)
     assert_equal(origin, ORIGIN)
 
 
 def test_unknown_position_is_an_empty_frame():
-    message = conversions.poles_to_message(Poles(), Origin())
+    message = messages.poles_to_message(Poles(), Origin())
     assert message.tip_pose.header.frame_id == ""
     assert np.isnan(message.contact_force_n)
     assert np.isnan(message.contact_force_rms_n)
-    assert conversions.poles_from_message(message)[1].contact.position_m is None
+    assert stored.poles_from_message(message)[1].contact.position_m is None
 
 
 def test_every_status_has_its_constant():
     for table in (
-        conversions.GRIDS,
-        conversions.INPUT_KINDS,
-        conversions.BETWEEN_SAMPLES,
-        conversions.FRF_STATUS,
-        conversions.POLES_STATUS,
+        stored.GRIDS,
+        stored.INPUT_KINDS,
+        stored.BETWEEN_SAMPLES,
+        messages.FRF_STATUS,
+        stored.POLES_STATUS,
     ):
         assert len(set(table.values())) == len(table) == len(type(next(iter(table))))
-    message = conversions.poles_to_message(Poles(), Origin())
+    message = messages.poles_to_message(Poles(), Origin())
     message.status = 77
     with pytest.raises(ValueError, match="status: 77, accepted are"):
-        conversions.poles_from_message(message)
+        stored.poles_from_message(message)
 
 
 def test_reading_makes_no_copy():
     message = through_the_wire(
-        conversions.record_to_message(Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4))
+        messages.record_to_message(Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4))
     )
-    record = conversions.record_from_message(message)
+    record = stored.record_from_message(message)
     message.sensor_v[2] = 5.0
     assert record.sensor.samples[2] == 5.0

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion of an arm that is commanded by twists: its velocity, its acceleration, and whether it follows."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    Six,
+    Turn,
+    Vector,
+    difference,
+    scaled,
+    transposed,
+    turn_product,
+    vector_from_turn,
+)
+from tactile_resonance.drivers.twist_config import TwistConfig
+
+REST: Six = (*ZERO, *ZERO)
+VELOCITY_OVER_NS = 7_000_000
+"""A velocity is the difference of two poses at least so far apart [ns]."""
+FOLLOWED_NS = 1_000_000_000
+"""Over so long the way of the tip is compared with what was commanded [ns]."""
+TURN_LEVER_M = 0.1
+"""Turns the limit of acceleration [m/s2] into one of rotation [rad/s2]."""
+
+
+class ToolPose(NamedTuple):
+    """One pose of the tool, and the tip that it carries."""
+
+    time_ns: int
+    tool_m: Vector
+    tip_m: Vector
+    turn: Turn  # of the tip
+
+
+class _Way(NamedTuple):
+    """Where the tip has been and should have been, at one cycle."""
+
+    time_ns: int
+    tip_m: Vector
+    commanded_m: Vector
+    path_m: float  # length of the commanded way
+    slack_m: float  # what of it was commanded within `follow_s`
+
+
+class Following:
+    """Whether the tip is where it was commanded to be within `follow_s`, give or take `follow_m`."""
+
+    def __init__(self, config: TwistConfig) -> None:
+        self._config = config
+        self.forget()
+
+    def forget(self) -> None:
+        """Compare only what comes from now on."""
+        self._ways: deque[_Way] = deque()
+        self._lag_from = 0  # the oldest of `follow_s`
+        self._commanded_m_s = ZERO  # since the last cycle
+
+    def contradiction(self, now_ns: int, tip_m: Vector, commanded_m_s: Vector) -> str:
+        """What the place of the tip contradicts, as a sentence; empty where it follows.
+
+        Parameters
+        ----------
+        now_ns : int
+        tip_m : (3,) tuple
+        commanded_m_s : (3,) tuple
+            Velocity that holds from now on.
+        """
+        velocity, self._commanded_m_s = self._commanded_m_s, commanded_m_s
+        if not self._ways:
+            self._ways.append(_Way(now_ns, tip_m, ZERO, 0.0, 0.0))
+            return ""
+        last = self._ways[-1]
+        step_s = (now_ns - last.time_ns) * 1e-9
+        if step_s <= 0:
+            return ""
+        x, y, z = scaled(step_s, velocity)
+        a, b, c = last.commanded_m
+        path_m = last.path_m + math.hypot(x, y, z)
+        oldest_ns = now_ns - 1e9 * self._config.follow_s
+        ways = self._ways
+        while ways[self._lag_from].time_ns < oldest_ns and self._lag_from < len(ways) - 1:
+            self._lag_from += 1
+        slack_m = path_m - ways[self._lag_from].path_m
+        newest = _Way(now_ns, tip_m, (a + x, b + y, c + z), path_m, slack_m)
+        ways.append(newest)
+        while ways[1].time_ns < now_ns - FOLLOWED_NS:
+            ways.popleft()
+            self._lag_from -= 1
+        first = ways[0]
+        gone_m = difference(tip_m, first.tip_m)
+        off_m = math.dist(gone_m, difference(newest.commanded_m, first.commanded_m))
+        allowed_m = self._config.follow_m + slack_m + first.slack_m
+        if off_m <= allowed_m:
+            return ""
+        return (
+            f"the tip is {1e3 * off_m:.2f} mm from where it was commanded to be, accepted are "
+            f"{1e3 * allowed_m:.2f} mm: is the controller active, and the only one?"
+        )
+
+
+def velocity_of(tools: Sequence[ToolPose]) -> Six:
+    """Velocity and angular velocity of the tip, from the newest pose and one far enough before it."""
+    newest = tools[-1]
+    before = newest
+    for before in reversed(tools):
+        if newest.time_ns - before.time_ns >= VELOCITY_OVER_NS:
+            break
+    seconds = (newest.time_ns - before.time_ns) * 1e-9
+    if seconds <= 0:
+        return REST
+    x, y, z = scaled(1 / seconds, difference(newest.tip_m, before.tip_m))
+    turned = vector_from_turn(turn_product(newest.turn, transposed(before.turn)))
+    return x, y, z, *scaled(1 / seconds, turned)
+
+
+def towards(now: Six, wanted: Six, step: float) -> Six:
+    """Twist nearer to what is wanted, by a change of velocity of `step` [m/s] at most."""
+    change = tuple(b - a for a, b in zip(now, wanted, strict=True))
+    largest = max(math.hypot(*change[:3]), TURN_LEVER_M * math.hypot(*change[3:]))
+    if largest <= step:
+        return wanted
+    share = step / largest
+    a, b, c, d, e, f = (a + share * d for a, d in zip(now, change, strict=True))
+    return a, b, c, d, e, f

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between objects of the core and messages: the only place that converts them in nodes.
+
+Beside it `recording.messages`, which needs no ROS, has what is recorded, and `nodes.scan_messages` what only
+scan_node takes and tells: the others do not load scans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+
+from tactile_resonance import msg
+from tactile_resonance.action import MakeContact
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import ContactGoal
+from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
+from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.multisine import Excitation
+from tactile_resonance.record import Contact, Origin, Record
+from tactile_resonance.recording.messages import (
+    array_of,
+    complex_of,
+    fill,
+    fill_complex,
+    key_of,
+    optional,
+    origin_from_message,
+    write_excitation,
+    write_origin,
+    write_poles,
+    write_pose,
+    write_record,
+)
+
+if TYPE_CHECKING:  # nodes without contact control do not load it
+    from tactile_resonance.contact.estimator import ContactEstimate
+    from tactile_resonance.contact.loop import Cycle
+    from tactile_resonance.contact.result import ContactResult
+    from tactile_resonance.contact.samples import WrenchSample
+
+FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
+
+COVARIANCE_ARRAYS = ("sensor_variance", "actuator_variance", "covariance_real", "covariance_imag")
+FRF_ARRAYS = (
+    *("real", "imag", "variance_noise", "variance_total"),
+    *("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"),
+    *COVARIANCE_ARRAYS,
+)
+
+RosTime = Callable[[int], int]
+"""From a time of the loop's clock [ns] to ROS time [ns]."""
+
+_HOLDS = {
+    MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
+    MakeContact.Goal.HOLD_INDENTATION: HoldMode.INDENTATION,
+}
+
+
+def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -> msg.Excitation:
+    """Message of an excitation designed at `time_ns`."""
+    message = msg.Excitation()
+    write_excitation(message, excitation, time_ns, frame_id)
+    return message
+
+
+def record_to_message(record: Record) -> msg.Record:
+    """Message of a record."""
+    message = msg.Record()
+    write_record(message, record)
+    return message
+
+
+def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
+    """Message of poles."""
+    message = msg.Poles()
+    write_poles(message, poles, origin)
+    return message
+
+
+def time_message(time_ns: int) -> Time:
+    """UNIX time as a stamp."""
+    return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+
+
+def pose_to_message(contact: Contact) -> PoseStamped:
+    """Tip pose; an empty frame where the position is unknown."""
+    message = PoseStamped()
+    write_pose(message, contact)
+    return message
+
+
+def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
+    """Message of an FRF with (F,) arrays."""
+    message = msg.FRF(
+        noise_dof=frf.noise_dof,
+        total_dof=frf.total_dof,
+        periods=frf.periods,
+        realisations=frf.realisations,
+        method=frf.method,
+        level_v=level_v,
+        saturated=saturated,
+        status=FRF_STATUS[frf.status],
+        message=frf.message,
+    )
+    write_origin(message, origin)
+    fill(message.frequency_hz, frf.frequency_hz)
+    fill_complex(message, "", frf.g)
+    for name in ("variance_noise", "variance_total"):
+        variance = getattr(frf, name)
+        if variance is not None:
+            fill(getattr(message, name), variance)
+    if frf.spectra is not None:
+        fill_complex(message, "sensor_", frf.spectra[0])
+        fill_complex(message, "actuator_", frf.spectra[1])
+    if frf.spectra_covariance is not None:
+        fill(message.sensor_variance, frf.spectra_covariance[0, 0].real)
+        fill(message.actuator_variance, frf.spectra_covariance[1, 1].real)
+        fill_complex(message, "covariance_", frf.spectra_covariance[0, 1])
+    if frf.bins is not None:
+        _write_bins(message, frf.bins)
+    return message
+
+
+def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
+    """FRF of a message, and what it belongs to."""
+    lines = len(message.frequency_hz)
+    for name in FRF_ARRAYS:
+        values = getattr(message, name)
+        if len(values) != lines and (len(values) or name in ("real", "imag")):
+            raise ValueError(f"{name}: {len(values)} values for {lines} lines, expected as many")
+    groups = (("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"), COVARIANCE_ARRAYS)
+    for names in groups:
+        if len({len(getattr(message, name)) for name in names}) > 1:
+            raise ValueError(f"{', '.join(names)}: some empty, expected all or none")
+    spectra = covariance = None
+    if len(message.sensor_real):
+        spectra = np.stack([complex_of(message, "sensor_"), complex_of(message, "actuator_")])
+    if len(message.sensor_variance):
+        cross = complex_of(message, "covariance_")
+        covariance = np.array(
+            [
+                [array_of(message.sensor_variance), cross],
+                [cross.conj(), array_of(message.actuator_variance)],
+            ]
+        )
+    frf = FRF(
+        frequency_hz=array_of(message.frequency_hz),
+        g=complex_of(message, ""),
+        variance_noise=optional(message.variance_noise),
+        variance_total=optional(message.variance_total),
+        noise_dof=message.noise_dof,
+        total_dof=message.total_dof,
+        spectra=spectra,
+        spectra_covariance=covariance,
+        bins=_bins(message),
+        periods=message.periods,
+        realisations=message.realisations,
+        method=message.method,
+        status=key_of(FRF_STATUS, message.status, "status"),
+        message=message.message,
+    )
+    return frf, origin_from_message(message)
+
+
+def _write_bins(message: msg.FRF, bins: BandBins) -> None:
+    fill_complex(message, "bins_actuator_", bins.u)
+    fill_complex(message, "bins_sensor_", bins.y)
+    fill(message.bins_harmonics, bins.harmonics)
+    message.bins_first = bins.first_bin
+    message.bins_sample_rate_hz = bins.sample_rate_hz
+    message.bins_samples_per_period = bins.samples_per_period
+    message.bins_periods = bins.periods
+
+
+def _bins(message: msg.FRF) -> BandBins | None:
+    """Those of the realisations one after the other."""
+    names = [f"bins_{c}_{part}" for c in ("actuator", "sensor") for part in ("real", "imag")]
+    sizes = {len(getattr(message, name)) for name in names}
+    if sizes == {0}:
+        return None
+    if len(sizes) > 1:
+        raise ValueError(f"{', '.join(names)}: sizes {sorted(sizes)}, expected as many of each")
+    records = max(1, message.realisations)
+    if max(sizes) % records:
+        raise ValueError(
+            f"{names[0]}: size {max(sizes)}, expected as many of each of {records} realisations"
+        )
+    return BandBins(
+        message.bins_first,
+        complex_of(message, "bins_actuator_").reshape(records, -1),
+        complex_of(message, "bins_sensor_").reshape(records, -1),
+        array_of(message.bins_harmonics).astype(np.int64),
+        message.bins_sample_rate_hz,
+        message.bins_samples_per_period,
+        message.bins_periods,
+    )
+
+
+def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: float) -> ContactGoal:
+    """What a request asks for.
+
+    Raises
+    ------
+    ValueError
+        If its frame is not that of the base, the way to hold is unknown, or orientation or normal is invalid.
+    """
+    frame = request.pose.header.frame_id
+    if frame != base_frame:
+        raise ValueError(f"pose: in frame {frame!r}, accepted is {base_frame!r}")
+    if request.hold not in _HOLDS:
+        raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
+    point, turn = request.pose.pose.position, request.pose.pose.orientation
+    quaternion = [turn.x, turn.y, turn.z, turn.w]
+    if not 0.99 < math.hypot(*quaternion) < 1.01:
+        raise ValueError(f"pose: orientation {quaternion}, expected a unit quaternion")
+    axes = np.reshape(turn_from_quaternion(*quaternion), (3, 3))
+    given = np.array([request.normal.x, request.normal.y, request.normal.z])
+    normal = given if given.any() else axes[:, 2]
+    touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], ball_radius_m)
+    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
+
+
+def contact_result(result: ContactResult) -> MakeContact.Result:
+    """What became of a contact; NaN for what is not known."""
+    message = MakeContact.Result(
+        reached=result.reached, cause=result.cause.value, message=result.message
+    )
+    for name in (
+        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m"),
+        *("surface_m", "surface_std_m"),
+        *("contact_s", "total_s", "peak_force_n"),
+    ):
+        value = getattr(result, name)
+        setattr(message, name, math.nan if value is None else float(value))
+    return message
+
+
+def contact_feedback(state: str, estimate: ContactEstimate | None) -> MakeContact.Feedback:
+    """How far a contact is."""
+    force_n, depth_m, _ = _known(estimate)
+    return MakeContact.Feedback(state=state, force_n=force_n, depth_m=depth_m)
+
+
+def wrench_message(
+    wrenches: Sequence[WrenchSample], cycle: Cycle, ros_ns: RosTime, frame_id: str
+) -> WrenchStamped:
+    """Mean of these, less the tare, at the middle of their times."""
+    wrench = WrenchStamped()
+    wrench.header.stamp = time_message(ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2))
+    wrench.header.frame_id = frame_id
+    count, parts = len(wrenches), wrench.wrench
+    x, y, z = (sum(values) / count for values in zip(*(w.force_n for w in wrenches), strict=True))
+    bias_x, bias_y, bias_z = cycle.bias_n
+    parts.force.x, parts.force.y, parts.force.z = x - bias_x, y - bias_y, z - bias_z
+    parts.torque.x, parts.torque.y, parts.torque.z = (
+        sum(values) / count for values in zip(*(w.torque_nm for w in wrenches), strict=True)
+    )
+    return wrench
+
+
+def tip_pose(time_ns: int, frame_id: str, position_m: Vector, rotation_rad: Vector) -> PoseStamped:
+    """Where the tip is: its place and rotation vector in a frame."""
+    turn = quaternion_from_vector(rotation_rad)
+    return pose_to_message(
+        Contact(position_m=position_m, orientation_xyzw=turn, frame_id=frame_id, time_ns=time_ns)
+    )
+
+
+def contact_state(
+    cycle: Cycle,
+    ros_ns: RosTime,
+    estimate: ContactEstimate | None,
+    result: ContactResult | None,
+    frame_id: str,
+) -> msg.ContactState:
+    """What the controller does and knows, without the loop's counts."""
+    state = msg.ContactState(state=cycle.state.value)
+    state.header.stamp = time_message(ros_ns(cycle.time_ns))
+    state.header.frame_id = frame_id
+    state.force_n, state.depth_m, state.stiffness_n_per_m = _known(estimate)
+    if result is not None:
+        state.cause, state.message = result.cause.value, result.message
+    moved_n = None if result is None else result.zero_change_n
+    state.zero_moved_n = math.nan if moved_n is None else moved_n
+    return state
+
+
+def _known(estimate: ContactEstimate | None) -> tuple[float, float, float]:
+    """Force, depth and stiffness; NaN where there is no contact."""
+    if estimate is None:
+        return math.nan, math.nan, math.nan
+    return estimate.force_n, estimate.depth_m, estimate.stiffness_n_per_m

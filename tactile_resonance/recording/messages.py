@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Excitations, records and poles from and to messages, without ROS: each field is listed once, here.
+
+A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays may be those of rclpy
+(`array.array`) or of numpy. Those of rclpy are read as views of the message's memory (``numpy.frombuffer``)
+and filled in place (``array.frombytes``), without loops over samples: assigning a numpy array to a field of a
+message checks it element by element, hundreds of times slower.
+"""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from enum import Enum
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.contact.force_spread import ForceSpread
+from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.multisine import Excitation, Grid
+from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
+from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
+
+# The constants of the messages.
+GRIDS = {Grid.CUSTOM: 0, Grid.FULL: 1, Grid.ODD: 2, Grid.ODD_RANDOM: 3}
+INPUT_KINDS = {InputKind.MEASURED: 0, InputKind.COMMANDED: 1}
+BETWEEN_SAMPLES = {BetweenSamples.BAND_LIMITED: 0, BetweenSamples.ZERO_ORDER_HOLD: 1}
+POLES_STATUS = {
+    PolesStatus.OK: 0,
+    PolesStatus.MODEL_ERROR: 1,
+    PolesStatus.NOT_CONVERGED: 2,
+    PolesStatus.TOO_FEW_LINES: 3,
+    PolesStatus.ILL_CONDITIONED: 4,
+    PolesStatus.UNSTABLE_POLE: 5,
+    PolesStatus.NO_COVARIANCE: 6,
+    PolesStatus.NO_RESONANCE: 7,
+    PolesStatus.FAILED: 8,
+    PolesStatus.TRUTH: 100,
+}
+# Fields of equal name in message and object.
+ORIGIN = ("measurement_id", "excitation_id", "final", "label", "simulated")
+SPREAD = ("rms_n", "min_n", "max_n")  # of a contact's force
+EXCITATION = (
+    *("measurement_id", "excitation_id", "realisation", "realisations", "periods", "seed"),
+    *("sample_rate_hz", "samples_per_period", "random_phases", "label"),
+)
+EXCITATION_ARRAYS = ("harmonics", "amplitude_v", "phase_rad")
+RECORD = (
+    *("realisation", "block_index", "sample_rate_hz", "samples_per_period"),
+    *("channel_delay_s", "anti_alias_filter"),
+)
+POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
+POLES_ARRAYS = ("f0_hz", "damping_ratio")
+POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
+POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
+
+E = TypeVar("E", bound=Enum)
+
+
+def excitation_from_message(message: Any) -> Excitation:
+    """Excitation of a message.
+
+    Raises
+    ------
+    ValueError
+        If its fields contradict each other.
+    """
+    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
+    grid = key_of(GRIDS, message.grid, "grid")
+    return Excitation(**_values(message, EXCITATION), **arrays, grid=grid)
+
+
+def write_excitation(message: Any, excitation: Excitation, time_ns: int, frame_id: str) -> None:
+    """Fill the message of an excitation designed at `time_ns`."""
+    write_header(message.header, time_ns, frame_id)
+    _write_values(message, EXCITATION, excitation)
+    for name in EXCITATION_ARRAYS:
+        fill(getattr(message, name), getattr(excitation, name))
+    message.grid, message.level_v = GRIDS[excitation.grid], excitation.level_v
+
+
+def record_from_message(message: Any) -> Record:
+    """Record of a message; its samples are views of the message's memory."""
+    if not MIN_RATE_HZ <= message.sample_rate_hz <= MAX_RATE_HZ:
+        raise ValueError(
+            f"sample_rate_hz: {message.sample_rate_hz:g}, expected {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz"
+        )
+    return Record(
+        actuator=_channel(message, "actuator"),
+        sensor=_channel(message, "sensor"),
+        **_values(message, RECORD),
+        input_kind=key_of(INPUT_KINDS, message.input_kind, "input_kind"),
+        between_samples=key_of(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
+        origin=origin_from_message(message),
+    )
+
+
+def write_record(message: Any, record: Record) -> None:
+    """Fill the message of a record."""
+    _write_values(message, RECORD, record)
+    message.input_kind = INPUT_KINDS[record.input_kind]
+    message.between_samples = BETWEEN_SAMPLES[record.between_samples]
+    for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
+        setattr(message, f"{name}_saturated", channel.saturated)
+        if channel.is_counts:
+            fill(getattr(message, f"{name}_counts"), channel.samples)
+            setattr(message, f"{name}_scale_v", channel.scale_v)
+            setattr(message, f"{name}_offset_v", channel.offset_v)
+        else:
+            fill(getattr(message, f"{name}_v"), channel.samples)
+    write_origin(message, record.origin)
+    message.contact_coverage = float(record.origin.contact.coverage)
+    message.contact_reason = record.origin.contact.reason
+
+
+def _channel(message: Any, name: str) -> Channel:
+    counts = array_of(getattr(message, f"{name}_counts"))
+    volts = array_of(getattr(message, f"{name}_v"))
+    if (counts.size > 0) == (volts.size > 0):
+        raise ValueError(
+            f"{name}: {counts.size} counts and {volts.size} voltages, expected one of the two"
+        )
+    saturated = getattr(message, f"{name}_saturated")
+    if not counts.size:
+        return Channel(volts, saturated=saturated)
+    scale_v, offset_v = getattr(message, f"{name}_scale_v"), getattr(message, f"{name}_offset_v")
+    return Channel(counts, scale_v, offset_v, saturated)
+
+
+def poles_from_message(message: Any) -> tuple[Poles, Origin]:
+    """Poles of a message, and what they belong to; the fitted model itself does not travel."""
+    poles_rad_s = complex_of(message, "", "_rad_s")
+    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in POLES_ARRAYS}
+    for name in (*POLES_DRIFTS, *POLES_COVARIANCES):
+        arrays[name] = optional(getattr(message, name))
+    for name in POLES_COVARIANCES:
+        if (covariance := arrays[name]) is not None:
+            arrays[name] = covariance.reshape(poles_rad_s.size, 2, 2)
+    structure = ModelStructure()
+    if message.order:
+        structure = ModelStructure(message.order, message.numerator_order)
+    poles = Poles(
+        poles_rad_s=poles_rad_s,
+        residues=complex_of(message, "residue_"),
+        **arrays,
+        **_values(message, POLES),
+        instant_s=None if math.isnan(message.instant_s) else message.instant_s,
+        structure=structure,
+        band_hz=(message.band_low_hz, message.band_high_hz),
+        status=key_of(POLES_STATUS, message.status, "status"),
+    )
+    return poles, origin_from_message(message)
+
+
+def write_poles(message: Any, poles: Poles, origin: Origin) -> None:
+    """Fill the message of poles."""
+    write_origin(message, origin)
+    _write_values(message, POLES, poles)
+    message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
+    message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
+    message.instant_s = math.nan if poles.instant_s is None else poles.instant_s
+    message.status = POLES_STATUS[poles.status]
+    fill_complex(message, "", poles.poles_rad_s, "_rad_s")
+    fill_complex(message, "residue_", poles.residues)
+    for name in (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES):
+        if (known := getattr(poles, name)) is not None:
+            fill(getattr(message, name), known)
+
+
+def origin_from_message(message: Any) -> Origin:
+    """What a record, FRF or poles belong to."""
+    contact = contact_from_message(
+        message.tip_pose, message.contact_force_n, message.contact_force_std_n
+    )
+    return Origin(
+        **_values(message, ORIGIN),
+        time_ns=time_from_message(message.header.stamp),
+        frame_id=message.header.frame_id,
+        contact=replace(
+            contact,
+            spread=spread_from_message(message, "contact_force_"),
+            # of records alone
+            coverage=getattr(message, "contact_coverage", math.nan),
+            reason=getattr(message, "contact_reason", ""),
+        ),
+    )
+
+
+def write_origin(message: Any, origin: Origin) -> None:
+    """Write what a record, FRF or poles belong to."""
+    contact = origin.contact
+    write_header(message.header, origin.time_ns, origin.frame_id)
+    _write_values(message, ORIGIN, origin)
+    write_pose(message.tip_pose, contact)
+    message.contact_force_n = float(contact.force_n)
+    message.contact_force_std_n = float(contact.force_std_n)
+    for name in SPREAD:
+        setattr(message, f"contact_force_{name}", float(getattr(contact.spread, name)))
+
+
+def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Contact:
+    """Contact of a tip pose and a force."""
+    if not message.header.frame_id:
+        return Contact(force_n, force_std_n)
+    point, turn = message.pose.position, message.pose.orientation
+    return Contact(
+        *(force_n, force_std_n, (point.x, point.y, point.z), (turn.x, turn.y, turn.z, turn.w)),
+        *(message.header.frame_id, time_from_message(message.header.stamp)),
+    )
+
+
+def write_pose(message: Any, contact: Contact) -> None:
+    """Write the pose of a tip; an empty frame where its position is unknown."""
+    if contact.position_m is None:
+        return
+    write_header(message.header, contact.time_ns, contact.frame_id)
+    point, turn = message.pose.position, message.pose.orientation
+    point.x, point.y, point.z = contact.position_m
+    turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
+
+
+def spread_from_message(message: Any, prefix: str) -> ForceSpread:
+    """How a force moved, of a message whose fields begin with `prefix`."""
+    return ForceSpread(*(getattr(message, prefix + name) for name in SPREAD))
+
+
+def time_from_message(stamp: Any) -> int:
+    """Stamp as UNIX time [ns]."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def write_header(header: Any, time_ns: int, frame_id: str) -> None:
+    """Write UNIX time [ns] and frame."""
+    header.stamp.sec, header.stamp.nanosec = divmod(time_ns, 10**9)
+    header.frame_id = frame_id
+
+
+def array_of(values: Any) -> npt.NDArray:
+    """Array of a message as numpy sees it, without a copy."""
+    if isinstance(values, array.array):
+        return np.frombuffer(values, dtype=values.typecode)
+    return np.asarray(values)
+
+
+def optional(values: Any) -> npt.NDArray | None:
+    """Array of a message; None where it is empty."""
+    return array_of(values) if len(values) else None
+
+
+def complex_of(message: Any, prefix: str, suffix: str = "") -> npt.NDArray[np.complex128]:
+    """Array whose parts are the fields ``real`` and ``imag`` between a prefix and a suffix."""
+    real = array_of(getattr(message, f"{prefix}real{suffix}"))
+    return real + 1j * array_of(getattr(message, f"{prefix}imag{suffix}"))
+
+
+def fill(target: array.array, values: npt.ArrayLike) -> None:
+    """Fill an array of a message that is empty."""
+    whole = np.ascontiguousarray(values, dtype=target.typecode)
+    target.frombytes(whole.ravel().view(np.uint8).data)
+
+
+def fill_complex(
+    message: Any, prefix: str, values: npt.NDArray[np.complex128], suffix: str = ""
+) -> None:
+    """Fill the arrays of `complex_of`."""
+    fill(getattr(message, f"{prefix}real{suffix}"), values.real)
+    fill(getattr(message, f"{prefix}imag{suffix}"), values.imag)
+
+
+def key_of(table: dict[E, int], value: int, name: str) -> E:
+    """Member of an enumeration whose number is `value`; ValueError that lists the others."""
+    for key, number in table.items():
+        if number == value:
+            return key
+    raise ValueError(f"{name}: {value}, accepted are {sorted(table.values())}")
+
+
+def _values(message: Any, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(message, name) for name in names}
+
+
+def _write_values(message: Any, names: Iterable[str], source: object) -> None:
+    """Write fields of equal name; numbers of numpy as those of Python, which alone rclpy takes."""
+    for name in names:
+        value = getattr(source, name)
+        setattr(message, name, value.item() if isinstance(value, np.generic) else value)

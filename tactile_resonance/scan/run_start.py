@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a goal to a run that is open: what is refused or touched first, and what the run says of itself."""
+
+from __future__ import annotations
+
+import platform
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from tactile_resonance.configuration import PACKAGE_NAME, share_path
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import require
+from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.goal import Frames, ScanGoal, WantedScan, read_goal, resumed_run
+from tactile_resonance.scan.goal_files import GoalFiles
+from tactile_resonance.scan.hands import Check, Hands, Touch
+from tactile_resonance.scan.measurement import design_measurement
+from tactile_resonance.scan.plan import Plan, plan_points
+from tactile_resonance.scan.preparation import prepare
+from tactile_resonance.scan.progress import Phase, Progress
+from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.scene import ScanScene, read_scan_scene
+from tactile_resonance.sensor import sensor_named
+
+_LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
+
+
+@dataclass(frozen=True)
+class NewRun:
+    """A run that a goal asks for: what is wanted, its folder, and the room that needs [bytes]."""
+
+    wanted: WantedScan
+    path: Path
+    needed_bytes: int
+
+
+@dataclass(frozen=True)
+class StartedRun:
+    """A run that is open, with all that a `ScanRunner` needs of it."""
+
+    scene: ScanScene
+    plan: Plan
+    run: RunDirectory
+    seed: int
+
+
+def new_run(goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool) -> NewRun:
+    """What a goal asks for, with nothing moved or written yet.
+
+    Parameters
+    ----------
+    goal : ScanGoal
+        Its files checked.
+    frames : Frames
+    files : GoalFiles
+    forces : bool
+        Whether forces are measured.
+
+    Raises
+    ------
+    ValueError, OSError
+        If it is wrong, or the run cannot begin in its folder.
+    """
+    wanted = read_goal(goal, frames)
+    _require_force(wanted.scene, forces)
+    path = Path(goal.run_directory) if goal.run_directory else files.unused()
+    needed = expected_bytes(len(wanted.scene.positions_m), design_measurement(wanted.scene))
+    RunDirectory.check_new(path, needed)
+    return NewRun(wanted, path, needed)
+
+
+def start_run(
+    goal: ScanGoal,
+    frames: Frames,
+    files: GoalFiles,
+    hands: Hands,
+    *,
+    seed: int,
+    tip_use: Callable[[str], TipUse | None] | None,
+    tell: Callable[[Progress], None],
+    check: Check,
+) -> StartedRun:
+    """Begin the run of a goal, or open the one that it goes on with.
+
+    Parameters
+    ----------
+    goal, frames, files
+        As `new_run`.
+    hands : Hands
+        Touches surface and normals where the scene asks for it; knows the scene's frame from now on.
+    seed : int
+        Of a goal that names none.
+    tip_use : callable or None
+        How a sensor is used, by its name; see `prepare`.
+    tell, check : callable
+        Receives each touch; raises `Interrupted` where the goal is cancelled.
+
+    Raises
+    ------
+    ValueError, OSError
+        If it is refused.
+    """
+    if goal.resume:
+        return _resumed(resumed_run(goal), frames, hands)
+    new = new_run(goal, frames, files, forces=hands.free_air)
+    scene = _placed(new.wanted.scene, frames, hands)
+    radius_m = sensor_named(scene.sensor.name).tip.radius_m
+
+    def find(point: ScanPoint, force_n: float, count: int) -> Touch:
+        tell(Progress(point, Phase.SURFACE, point.index, count))
+        return hands.find(point, force_n, radius_m, check)
+
+    use = None if tip_use is None else lambda: tip_use(scene.sensor.name)
+    made = prepare(scene, new.wanted.plan, radius_m, find, use)
+    seed = goal.seed or seed
+    facts = run_facts(
+        made.plan,
+        seed,
+        {
+            "name": scene.name,
+            "notes": scene.notes.as_json(),
+            "scan_node": {
+                "contact": "robot" if hands.free_air else "none",
+                "table_in_base": frames.table_in_base.vector.tolist(),
+                "base_frame": frames.base,
+            },
+            "frames": {name: pose.vector.tolist() for name, pose in frames.others.items()},
+            **made.facts,
+        },
+    )
+    run = RunDirectory.create(
+        new.path, new.wanted.text, made.plan.points, facts, new.needed_bytes
+    )
+    return StartedRun(scene, made.plan, run, seed)
+
+
+def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
+    run = RunDirectory.open(path)
+    try:
+        facts = run.content.facts
+        # where the table is known better now, that is another place
+        noted, table = facts.get("scan_node", {}), frames.table_in_base.vector.tolist()
+        began = noted.get("table_in_base")
+        accepted = f"{began}, with which the run began, to resume it"
+        require(began in (None, table), "table_in_base", table, accepted)
+        scene = read_scan_scene(run.path / "scene.yaml")
+        _require_force(scene, hands.free_air)
+        scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
+        return StartedRun(scene, plan_points(scene, run.content.points), run, int(facts["seed"]))
+    except BaseException:
+        run.close()
+        raise
+
+
+def _placed(scene: ScanScene, frames: Frames, hands: Hands) -> ScanScene:
+    """Tell the hands where the scene's frame stands, and return it with that frame's name."""
+    frame_id = frames.of_scene(scene.frame_id)
+    hands.frame_in_base = frames.in_base(frame_id, "frame_id")
+    return replace(scene, frame_id=frame_id)
+
+
+def _require_force(scene: ScanScene, forces: bool) -> None:
+    """A gate judges a force that is measured."""
+    accepted = "none where scan_node's parameter contact is none: no force is measured then"
+    require(scene.gate is None or forces, "gate", scene.gate, accepted)
+
+
+def _frames_of(facts: Mapping[str, Any], scene: ScanScene, frames: Frames) -> dict[str, Pose]:
+    """Other frames in the base, as they stood when a run began."""
+    noted = facts.get("frames")
+    if noted is None:  # of an earlier version, where every scene's frame was the table
+        return {scene.frame_id: frames.table_in_base}
+    return {name: Pose.from_vector(vector) for name, vector in noted.items()}
+
+
+def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Facts of a run that begins now, as JSON holds them.
+
+    Parameters
+    ----------
+    plan : Plan
+    seed : int
+        Of the excitations.
+    more : mapping, optional
+        What else belongs to the run: parameters of the nodes, frames, a surface that was found.
+    """
+    design = plan.measurement
+    return {
+        "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "seed": seed,
+        "versions": _versions(),
+        "shortest_s": plan.shortest_s,
+        "longest_s": plan.longest_s,
+        "measurement": {
+            "grid": design.grid.value,
+            "f_min_hz": design.f_min_hz,
+            "f_max_hz": design.f_max_hz,
+            "level_v": design.level_v,
+            "most_periods": design.periods,
+            "realisations": design.realisations,
+        },
+        "skipped": [asdict(skipped) for skipped in plan.skipped],
+        **(more or {}),
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Of this package, Python and the libraries that results depend on; those absent are left out."""
+    try:
+        own = ElementTree.parse(share_path("package.xml")).getroot().findtext("version")
+    except FileNotFoundError:  # neither the source tree nor an installation for ROS
+        own = version(PACKAGE_NAME)
+    found = {PACKAGE_NAME: str(own), "python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
