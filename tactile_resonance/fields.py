@@ -1,23 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checked reading of configuration: one error that names field, value and what is accepted."""
+"""Checked reading of configuration: one error that names field, value and what is accepted.
+
+The one reader of files, and of plain values from elsewhere: the annotations of a frozen dataclass say what a
+file may hold, `read_file` or `read` makes it from the content, and its ``__post_init__`` checks ranges. Kinds
+of fields: float (finite), int, bool, str, enumerations (by value), ``Literal``, dataclasses, tuples, mappings,
+arrays of numbers, each of these or None, and ``Annotated[KIND, read_it]``: ``read_it(value, field)`` reads it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import stat
 import sys
+import types
 from collections.abc import Mapping
+from enum import Enum
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from reprlib import Repr
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
-import yaml
+from tactile_resonance.strict_yaml import parse_yaml
 
 T = TypeVar("T")
+
+MOST_BYTES = 1 << 24
+"""Of a file of configuration: 100 000 positions take a fifth of it."""
+
+LONGEST = 200
+"""Characters of a value in a message."""
+
+_SHOWN = Repr()
+_SHOWN.maxstring = _SHOWN.maxother = _SHOWN.maxlong = LONGEST
+_SHOWN.maxlist = _SHOWN.maxtuple = _SHOWN.maxdict = _SHOWN.maxset = 12
+_PLAIN: dict[Any, str] = {int: "an integer", bool: "true or false", str: "text"}
 
 
 def require(condition: bool, field: str, value: object, accepted: str) -> None:
     """Raise ``ValueError`` naming field, value and what is accepted, unless `condition` holds."""
     if not condition:
-        raise ValueError(f"{field}: got {value!r}; accepted is {accepted}")
+        raise ValueError(f"{field}: got {cut(_SHOWN.repr(value))}; accepted is {accepted}")
+
+
+def cut(text: str) -> str:
+    """Return one line of at most `LONGEST` characters."""
+    line = " ".join(text.split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 3]}..."
+
+
+def read_text(path: Path) -> str:
+    """Text of a regular file of at most `MOST_BYTES`.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, or cannot be read.
+    """
+    try:
+        regular = stat.S_ISREG(os.stat(path).st_mode)  # to open a pipe would wait
+        require(regular, str(path), "a folder or device", "a regular file")
+        with open(path, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
+        require(len(content) <= MOST_BYTES, str(path), "a larger one", "a file of at most 16 MiB")
+        return content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {cut(str(error))}") from error
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -28,26 +86,58 @@ def read_yaml(path: Path) -> dict[str, Any]:
     ValueError
         If the file cannot be read or parsed, or its top level is no mapping.
     """
+    text = read_text(path)
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML: {error}") from error
+        content = parse_yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: cannot be read as YAML: {cut(str(error))}") from error
     require(isinstance(content, dict), str(path), type(content).__name__, "a mapping of sections")
     return content
 
 
+def read_file(kind: type[T], path: Path) -> T:
+    """Read a YAML file as a dataclass.
+
+    Raises
+    ------
+    ValueError
+        One line that names file, field, value and what is accepted.
+    """
+    return read_dataclass(kind, read_yaml(path), f"{path.name}:")
+
+
 def section(mapping: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
     """Return the sub-mapping `key`; ``ValueError`` if it is absent or no mapping."""
-    value = mapping.get(key)
-    require(isinstance(value, Mapping), _join(where, key), value, "a mapping")
-    assert isinstance(value, Mapping)
-    return value
+    return _mapping(mapping.get(key), join(where, key))
 
 
 def known_keys(mapping: Mapping[str, Any], keys: set[str], where: str) -> None:
     """Raise ``ValueError`` if `mapping` has a key that is not among `keys`."""
     for key in mapping:
-        require(key in keys, _join(where, str(key)), mapping[key], f"one of {sorted(keys)}")
+        require(key in keys, join(where, key), mapping[key], f"one of {', '.join(sorted(keys))}")
+
+
+def one_of(
+    kinds: Mapping[str, Any],
+    mapping: Mapping[str, Any],
+    where: str,
+    beside: frozenset[str] = frozenset(),
+) -> tuple[str, Any]:
+    """Read the one entry of a mapping whose key names its kind; return key and what was read.
+
+    Parameters
+    ----------
+    kinds : mapping
+        From each accepted key to the type of what stands under it.
+    mapping : mapping
+    where : str
+    beside : frozenset of str
+        Keys that may stand beside it, and are left to the caller.
+    """
+    known_keys(mapping, {*kinds, *beside}, where)
+    given = [key for key in mapping if key in kinds]
+    require(len(given) == 1, where, given, f"exactly one of {', '.join(kinds)}")
+    return given[0], read(kinds[given[0]], mapping[given[0]], join(where, given[0]))
 
 
 def number(value: object, field: str) -> float:
@@ -58,56 +148,140 @@ def number(value: object, field: str) -> float:
         and not isinstance(value, bool)
         and abs(value) <= sys.float_info.max
     )
-    require(good, field, value, "a finite number (write exponents as 1.0e-3)")
+    require(good, field, value, "a finite number")
     return float(value)  # type: ignore[arg-type]
 
 
 def numbers(value: object, field: str, count: int | None = None) -> tuple[float, ...]:
     """Return a list of finite numbers as a tuple, of length `count` where that is given."""
-    good = isinstance(value, (list, tuple)) and (count is None or len(value) == count)
-    require(good, field, value, "a list of " + ("" if count is None else f"{count} ") + "numbers")
-    assert isinstance(value, (list, tuple))
-    return tuple(number(item, f"{field}[{i}]") for i, item in enumerate(value))
+    return _tuple((float, ...) if count is None else (float,) * count, value, field)
 
 
-def read_dataclass(cls: type[T], mapping: Mapping[str, Any], where: str, **read: object) -> T:
-    """Build a dataclass of float, int, bool and str fields from a mapping with exactly its keys.
+def read_dataclass(cls: type[T], mapping: Any, where: str, **given: object) -> T:
+    """Build a dataclass from a mapping with exactly its keys.
 
-    Fields with a default may be left out. Range checks are the dataclass's own. `read` are fields of other
-    types, which the caller has read.
+    Fields with a default may be left out. `given` are fields that do not come from the mapping.
+
+    Raises
+    ------
+    ValueError
+        If a key is unknown or missing, a value is not accepted, or the dataclass refuses it.
     """
-    specifications = {
-        f.name: f
-        for f in dataclasses.fields(cls)  # type: ignore[arg-type]
-        if f.name not in read
-    }
-    known_keys(mapping, set(specifications), where)
-    values: dict[str, Any] = dict(read)
-    for name, specification in specifications.items():
-        field = _join(where, name)
-        if name not in mapping:
-            optional = specification.default is not dataclasses.MISSING
-            require(optional, field, None, "a value (it is missing)")
-            continue
-        value, kind = mapping[name], str(specification.type)
-        if kind == "float":
-            values[name] = number(value, field)
-        elif kind == "int":
-            require(type(value) is int, field, value, "an integer")
-            values[name] = value
-        elif kind == "bool":
-            require(isinstance(value, bool), field, value, "true or false")
-            values[name] = value
-        elif kind == "str":
-            require(isinstance(value, str), field, value, "text")
-            values[name] = value
+    mapping = _mapping(mapping, where)
+    wanted = {name: kind for name, kind in _fields(cast(Any, cls)).items() if name not in given}
+    known_keys(mapping, set(wanted), where)
+    values = dict(given)
+    for name, (kind, optional) in wanted.items():
+        if name in mapping:
+            values[name] = read(kind, mapping[name], join(where, name))
         else:
-            raise TypeError(f"{cls.__name__}.{name}: fields of type {kind} are read by hand")
+            require(optional, join(where, name), None, f"{accepted(kind)} (it is missing)")
+    return build(cls, where, **values)
+
+
+def build(make: Any, where: str, *arguments: Any, **values: Any) -> Any:
+    """Call `make`, with what it refuses named from `where` on."""
     try:
-        return cls(**values)
+        return make(*arguments, **values)
     except ValueError as error:
-        raise ValueError(_join(where, str(error))) from error
+        raise ValueError(f"{_inside(where)}{error}") from error
 
 
-def _join(where: str, key: str) -> str:
-    return f"{where}.{key}" if where else key
+def read(kind: Any, value: object, field: str) -> Any:
+    """Return a plain value as an object of a kind; see the module.
+
+    Raises
+    ------
+    ValueError
+        Naming field, value and what is accepted.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return arguments[1](value, field)
+    if origin in (Union, types.UnionType):
+        (kind,) = (argument for argument in arguments if argument is not types.NoneType)
+        return None if value is None else read(kind, value, field)
+    if origin is tuple:
+        return _tuple(arguments, value, field)
+    if origin in (dict, Mapping):
+        return {
+            read(arguments[0], key, join(field, key)): read(arguments[1], item, join(field, key))
+            for key, item in _mapping(value, field).items()
+        }
+    if getattr(origin, "__name__", "") == "ndarray":
+        return _array(value, field)
+    if origin is Literal or (isinstance(kind, type) and issubclass(kind, Enum)):
+        choices = {choice: choice for choice in arguments} or {item.value: item for item in kind}
+        chosen = [it for text, it in choices.items() if type(text) is type(value) and text == value]
+        require(bool(chosen), field, value, accepted(kind))
+        return chosen[0]
+    if dataclasses.is_dataclass(kind):
+        return read_dataclass(cast(type, kind), value, field)
+    if kind is float:
+        return number(value, field)
+    if kind is not Any:
+        require(type(value) is kind, field, value, accepted(kind))
+    return value
+
+
+def accepted(kind: Any) -> str:
+    """What is accepted for a kind, in words."""
+    enumeration = isinstance(kind, type) and issubclass(kind, Enum)
+    choices = [item.value for item in kind] if enumeration else get_args(kind)
+    if enumeration or get_origin(kind) is Literal:
+        return f"{'one of ' if len(choices) > 1 else ''}{', '.join(map(str, choices))}"
+    return _PLAIN.get(kind, "a number" if kind is float else "a value")
+
+
+def join(where: str, key: object) -> str:
+    """Name of a field inside of another; one that ends in a colon is a file."""
+    return f"{_inside(where)}{cut(str(key) if str(key).isprintable() else repr(key))}"
+
+
+def _inside(where: str) -> str:
+    return f"{where} " if where.endswith(":") else f"{where}." if where else ""
+
+
+@cache
+def _fields(cls: type) -> dict[str, tuple[Any, bool]]:
+    """Kind of each field of a dataclass, and whether it may be left out."""
+    hints = get_type_hints(cls, include_extras=True)
+    nothing = dataclasses.MISSING
+    return {
+        f.name: (hints[f.name], not (f.default is nothing and f.default_factory is nothing))
+        for f in dataclasses.fields(cls)
+        if f.init
+    }
+
+
+def _mapping(value: object, field: str) -> Mapping[str, Any]:
+    require(isinstance(value, Mapping), field.rstrip(":"), value, "a mapping")
+    return cast(Mapping[str, Any], value)
+
+
+def _tuple(kinds: tuple[Any, ...], value: object, field: str) -> tuple[Any, ...]:
+    """Tuple of a list: of these kinds, or any number of the first."""
+    endless = kinds[-1] is Ellipsis
+    what = "numbers" if kinds[0] is float else "entries"
+    good = isinstance(value, (list, tuple)) and (endless or len(value) == len(kinds))
+    require(good, field, value, f"a list of {what if endless else f'{len(kinds)} {what}'}")
+    assert isinstance(value, (list, tuple))
+    each = kinds[:1] * len(value) if endless else kinds
+    return tuple(
+        read(kind, item, f"{field}[{i}]")
+        for i, (kind, item) in enumerate(zip(each, value, strict=True))
+    )
+
+
+def _array(value: object, field: str) -> Any:
+    """Array of a list of numbers, or of lists of them of one length."""
+    import numpy as np  # a node that reads no arrays need not load it
+
+    require(isinstance(value, (list, tuple)), field, value, "a list of numbers, or of such lists")
+    assert isinstance(value, (list, tuple))
+    if not any(isinstance(item, (list, tuple)) for item in value):
+        return np.array(numbers(value, field))
+    rows = [_array(item, f"{field}[{i}]") for i, item in enumerate(value)]
+    for i, row in enumerate(rows):
+        require(row.shape == rows[0].shape, f"{field}[{i}]", row.shape, f"shape {rows[0].shape}")
+    return np.array(rows)

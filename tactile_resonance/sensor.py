@@ -6,17 +6,11 @@ Sources and honesty marks of the default values stand beside them in that file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import (
-    known_keys,
-    read_dataclass,
-    read_yaml,
-    require,
-    section,
-)
+from tactile_resonance.fields import read_file, require
 
 
 def _positive(owner: object, *names: str) -> None:
@@ -147,20 +141,4 @@ def read_sensor(path: Path | None = None) -> SensorParameters:
         If the file cannot be read, or a field is missing, unknown or out of range.
     """
     path = share_path("config/sensors/bimorph.yaml") if path is None else Path(path)
-    content = read_yaml(path)
-    known_keys(content, {f.name for f in fields(SensorParameters)}, path.name)
-
-    where = path.name
-    return SensorParameters(
-        beam=read_dataclass(BeamParameters, section(content, "beam", where), f"{where}: beam"),
-        tip=read_dataclass(TipParameters, section(content, "tip", where), f"{where}: tip"),
-        electric=read_dataclass(
-            ElectricParameters, section(content, "electric", where), f"{where}: electric"
-        ),
-        nonlinear=read_dataclass(
-            NonlinearParameters, section(content, "nonlinear", where), f"{where}: nonlinear"
-        ),
-        acquisition=read_dataclass(
-            AcquisitionParameters, section(content, "acquisition", where), f"{where}: acquisition"
-        ),
-    )
+    return read_file(SensorParameters, path)

@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import (
-    known_keys,
-    numbers,
-    read_dataclass,
-    read_yaml,
-    require,
-    section,
-)
+from tactile_resonance.fields import build, read_file, require
 
 
 @dataclass(frozen=True)
@@ -170,8 +163,8 @@ class Workspace:
         Opposite corners of the box in which the tip may be, in the base [m].
     """
 
-    low_m: tuple[float, ...] = (-1.0, -1.0, -0.2)
-    high_m: tuple[float, ...] = (1.0, 1.0, 1.0)
+    low_m: tuple[float, float, float] = (-1.0, -1.0, -0.2)
+    high_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         low, high = self.low_m, self.high_m
@@ -288,6 +281,12 @@ class Limits:
         require(self.approach_s >= least, "approach_s", self.approach_s, need)
 
 
+@dataclass(frozen=True)
+class _ContactFile:
+    contact: ContactParameters
+    limits: Limits
+
+
 def read_contact(path: Path | None = None) -> tuple[ContactParameters, Limits]:
     """Read both; without a path, from ``config/contact.yaml``.
 
@@ -297,19 +296,6 @@ def read_contact(path: Path | None = None) -> tuple[ContactParameters, Limits]:
         If the file cannot be read, or a field is unknown, out of range or beyond the limits.
     """
     path = share_path("config/contact.yaml") if path is None else Path(path)
-    content, where = read_yaml(path), path.name
-    known_keys(content, {"contact", "limits"}, where)
-    parameters = read_dataclass(
-        ContactParameters, section(content, "contact", where), f"{where}: contact"
-    )
-    entries = dict(section(content, "limits", where))
-    box = entries.pop("workspace", None)
-    limits = read_dataclass(Limits, entries, f"{where}: limits")
-    if box is not None:
-        at = f"{where}: limits.workspace"
-        require(isinstance(box, dict), at, box, "a mapping of low_m and high_m")
-        known_keys(box, {"low_m", "high_m"}, at)
-        corners = [numbers(box.get(name), f"{at}.{name}", 3) for name in ("low_m", "high_m")]
-        limits = replace(limits, workspace=Workspace(*corners))
-    limits.check(parameters)
-    return parameters, limits
+    both = read_file(_ContactFile, path)
+    build(both.limits.check, f"{path.name}:", both.contact)
+    return both.contact, both.limits

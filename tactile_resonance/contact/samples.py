@@ -8,7 +8,7 @@ Numbers are floats in tuples: arithmetic on those of numpy costs a control loop 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from tactile_resonance.contact.vectors import (
     vector,
     vector_from_turn,
 )
+from tactile_resonance.fields import numbers
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -76,6 +77,14 @@ class Pose:
         place = rotated_back(frame.turn, vector(self.position_m - frame.position_m))
         turn = turn_product(transposed(frame.turn), self.turn)
         return Pose(np.array(place), np.array(vector_from_turn(turn)))
+
+
+def _read_six(value: object, field: str) -> Pose:
+    return Pose.from_vector(np.array(numbers(value, field, 6)))
+
+
+PoseOfSix = Annotated[Pose, _read_six]
+"""In files: six numbers, as Universal Robots write a pose."""
 
 
 class CellSample(NamedTuple):

@@ -86,11 +86,11 @@ class NiDaqDevice:
                         f"nidaqmx: {name} samples one channel after the other: measure the delay "
                         "by a loop-back and give it as channel_delay_s"
                     )
-            output = self._system.Device(config.output_channel.split("/")[0])
+            output = self._system.Device(config.output.channel.split("/")[0])
             reach_v = max(output.ao_voltage_rngs, default=0.0)
-        if config.max_voltage_v > reach_v:
+        if config.output.max_voltage_v > reach_v:
             raise DeviceError(
-                f"nidaqmx: output.max_voltage_v: {config.max_voltage_v:g}, the device reaches "
+                f"nidaqmx: output.max_voltage_v: {config.output.max_voltage_v:g}, the device reaches "
                 f"{reach_v:g} V"
             )
         self._rate_hz = sample_rate_hz
@@ -111,7 +111,7 @@ class NiDaqDevice:
             simulated=False,
             input_kind=config.input_kind,
             between_samples=config.between_samples,
-            output_peak_v=config.max_voltage_v,
+            output_peak_v=config.output.max_voltage_v,
             channel_delay_s=config.channel_delay_s,
             anti_alias_filter=config.anti_alias_filter,
         )
@@ -120,10 +120,10 @@ class NiDaqDevice:
         """Load one period into the output and commit both tasks; nothing moves."""
         period = excitation.period()
         peak_v = float(np.max(np.abs(period)))
-        if not peak_v <= self._config.max_voltage_v:
+        if not peak_v <= self._config.output.max_voltage_v:
             raise DeviceError(
                 f"nidaqmx: peak {peak_v:.3g} V, output.max_voltage_v is "
-                f"{self._config.max_voltage_v:.3g} V"
+                f"{self._config.output.max_voltage_v:.3g} V"
             )
         if excitation.sample_rate_hz != self._rate_hz:
             raise DeviceError(
@@ -256,7 +256,7 @@ class NiDaqDevice:
 
     def _make_output(self, period: npt.NDArray[np.float64]) -> Any:
         """The period, repeated on the inputs' clock from the inputs' start on."""
-        clock = f"/{self._config.clock_device}/ai"
+        clock = f"/{self._config.clock}/ai"
         task = self._daq.Task()
         try:
             self._add_output(task)
@@ -278,9 +278,9 @@ class NiDaqDevice:
         return task
 
     def _add_output(self, task: Any) -> None:
-        limit_v = self._config.max_voltage_v
+        limit_v = self._config.output.max_voltage_v
         task.ao_channels.add_ao_voltage_chan(
-            self._config.output_channel, min_val=-limit_v, max_val=limit_v
+            self._config.output.channel, min_val=-limit_v, max_val=limit_v
         )
 
     def _close_tasks(self) -> list[str]:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import yaml
-
+from tactile_resonance.fields import known_keys, number, read, read_dataclass, read_file, require
 from tactile_resonance.record import BetweenSamples, InputKind
 
 TERMINALS = {
@@ -29,6 +29,38 @@ class InputChannel:
     range_v: float
     terminals: str
 
+    def __post_init__(self) -> None:
+        require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ai0")
+        require(self.range_v > 0, "range_v", self.range_v, "a number above 0")
+        good = self.terminals in TERMINALS
+        require(good, "terminals", self.terminals, f"one of {', '.join(TERMINALS)}")
+
+
+@dataclass(frozen=True)
+class OutputChannel:
+    """The analogue output: its name, and the largest voltage of either sign that may be put out."""
+
+    channel: str
+    max_voltage_v: float
+
+    def __post_init__(self) -> None:
+        require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ao0")
+        require(self.max_voltage_v > 0, "max_voltage_v", self.max_voltage_v, "a number above 0")
+
+
+def _read_actuator(value: Any, field: str) -> InputChannel | None:
+    """None where the drive is taken to be what was asked of the output."""
+    source = value.get("source") if isinstance(value, dict) else None
+    measured = read(InputKind, source, f"{field}.source") is InputKind.MEASURED
+    channel = {key: item for key, item in value.items() if key != "source"}
+    if not measured:
+        known_keys(channel, {"source"}, field)
+    return read_dataclass(InputChannel, channel, field) if measured else None
+
+
+def _read_delay(value: object, field: str) -> float:
+    return math.nan if value is None else number(value, field)
+
 
 @dataclass(frozen=True)
 class NiDaqConfig:
@@ -36,31 +68,33 @@ class NiDaqConfig:
 
     Attributes
     ----------
-    output_channel : str
-    max_voltage_v : float
-        Largest voltage, positive or negative, that may be put out.
+    output : OutputChannel
     actuator : InputChannel or None
         None where the drive is not measured.
     sensor : InputChannel
     between_samples : BetweenSamples
+    buffer_s : float
+        Length of the input buffer [s].
     anti_alias_filter : str
     channel_delay_s : float
         Of the sensor channel behind the actuator channel; NaN where not measured.
     clock_device : str
-        Whose sample clock and start trigger all use.
-    buffer_s : float
-        Length of the input buffer [s].
+        Whose sample clock and start trigger all use; empty: that of the sensor.
     """
 
-    output_channel: str
-    max_voltage_v: float
-    actuator: InputChannel | None
+    output: OutputChannel
+    actuator: Annotated[InputChannel | None, _read_actuator]
     sensor: InputChannel
     between_samples: BetweenSamples
-    anti_alias_filter: str
-    channel_delay_s: float
-    clock_device: str
     buffer_s: float
+    anti_alias_filter: str = ""
+    channel_delay_s: Annotated[float, _read_delay] = math.nan
+    clock_device: str = ""
+
+    def __post_init__(self) -> None:
+        taken = self.actuator is not None and self.actuator.channel == self.sensor.channel
+        require(not taken, "sensor.channel", self.sensor.channel, "another than actuator.channel")
+        require(self.buffer_s > 0, "buffer_s", self.buffer_s, "a number above 0")
 
     @property
     def input_kind(self) -> InputKind:
@@ -72,6 +106,11 @@ class NiDaqConfig:
         """In the order in which they are read: actuator, where it is measured, then sensor."""
         return [self.actuator, self.sensor] if self.actuator else [self.sensor]
 
+    @property
+    def clock(self) -> str:
+        """Device whose sample clock and start trigger all use."""
+        return self.clock_device or self.sensor.channel.split("/")[0]
+
 
 def read_nidaq_config(path: Path) -> NiDaqConfig:
     """Read and check a configuration.
@@ -80,103 +119,5 @@ def read_nidaq_config(path: Path) -> NiDaqConfig:
     ------
     ValueError
         Names the field, its value, and what is accepted.
-    OSError
-        If the file cannot be opened.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path.name}: no YAML ({' '.join(str(error).split())})") from error
-    try:
-        return _config(content)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
-
-
-def _config(content: Any) -> NiDaqConfig:
-    top = _Fields(content, "")
-    output = _Fields(top.take("output"), "output.")
-    drive = _Fields(top.take("actuator"), "actuator.")
-    sensor = _input(_Fields(top.take("sensor"), "sensor."))
-    source = drive.choice("source", [kind.value for kind in InputKind])
-    actuator = None
-    if source == InputKind.MEASURED.value:
-        actuator = _input(drive)
-        if actuator.channel == sensor.channel:
-            raise ValueError(f"sensor.channel: {sensor.channel}, expected another than actuator's")
-    delay = top.take("channel_delay_s", None)
-    config = NiDaqConfig(
-        output_channel=output.text("channel"),
-        max_voltage_v=output.positive("max_voltage_v"),
-        actuator=actuator,
-        sensor=sensor,
-        between_samples=BetweenSamples(
-            top.choice("between_samples", [kind.value for kind in BetweenSamples])
-        ),
-        anti_alias_filter=str(top.take("anti_alias_filter", "")),
-        channel_delay_s=float("nan") if delay is None else _number("channel_delay_s", delay),
-        clock_device=str(top.take("clock_device", "")) or sensor.channel.split("/")[0],
-        buffer_s=top.positive("buffer_s"),
-    )
-    for fields in (top, output, drive):
-        fields.finish()
-    return config
-
-
-def _input(fields: _Fields) -> InputChannel:
-    channel = InputChannel(
-        fields.text("channel"),
-        fields.positive("range_v"),
-        fields.choice("terminals", list(TERMINALS)),
-    )
-    fields.finish()
-    return channel
-
-
-_MISSING = object()
-
-
-class _Fields:
-    """A mapping whose fields are taken out one by one, each with its name for messages."""
-
-    def __init__(self, content: Any, prefix: str) -> None:
-        if not isinstance(content, dict):
-            name = prefix.rstrip(".") or "configuration"
-            raise ValueError(f"{name}: {content!r}, expected fields with values")
-        self._content = dict(content)
-        self._prefix = prefix
-
-    def take(self, name: str, default: Any = _MISSING) -> Any:
-        value = self._content.pop(name, default)
-        if value is _MISSING:
-            raise ValueError(f"{self._prefix}{name}: missing")
-        return value
-
-    def text(self, name: str) -> str:
-        value = self.take(name)
-        if not isinstance(value, str) or not value:
-            raise ValueError(f"{self._prefix}{name}: {value!r}, expected a name such as Dev1/ai0")
-        return value
-
-    def positive(self, name: str) -> float:
-        value = _number(self._prefix + name, self.take(name))
-        if not 0 < value < float("inf"):
-            raise ValueError(f"{self._prefix}{name}: {value:g}, expected a positive number")
-        return value
-
-    def choice(self, name: str, accepted: list[str]) -> str:
-        value = self.take(name)
-        if value not in accepted:
-            raise ValueError(f"{self._prefix}{name}: {value!r}, accepted are {', '.join(accepted)}")
-        return value
-
-    def finish(self) -> None:
-        if self._content:
-            unknown = ", ".join(f"{self._prefix}{name}" for name in self._content)
-            raise ValueError(f"{unknown}: no such field")
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
-        raise ValueError(f"{name}: {value!r}, expected a number (with a point: 1.0e-6)")
-    return float(value)
+    return read_file(NiDaqConfig, path)

@@ -7,11 +7,12 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import numbers, read_dataclass, read_yaml, require
+from tactile_resonance.contact.samples import PoseOfSix
+from tactile_resonance.fields import read_file, require
 
 TOPIC = r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 """As in ROS 2, without substitutions (https://design.ros2.org/articles/topic_and_service_names.html)."""
@@ -35,9 +36,11 @@ class TwistConfig:
 
     Attributes
     ----------
+    kind : str
+        Distinguishes the file from those of other arms.
     command_topic, pose_topic : str
         geometry_msgs/TwistStamped to the controller, geometry_msgs/PoseStamped of the tool.
-    tip_in_tool : Pose
+    tip_in_tool : Pose, in files six numbers
         Frame `tip` in the frame whose poses come.
     rate_hz : float
         Of the poses.
@@ -54,9 +57,10 @@ class TwistConfig:
         Time is that of a simulated controller: each of its steps is answered by one command.
     """
 
+    kind: Literal["twist"]
     command_topic: str
     pose_topic: str
-    tip_in_tool: Pose
+    tip_in_tool: PoseOfSix
     rate_hz: float = 500.0
     max_state_age_s: float = 0.020
     max_command_gap_s: float = 0.040
@@ -93,10 +97,4 @@ def read_twist_config(path: Path) -> TwistConfig:
     ValueError
         Names the field that is unknown, missing or not accepted, its value and what is.
     """
-    fields, where = read_yaml(path), path.name
-    kind = fields.pop("kind", None)
-    require(kind == "twist", f"{where}.kind", kind, "twist")
-    offset = numbers(fields.pop("tip_in_tool", None), f"{where}.tip_in_tool", 6)
-    return read_dataclass(
-        TwistConfig, fields, where, tip_in_tool=Pose.from_vector(np.array(offset))
-    )
+    return read_file(TwistConfig, path)

@@ -8,13 +8,10 @@ import ipaddress
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-import yaml
-
-from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import require
+from tactile_resonance.contact.samples import Pose, PoseOfSix
+from tactile_resonance.fields import read_dataclass, read_file, require
 
 
 def _is_loopback(host: str) -> bool:
@@ -33,7 +30,7 @@ class UrArmConfig:
     ----------
     host : str
         Name or address of the robot.
-    tip_in_flange : Pose
+    tip_in_flange : Pose, in files six numbers
         Frame `tip` in the tool flange: what the robot gets as its TCP.
     payload_kg : float or None
         Mass on the flange; None leaves what is set on the pendant.
@@ -57,10 +54,12 @@ class UrArmConfig:
         Ask the dashboard server for remote control and modes; PolyScope X has none.
     realtime_priority : int
         SCHED_FIFO priority of the client process, 1 to 99; 0: none.
+    kind : str
+        Distinguishes the file from those of other arms.
     """
 
     host: str
-    tip_in_flange: Pose = field(default_factory=Pose.at_origin)
+    tip_in_flange: PoseOfSix = field(default_factory=Pose.at_origin)
     payload_kg: float | None = None
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_hz: float = 500.0
@@ -73,10 +72,10 @@ class UrArmConfig:
     max_acceleration_m_s2: float = 2.0
     check_dashboard: bool = True
     realtime_priority: int = 0
+    kind: Literal["ur"] = "ur"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.host, str) or not self.host:
-            raise ValueError(f"host: {self.host!r}, expected a name or an address")
+        require(bool(self.host), "host", self.host, "a name or an address")
         for name, low, high in (
             ("rate_hz", 25.0, 500.0),
             ("watchdog_hz", 5.0 if self.simulated else 25.0, 125.0),
@@ -86,20 +85,16 @@ class UrArmConfig:
             ("max_speed_m_s", 1e-4, 1.5),
             ("max_turn_rad_s", 1e-4, math.pi),
             ("max_acceleration_m_s2", 1e-3, 20.0),
+            ("realtime_priority", 0, 99),
+            *([] if self.payload_kg is None else [("payload_kg", 0.0, 50.0)]),
         ):
-            _check_number(name, getattr(self, name), low, high)
-        if self.payload_kg is not None:
-            _check_number("payload_kg", self.payload_kg, 0.0, 50.0)
+            value = getattr(self, name)
+            require(low <= value <= high, name, value, f"{low:g} to {high:g}")
         for name, values in (
             ("payload_cog_m", self.payload_cog_m),
-            ("tip_in_flange", self.tip_in_flange.vector),
+            ("tip_in_flange", self.tip_in_flange.vector.tolist()),
         ):
-            if not all(abs(value) < 10 for value in values):
-                raise ValueError(f"{name}: {list(values)}, expected numbers within +-10")
-        if type(self.check_dashboard) is not bool:
-            raise ValueError(f"check_dashboard: {self.check_dashboard!r}, expected true or false")
-        if type(self.realtime_priority) is not int or not 0 <= self.realtime_priority <= 99:
-            raise ValueError(f"realtime_priority: {self.realtime_priority!r}, expected 0 to 99")
+            require(all(abs(v) < 10 for v in values), name, values, "numbers within +-10")
 
     @property
     def simulated(self) -> bool:
@@ -122,19 +117,7 @@ class UrArmConfig:
         ValueError
             Names the field that is unknown, missing or not acceptable.
         """
-        known = [name.name for name in dataclasses.fields(cls)]
-        for name in fields:
-            if name not in known:
-                raise ValueError(f"{name}: not known, expected one of {', '.join(known)}")
-        if "host" not in fields:
-            raise ValueError("host: missing, expected a name or an address")
-        given = dict(fields)
-        for name, length in (("tip_in_flange", 6), ("payload_cog_m", 3)):
-            if name in given:
-                given[name] = _numbers(name, given[name], length)
-        if "tip_in_flange" in given:
-            given["tip_in_flange"] = Pose.from_vector(np.array(given["tip_in_flange"]))
-        return cls(**given)
+        return read_dataclass(cls, fields, "")
 
 
 def read_ur_config(path: Path) -> UrArmConfig:
@@ -145,27 +128,4 @@ def read_ur_config(path: Path) -> UrArmConfig:
     ValueError
         Names file and field.
     """
-    try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if not isinstance(fields, dict):
-            raise ValueError("expected names and values")
-        kind = fields.pop("kind", "ur")
-        require(kind == "ur", "kind", kind, "ur")
-        return UrArmConfig.from_dict(fields)
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise ValueError(f"{name}: {value!r}, expected {low:g} to {high:g}")
-
-
-def _numbers(name: str, values: Any, length: int) -> tuple[float, ...]:
-    if (
-        not isinstance(values, (list, tuple))
-        or len(values) != length
-        or not all(type(value) in (int, float) for value in values)
-    ):
-        raise ValueError(f"{name}: {values!r}, expected {length} numbers")
-    return tuple(float(value) for value in values)
+    return read_file(UrArmConfig, path)

@@ -10,7 +10,7 @@ from operator import add
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import known_keys, number, numbers, read_yaml, require
+from tactile_resonance.fields import read_file, require
 from tactile_resonance.simulation.noise import NormalRows, Seed
 
 SAMPLE_PERIOD_S = 0.001
@@ -46,8 +46,8 @@ class CellParameters:
     torque_noise_rms_nm: float
     force_range_n: float
     torque_range_nm: float
-    force_bias_n: tuple[float, ...] = (0.0, 0.0, 0.0)
-    torque_bias_nm: tuple[float, ...] = (0.0, 0.0, 0.0)
+    force_bias_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    torque_bias_nm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     force_drift_n_per_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -62,21 +62,7 @@ class CellParameters:
     def from_yaml(cls, path: Path | None = None) -> CellParameters:
         """Read a file; without a path ``config/load_cells/fine.yaml``. Raises ``ValueError``."""
         path = share_path("config/load_cells/fine.yaml") if path is None else path
-        content = read_yaml(path)
-        known_keys(content, {f.name for f in fields(cls)}, path.name)
-        values: dict[str, object] = {}
-        for key, value in content.items():
-            field = f"{path.name}: {key}"
-            if key == "name":
-                values[key] = str(value)
-            elif key in ("force_bias_n", "torque_bias_nm"):
-                values[key] = numbers(value, field, 3)
-            else:
-                values[key] = number(value, field)
-        try:
-            return cls(**values)  # type: ignore[arg-type]
-        except TypeError as error:
-            raise ValueError(f"{path.name}: a value is missing ({error})") from error
+        return read_file(cls, path)
 
 
 @dataclass

@@ -217,7 +217,9 @@ def test_what_the_device_cannot_do_is_refused(hardware):
         device.configure(RATE_HZ)
     hardware.rate_error = 0.0
     with pytest.raises(DeviceError, match="max_voltage_v: 12, the device reaches 10 V"):
-        NiDaqDevice(replace(CONFIG, max_voltage_v=12.0)).configure(RATE_HZ)
+        NiDaqDevice(replace(CONFIG, output=replace(CONFIG.output, max_voltage_v=12.0))).configure(
+            RATE_HZ
+        )
     hardware.simultaneous = False
     with pytest.raises(DeviceError, match="one channel after the other"):
         device.configure(RATE_HZ)

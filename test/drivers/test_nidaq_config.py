@@ -13,20 +13,23 @@ EXAMPLE = share_path("config/devices/nidaqmx.yaml")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"output": {"channel": "Dev1/ao0"}}, "output.max_voltage_v: missing"),
-        ({"between_samples": "linear"}, "between_samples: 'linear', accepted are"),
-        ({"channel_delay_s": "1e-6"}, "channel_delay_s: '1e-6', expected a number"),
-        ({"buffer_s": 0}, "buffer_s: 0, expected a positive number"),
-        ({"gain": 3}, "gain: no such field"),
-        ({"sensor": {"channel": 3}}, "sensor.channel: 3, expected a name"),
-        ({"sensor": None}, "sensor: None, expected fields"),
+        (
+            {"output": {"channel": "Dev1/ao0"}},
+            "output.max_voltage_v: got None; accepted is a number .it is missing.",
+        ),
+        ({"between_samples": "linear"}, "between_samples: got 'linear'; accepted is one of"),
+        ({"channel_delay_s": "1 us"}, "channel_delay_s: got '1 us'; accepted is a finite number"),
+        ({"buffer_s": 0}, "buffer_s: got 0.0; accepted is a number above 0"),
+        ({"gain": 3}, "gain: got 3; accepted is one of"),
+        ({"sensor": {"channel": 3}}, "sensor.channel: got 3; accepted is text"),
+        ({"sensor": None}, "sensor: got None; accepted is a mapping"),
         (
             {"sensor": {"channel": "Dev1/ai0", "range_v": 1.0, "terminals": "rse"}},
-            "sensor.channel: Dev1/ai0, expected another",
+            "sensor.channel: got 'Dev1/ai0'; accepted is another",
         ),
         (
             {"actuator": {"source": "commanded", "channel": "Dev1/ai0"}},
-            "actuator.channel: no such field",
+            "actuator.channel: got 'Dev1/ai0'; accepted is one of source",
         ),
     ],
 )

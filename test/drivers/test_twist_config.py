@@ -42,7 +42,7 @@ def test_the_place_of_the_tip_in_the_tool_is_read(read):
 def test_numbers_out_of_range_are_named(read, name, limits):
     low, high = limits
     for value in (0.99 * low, 1.01 * high):
-        with pytest.raises(ValueError, match=rf"mine.yaml.{name}: got .*; accepted is .* to "):
+        with pytest.raises(ValueError, match=rf"mine.yaml: {name}: got .*; accepted is .* to "):
             read(**{name: value})
     for value in ("fast", True, float("nan"), None):
         with pytest.raises(ValueError, match=rf"{name}: got .*accepted is a finite number"):
@@ -52,9 +52,9 @@ def test_numbers_out_of_range_are_named(read, name, limits):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"kind": "ur"}, "mine.yaml.kind: got 'ur'; accepted is twist"),
-        ({"kind": "left out"}, "mine.yaml.kind: got None"),
-        ({"command_topic": "left out"}, "command_topic: got None; accepted is a value (it is miss"),
+        ({"kind": "ur"}, "mine.yaml: kind: got 'ur'; accepted is twist"),
+        ({"kind": "left out"}, "mine.yaml: kind: got None"),
+        ({"command_topic": "left out"}, "command_topic: got None; accepted is text (it is miss"),
         ({"command_topic": ""}, "command_topic: got ''; accepted is the name of a topic"),
         ({"pose_topic": 3}, "pose_topic: got 3; accepted is text"),
         ({"pose_topic": ""}, "pose_topic: got ''"),
@@ -66,7 +66,7 @@ def test_numbers_out_of_range_are_named(read, name, limits):
         ({"lockstep": 1}, "lockstep: got 1; accepted is true or false"),
         ({"tip_in_tool": [0.0] * 5}, "tip_in_tool: got [0.0, 0.0, 0.0, 0.0, 0.0]; accepted is a"),
         ({"tip_in_tool": [0.0] * 5 + [11.0]}, "tip_in_tool: got [0.0, 0.0, 0.0, 0.0, 0.0, 11.0]"),
-        ({"host": "127.0.1.1"}, "mine.yaml.host: got '127.0.1.1'; accepted is one of"),
+        ({"host": "127.0.1.1"}, "mine.yaml: host: got '127.0.1.1'; accepted is one of"),
         # a deadline shorter than the period would always be missed
         ({"rate_hz": 40.0}, "max_state_age_s: got 0.02; accepted is above 1/rate_hz = 0.025"),
         (

@@ -44,7 +44,7 @@ def test_a_device_that_is_not_there_is_named(make, tmp_path, monkeypatch):
         make(device="replay")
     with pytest.raises(ValueError, match="no measurement in it"):
         make(device="replay", device_config=str(tmp_path))
-    with pytest.raises(OSError, match="nowhere.yaml"):
+    with pytest.raises(ValueError, match="nowhere.yaml: cannot be read"):
         make(device="nidaqmx", device_config=str(tmp_path / "nowhere.yaml"))
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
     with pytest.raises(DeviceError, match="install the package"):

@@ -138,7 +138,7 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     [
         ({"force": 1}, r"scene.yaml: force: got 1; accepted is one of"),
         ({"force_n": -1}, "force_n: got -1.0; accepted is a number above 0"),
-        ({"force_n": "1e-2"}, "force_n: got '1e-2'; accepted is a finite number"),
+        ({"force_n": "1 cN"}, "force_n: got '1 cN'; accepted is a finite number"),
         ({"hold": "pressure"}, "hold: got 'pressure'; accepted is one of force, indentation"),
         ({"outputs": ["poles", "sound"]}, "outputs: got .*sound.* a list out of poles"),
         ({"outputs": []}, "outputs: got"),
