@@ -10,26 +10,43 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from tactile_resonance.configuration import shared_file
-from tactile_resonance.fields import known_keys, read_yaml, require, section
+from tactile_resonance.fields import read, read_file, require
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+
+
+def _read_data(value: object, where: str) -> bytes:
+    numbers = read(tuple[int, ...], value, where)
+    good = 0 < len(numbers) <= 8 and all(0 <= number <= 255 for number in numbers)
+    require(good, where, value, "1 to 8 bytes, integers from 0 to 255")
+    return bytes(numbers)
+
+
+def _read_layout(value: object, where: str) -> struct.Struct:
+    try:
+        return struct.Struct(read(str, value, where).encode("ascii"))
+    except (struct.error, UnicodeEncodeError) as error:
+        raise ValueError(f"{where}: got {value!r}; accepted is a struct format") from error
+
+
+Data = Annotated[bytes, _read_data]
 
 
 @dataclass(frozen=True)
 class CellCommand:
     """A frame to the cell, and whether it answers."""
 
-    name: str
-    data: bytes
-    reply: bool
+    data: Data
+    name: str = "set-up"
+    reply: bool = True
 
 
 @dataclass(frozen=True)
@@ -42,14 +59,58 @@ class Reply:
         Offset into the joined bytes (from 0), and its value where all is well.
     error_byte : int
         Offset of the reason.
-    errors : dict
+    errors : mapping
         Reasons in words.
     """
 
     result_byte: int
     good: int
     error_byte: int
-    errors: dict[int, str]
+    errors: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("result_byte", "good", "error_byte"):
+            value = getattr(self, name)
+            require(0 <= value <= 255, name, value, "an integer from 0 to 255")
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What is sent to the cell.
+
+    Attributes
+    ----------
+    id : int
+        Identifier of the frames that carry commands.
+    stop, start : bytes or None
+    setup : tuple of CellCommand
+    rates : mapping
+        From wrenches a second to the command that sets it; empty where the rate is fixed.
+    request : bytes or None
+        Sent for each wrench, where the cell does not stream by itself.
+    reply : Reply or None
+    """
+
+    id: int
+    stop: Data | None = None
+    start: Data | None = None
+    setup: tuple[CellCommand, ...] = ()
+    rates: Mapping[int, Data] = field(default_factory=dict)
+    request: Data | None = None
+    reply: Reply | None = None
+
+    def __post_init__(self) -> None:
+        answered = bool(self.rates) or any(command.reply for command in self.setup)
+        good = self.reply is not None or not answered
+        require(good, "reply", None, "where the answers to set-up and rates say what was done")
+
+
+@dataclass(frozen=True)
+class Overload:
+    """Field and mask of the overload bits."""
+
+    field: str
+    mask: int
 
 
 @dataclass(frozen=True)
@@ -58,47 +119,59 @@ class CanDescription:
 
     Attributes
     ----------
-    name : str
     frame_ids : tuple of int
         Identifiers of the frames of one wrench, in the order in which they are sent.
-    extended_ids : bool
     layout : struct.Struct
         Of the joined bytes of these frames.
     fields : tuple of str
         Name of each value of the layout; `CHANNELS` are among them.
-    constant : dict
+    name : str
+    extended_ids : bool
+    constant : mapping
         Values that distinguish a wrench from other answers.
-    overload : tuple of str and int, or None
-        Field and mask of the overload bits.
+    overload : Overload or None
     invalid_counts : tuple of int
         Counts that mean an invalid value.
     full_scale_counts : int or None
         At and beyond which a count is an overload.
-    command_id : int or None
-    stop, start, setup : CellCommand or None, tuple of CellCommand
-    rates : dict
-        From wrenches a second to the command that sets it; empty where the rate is fixed.
-    request : bytes or None
-        Sent for each wrench, where the cell does not stream by itself.
-    reply : Reply or None
+    commands : Commands
+        None of them where the cell takes none and streams by itself.
     """
 
-    name: str
     frame_ids: tuple[int, ...]
-    extended_ids: bool
-    layout: struct.Struct
+    layout: Annotated[struct.Struct, _read_layout]
     fields: tuple[str, ...]
-    constant: dict[str, int] = field(default_factory=dict)
-    overload: tuple[str, int] | None = None
+    name: str = ""
+    extended_ids: bool = False
+    constant: Mapping[str, int] = field(default_factory=dict)
+    overload: Overload | None = None
     invalid_counts: tuple[int, ...] = ()
     full_scale_counts: int | None = None
-    command_id: int | None = None
-    stop: CellCommand | None = None
-    start: CellCommand | None = None
-    setup: tuple[CellCommand, ...] = ()
-    rates: dict[int, CellCommand] = field(default_factory=dict)
-    request: bytes | None = None
-    reply: Reply | None = None
+    commands: Commands = field(default_factory=lambda: Commands(id=0))
+
+    def __post_init__(self) -> None:
+        ids, size = self.frame_ids, self.layout.size
+        most = 0x1FFFFFFF if self.extended_ids else 0x7FF
+        good = bool(ids) and len(set(ids)) == len(ids) and all(0 <= i <= most for i in ids)
+        require(good, "frame_ids", ids, f"different integers from 0 to {most:#x}")
+        most_bytes = f"at most 8 bytes a frame, {8 * len(ids)} here"
+        require(0 < size <= 8 * len(ids), "layout", self.layout.format, most_bytes)
+        count = len(self.layout.unpack(bytes(size)))
+        good = len(self.fields) == count and set(CHANNELS) <= set(self.fields)
+        needed = f"{count} names as in layout, {', '.join(CHANNELS)} among them"
+        require(good, "fields", self.fields, needed)
+        for name, value in self.constant.items():
+            require(name in self.fields, f"constant.{name}", value, "a value of one of fields")
+        if self.overload is not None:
+            name = self.overload.field
+            require(name in self.fields, "overload.field", name, "one of fields")
+        counts = self.full_scale_counts
+        require(counts is None or counts > 0, "full_scale_counts", counts, "an integer above 0")
+        command_id, reply = self.commands.id, self.commands.reply
+        require(0 <= command_id <= most, "commands.id", command_id, f"0 to {most:#x}")
+        for name in ("result_byte", "error_byte") if reply else ():
+            offset = getattr(reply, name)
+            require(offset < size, f"commands.reply.{name}", offset, f"below {size}")
 
     def decode(self, data: bytes) -> tuple[tuple[float, ...], bool] | None:
         """Counts (6,) and overload of the joined bytes; NaN for a count that means an invalid value.
@@ -113,7 +186,7 @@ class CanDescription:
                 return None
         counts = self._counts_of(values)
         over = self._overload_at is not None and bool(
-            values[self._overload_at] & self.overload[1]  # type: ignore[index]
+            values[self._overload_at] & self.overload.mask  # type: ignore[union-attr]
         )
         full_scale, invalid = self.full_scale_counts, self.invalid_counts
         if full_scale is not None and (max(counts) >= full_scale or min(counts) <= -full_scale):
@@ -136,7 +209,7 @@ class CanDescription:
 
     @cached_property
     def _overload_at(self) -> int | None:
-        return None if self.overload is None else self.fields.index(self.overload[0])
+        return None if self.overload is None else self.fields.index(self.overload.field)
 
 
 class Assembler:
@@ -195,118 +268,4 @@ def read_can_description(path: Path) -> CanDescription:
     ValueError
         Names the field, its value, and what is accepted.
     """
-    path = shared_file(path, "config/force/frames")
-    content = read_yaml(path)
-    try:
-        return _description(content)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
-
-
-def _description(content: dict[str, Any]) -> CanDescription:
-    known_keys(
-        content,
-        {"name", "frame_ids", "extended_ids", "layout", "fields", "constant", "overload"}
-        | {"invalid_counts", "full_scale_counts", "commands"},
-        "",
-    )
-    extended = content.get("extended_ids", False)
-    require(type(extended) is bool, "extended_ids", extended, "true or false")
-    most_id = 0x1FFFFFFF if extended else 0x7FF
-    ids = _integers(content.get("frame_ids"), "frame_ids", most_id)
-    require(bool(ids) and len(set(ids)) == len(ids), "frame_ids", ids, "different identifiers")
-    layout_text = content.get("layout")
-    try:
-        layout = struct.Struct(str(layout_text))
-        count = len(layout.unpack(bytes(layout.size)))
-    except struct.error as error:
-        raise ValueError(f"layout: got {layout_text!r}; accepted is a struct format") from error
-    fits = 0 < layout.size <= 8 * len(ids)
-    require(fits, "layout", layout_text, f"at most 8 bytes a frame, {8 * len(ids)} here")
-    names = content.get("fields")
-    good = isinstance(names, list) and len(names) == count and set(CHANNELS) <= set(names)
-    require(good, "fields", names, f"{count} names as in layout, {', '.join(CHANNELS)} among them")
-    constant = dict(content.get("constant") or {})
-    for name, value in constant.items():
-        require(
-            name in names and type(value) is int, f"constant.{name}", value, "a field's integer"
-        )
-    overload = None
-    if content.get("overload") is not None:
-        part = section(content, "overload", "")
-        known_keys(part, {"field", "mask"}, "overload")
-        require(part.get("field") in names, "overload.field", part.get("field"), "one of fields")
-        require(type(part.get("mask")) is int, "overload.mask", part.get("mask"), "an integer")
-        overload = (part["field"], part["mask"])
-    full_scale = content.get("full_scale_counts")
-    good = full_scale is None or (type(full_scale) is int and full_scale > 0)
-    require(good, "full_scale_counts", full_scale, "a positive integer")
-    commands = content.get("commands")
-    parsed: dict[str, Any] = {}
-    if commands is not None:
-        parsed = _commands(section(content, "commands", ""), most_id, layout.size)
-    return CanDescription(
-        name=str(content.get("name", "")),
-        frame_ids=ids,
-        extended_ids=extended,
-        layout=layout,
-        fields=tuple(names),
-        constant=constant,
-        overload=overload,
-        invalid_counts=_integers(content.get("invalid_counts", []), "invalid_counts", None),
-        full_scale_counts=full_scale,
-        **parsed,
-    )
-
-
-def _commands(part: Any, most_id: int, size: int) -> dict[str, Any]:
-    known_keys(part, {"id", "stop", "start", "setup", "rates", "request", "reply"}, "commands")
-    (command_id,) = _integers([part.get("id")], "commands.id", most_id)
-    result: dict[str, Any] = {"command_id": command_id}
-    for name in ("stop", "start"):
-        if part.get(name) is not None:
-            result[name] = CellCommand(name, _bytes(part[name], f"commands.{name}"), False)
-    if part.get("request") is not None:
-        result["request"] = _bytes(part["request"], "commands.request")
-    setup = []
-    for i, item in enumerate(part.get("setup") or []):
-        where = f"commands.setup[{i}]"
-        require(isinstance(item, dict), where, item, "fields with values")
-        known_keys(item, {"name", "data", "reply"}, where)
-        data = _bytes(item.get("data"), f"{where}.data")
-        setup.append(CellCommand(str(item.get("name", where)), data, bool(item.get("reply", True))))
-    result["setup"] = tuple(setup)
-    rates = part.get("rates") or {}
-    require(isinstance(rates, dict), "commands.rates", rates, "commands by rate")
-    result["rates"] = {
-        rate: CellCommand(f"rate {rate} Hz", _bytes(data, f"commands.rates.{rate}"), True)
-        for rate, data in rates.items()
-    }
-    if part.get("reply") is not None:
-        reply = section(part, "reply", "commands")
-        names = {"result_byte", "good", "error_byte", "errors"}
-        known_keys(reply, names, "commands.reply")
-        numbers = [reply.get(name) for name in ("result_byte", "good", "error_byte")]
-        result["reply"] = Reply(
-            *_integers(numbers, "commands.reply", 255), errors=dict(reply.get("errors") or {})
-        )
-        for name in ("result_byte", "error_byte"):
-            require(reply[name] < size, f"commands.reply.{name}", reply[name], f"below {size}")
-    answered = [c.name for c in (*setup, *result["rates"].values()) if c.reply]
-    missing = bool(answered) and "reply" not in result
-    require(not missing, "commands.reply", None, f"where {answered[:1]} are answered")
-    return result
-
-
-def _integers(value: Any, name: str, most: int | None) -> tuple[int, ...]:
-    good = isinstance(value, list) and all(
-        type(item) is int and (most is None or 0 <= item <= most) for item in value
-    )
-    require(good, name, value, "integers" + ("" if most is None else f" from 0 to {most:#x}"))
-    return tuple(value)
-
-
-def _bytes(value: Any, name: str) -> bytes:
-    data = _integers(value, name, 255)
-    require(0 < len(data) <= 8, name, value, "1 to 8 bytes")
-    return bytes(data)
+    return read_file(CanDescription, shared_file(path, "config/force/frames"))

@@ -97,12 +97,9 @@ class CanWrench:
         self._checks.restart()
         self._begin()
         info, description = self._config.info, self._can.description
-        request = None
-        if description.request is not None:
-            assert description.command_id is not None
-            period_s = 1 / info.rate_hz
-            extended = description.extended_ids
-            request = (description.command_id, description.request, extended, period_s)
+        request, commands = None, description.commands
+        if commands.request is not None:
+            request = (commands.id, commands.request, description.extended_ids, 1 / info.rate_hz)
         look_s = self._config.limits.silent_s / 2
         self._bus = open_bus(self._can.bus, self._where, request, look_s)
         try:
@@ -152,9 +149,9 @@ class CanWrench:
         if bus is None:
             return
         with contextlib.suppress(can.CanError, OSError):
-            stop = self._can.description.stop
+            stop = self._can.description.commands.stop
             if stop is not None and self._fault is None:
-                self._send(bus, stop.data)
+                self._send(bus, stop)
         with contextlib.suppress(can.CanError, OSError):
             bus.close()
 
@@ -191,15 +188,14 @@ class CanWrench:
 
     def _send(self, bus: Bus, data: bytes) -> None:
         description = self._can.description
-        assert description.command_id is not None
-        bus.send(description.command_id, data, description.extended_ids)
+        bus.send(description.commands.id, data, description.extended_ids)
 
     def _set_up(self, bus: Bus) -> None:
         """Stop the cell, set it, start it."""
-        description, simulated = self._can.description, self.clock.simulated
+        commands, simulated = self._can.description.commands, self.clock.simulated
         within_s = SIMULATED_WITHIN_S if simulated else ANSWER_WITHIN_S
-        if description.stop is not None:
-            self._send(bus, description.stop.data)
+        if commands.stop is not None:
+            self._send(bus, commands.stop)
             deadline_s = time.monotonic() + within_s
             quiet_s = time.monotonic() + QUIET_S
             while time.monotonic() < quiet_s:
@@ -207,15 +203,16 @@ class CanWrench:
                     quiet_s = time.monotonic() + QUIET_S
                     if quiet_s > deadline_s:
                         raise ForceError(ForceFault.REFUSED, f"{self._where}: does not stop")
-        commands = list(description.setup)
-        if description.rates:
-            commands.append(description.rates[int(self._config.info.rate_hz)])
-        for command in commands:
+        setup = list(commands.setup)
+        if commands.rates:
+            rate_hz = int(self._config.info.rate_hz)
+            setup.append(CellCommand(commands.rates[rate_hz], f"rate {rate_hz} Hz"))
+        for command in setup:
             self._send(bus, command.data)
             if command.reply:
                 self._await_reply(bus, command, within_s)
-        if description.start is not None:
-            self._send(bus, description.start.data)
+        if commands.start is not None:
+            self._send(bus, commands.start)
         deadline_s = time.monotonic() + ANSWER_WITHIN_S
         while not simulated and not self._ahead:  # simulated time may stand still for now
             frames = _frames(bus)
@@ -225,7 +222,7 @@ class CanWrench:
                 raise ForceError(ForceFault.SILENT, f"{self._where}: sends no wrench")
 
     def _await_reply(self, bus: Bus, command: CellCommand, within_s: float) -> None:
-        reply = self._can.description.reply
+        reply = self._can.description.commands.reply
         assert reply is not None
         assembler = self._new_assembler()
         deadline_s = time.monotonic() + within_s
@@ -269,9 +266,8 @@ class CanWrench:
             if not held_up or self._excused:
                 raise self._silence(bus, now_s - self._last_s)
             self._last_s, self._excused = now_s, True
-        if self._can.description.request is None and self._flow.short(
-            now_s, self.received + self.lost
-        ):
+        streams = self._can.description.commands.request is None
+        if streams and self._flow.short(now_s, self.received + self.lost):
             text = f"{self._flow.rate_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
             raise ForceError(
                 ForceFault.INCOMPLETE, f"{self._where}: {text}: the interface is too slow"
@@ -280,13 +276,13 @@ class CanWrench:
 
     def _silence(self, bus: Bus, since_s: float) -> ForceError:
         """Whether the cell or the link is silent: on a dead link two sends fail."""
-        stop = self._can.description.stop
+        stop = self._can.description.commands.stop
         text = f"{self._where}: silent for {since_s * 1e3:.0f} ms"
         if stop is not None:
             try:
-                self._send(bus, stop.data)
+                self._send(bus, stop)
                 time.sleep(0.001)
-                self._send(bus, stop.data)
+                self._send(bus, stop)
             except (can.CanError, OSError) as error:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)

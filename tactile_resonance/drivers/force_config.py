@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -16,19 +17,11 @@ from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.vectors import vector
+from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
-from tactile_resonance.fields import (
-    known_keys,
-    number,
-    numbers,
-    read_yaml,
-    require,
-    section,
-)
+from tactile_resonance.fields import build, read, read_dataclass, read_yaml, require
 
-KINDS = ("can", "rtde", "topic")
-STAMPS = ("adapter", "arrival")
+Stamps = Literal["adapter", "arrival"]
 LONGEST_S = 1.0
 """Of delays and filters: with more, no contact is controlled."""
 
@@ -45,7 +38,7 @@ class CanConfig:
     scale : (6, 6) array
         From counts to N and N m.
     stamps : str
-        One of `STAMPS`: time stamps of the adapter, related to this machine's clock, or times of arrival.
+        Time stamps of the adapter, related to this machine's clock, or times of arrival.
     shortest_delay_s, delay_std_s : float
         From the adapter's stamp to the arrival [s].
     """
@@ -53,7 +46,7 @@ class CanConfig:
     bus: dict[str, Any]
     description: CanDescription
     scale: np.ndarray
-    stamps: str
+    stamps: Stamps
     shortest_delay_s: float
     delay_std_s: float
 
@@ -65,7 +58,7 @@ class ForceConfig:
     Attributes
     ----------
     kind : str
-        One of `KINDS`.
+        One of can, rtde, topic.
     info : ForceInfo
     range_nm : float
         Largest torque [N m].
@@ -109,139 +102,160 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     """
     path = shared_file(path, "config/force")
     content = read_yaml(path)
-    try:
-        config = _config(content, path.parent)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
+    where = f"{path.name}:"
+    kind = read(Literal["can", "rtde", "topic"], content.get("kind"), f"{where} kind")
+    file: _File = read_dataclass(_KINDS[kind], content, where)
+    config = build(_config, where, file, path.parent)
     if force_n is not None:
         require_fit(config.info, force_n)
     return config
 
 
-def _config(content: dict[str, Any], folder: Path) -> ForceConfig:
-    kind = content.get("kind")
-    require(kind in KINDS, "kind", kind, f"one of {', '.join(KINDS)}")
-    shared = {"kind", "name", "rate_hz", "noise_rms_n", "range_n", "range_nm", "latency_s"}
-    shared |= {"mount", "frame", "payload", "inertia_window_s", "limits"}
-    own = {
-        "can": {"bus", "frames", "counts_per_n", "counts_per_nm", "matrix", "resolution_n"}
-        | {"stamps", "shortest_delay_s", "delay_std_s"},
-        "rtde": {"resolution_n"},
-        "topic": {"resolution_n", "topic"},
-    }
-    known_keys(content, shared | own[kind], "")
-    mount = content.get("mount")
-    require(mount in ("tool", "table"), "mount", mount, "tool or table")
-    can = _can(content, folder) if kind == "can" else None
-    # where the scale is a matrix the step depends on the direction: it is stated
-    counted = can is not None and "matrix" not in content and "resolution_n" not in content
-    resolution_n = 1 / content["counts_per_n"] if counted else _positive(content, "resolution_n")
-    info = ForceInfo(
-        name=str(content.get("name", kind)),
-        rate_hz=_positive(content, "rate_hz"),
-        noise_rms_n=_positive(content, "noise_rms_n"),
-        resolution_n=resolution_n,
-        range_n=_positive(content, "range_n"),
-        mount=Mount(mount),
-    )
-    if can is not None and can.description.rates:
-        rates = can.description.rates
-        require(info.rate_hz in rates, "rate_hz", info.rate_hz, f"one of {sorted(rates)}")
-    topic = content.get("topic", "")
-    good = isinstance(topic, str) and bool(topic)
-    require(kind != "topic" or good, "topic", topic, "the name of a topic")
-    given = dict(section(content, "limits", "") if content.get("limits") is not None else {})
-    stuck = given.pop("stuck_samples", None)
-    good = stuck is None or type(stuck) is int
-    require(good, "limits.stuck_samples", stuck, "an integer")
-    names = {f.name for f in fields(CellLimits)} - {"stuck_samples"}
-    known_keys(given, names, "limits")
-    for name in ("overload_samples", "lost_tolerated"):
-        good = name not in given or type(given[name]) is int
-        require(good, f"limits.{name}", given.get(name), "an integer")
-    for name in ("silent_s", "jump_n"):
-        if name in given:
-            given[name] = number(given[name], f"limits.{name}")
-    try:
-        limits = CellLimits(stuck_samples=stuck, **given)
-    except ValueError as error:
-        raise ValueError(f"limits.{error}") from error
-    periods = limits.silent_s * info.rate_hz
-    require(periods >= 2, "limits.silent_s", limits.silent_s, "two periods of rate_hz or more")
-    return ForceConfig(
-        kind=kind,
-        info=info,
-        range_nm=_positive(content, "range_nm"),
-        mounting=_mounting(content, Mount(mount)),
-        inertia_window_s=_short(content, "inertia_window_s"),
-        latency_s=_short(content, "latency_s"),
-        limits=limits,
-        can=can,
-        topic=topic,
-    )
+@dataclass(frozen=True)
+class _Frame:
+    position_m: Vector
+    rotation_rad: Vector
 
 
-def _can(content: dict[str, Any], folder: Path) -> CanConfig:
-    bus = dict(section(content, "bus", ""))
-    require(isinstance(bus.get("interface"), str), "bus.interface", bus.get("interface"), "a name")
-    if bus["interface"] == "socketcand":
-        # without it the kernel holds small packets back for tens of milliseconds
-        bus.setdefault("tcp_tune", True)
-        host, port = bus.get("host"), bus.get("port")
-        require(isinstance(host, str) and bool(host), "bus.host", host, "a name or an address")
-        good = type(port) is int and 0 < port < 1 << 16
-        require(good, "bus.port", port, "an integer from 1 to 65535")
-    frames = content.get("frames")
-    require(isinstance(frames, str) and bool(frames), "frames", frames, "a file")
-    beside = folder / str(frames)
-    description = read_can_description(beside if beside.is_file() else Path(str(frames)))
-    if content.get("matrix") is not None:
-        rows = content["matrix"]
-        require(isinstance(rows, list) and len(rows) == 6, "matrix", rows, "6 rows of 6 numbers")
-        scale = np.array([numbers(row, f"matrix[{i}]", 6) for i, row in enumerate(rows)])
-        # some load would be shown as none
-        blind = np.linalg.matrix_rank(scale / np.maximum(np.abs(scale).max(1), 1e-300)[:, None]) < 6
-        require(not blind, "matrix", rows, "rows that are independent")
+def _read_frame(value: object, where: str) -> Pose:
+    frame = read(_Frame, value, where)
+    return Pose(np.array(frame.position_m), np.array(frame.rotation_rad))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    """What every file states; what only one kind of source has is added below."""
+
+    kind: str
+    rate_hz: float
+    noise_rms_n: float
+    range_n: float
+    range_nm: float
+    mount: Mount
+    frame: Annotated[Pose, _read_frame]
+    name: str = ""
+    latency_s: float = 0.0
+    payload: Payload | None = None
+    inertia_window_s: float = 0.0
+    limits: CellLimits = field(default_factory=CellLimits)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name in _POSITIVE:
+                require(value is None or value > 0, name, value, "a number above 0")
+            if name in _SHORT:
+                require(0 <= value <= LONGEST_S, name, value, f"0 to {LONGEST_S:g} s")
+        silent_s = self.limits.silent_s
+        good = silent_s * self.rate_hz >= 2
+        require(good, "limits.silent_s", silent_s, "two periods of rate_hz or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rtde(_File):
+    resolution_n: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Topic(_Rtde):
+    topic: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(bool(self.topic), "topic", self.topic, "the name of a topic")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Can(_File):
+    bus: Mapping[str, Any]
+    frames: str
+    counts_per_n: float | None = None
+    counts_per_nm: float | None = None
+    matrix: tuple[Six, Six, Six, Six, Six, Six] | None = None
+    resolution_n: float | None = None
+    stamps: Stamps = "arrival"
+    shortest_delay_s: float = 0.0
+    delay_std_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        interface, host, port = (self.bus.get(name) for name in ("interface", "host", "port"))
+        require(isinstance(interface, str), "bus.interface", interface, "a name")
+        if interface == "socketcand":
+            good = isinstance(host, str) and bool(host)
+            require(good, "bus.host", host, "a name or an address")
+            good = type(port) is int and 0 < port < 1 << 16
+            require(good, "bus.port", port, "an integer from 1 to 65535")
+        if self.matrix is not None:
+            rows = np.array(self.matrix)
+            # some load would be shown as none
+            largest = np.maximum(np.abs(rows).max(axis=1, keepdims=True), 1e-300)
+            seen = bool(np.linalg.matrix_rank(rows / largest) == 6)
+            require(seen, "matrix", self.matrix, "rows that are independent")
         for name in ("counts_per_n", "counts_per_nm"):
-            require(name not in content, name, content.get(name), "nothing beside matrix")
-    else:
-        per_n, per_nm = _positive(content, "counts_per_n"), _positive(content, "counts_per_nm")
-        scale = np.diag(np.repeat([1 / per_n, 1 / per_nm], 3))
-    stamps = content.get("stamps", "arrival")
-    require(stamps in STAMPS, "stamps", stamps, f"one of {', '.join(STAMPS)}")
-    return CanConfig(
-        bus=bus,
-        description=description,
-        scale=scale,
-        stamps=stamps,
-        shortest_delay_s=_short(content, "shortest_delay_s"),
-        delay_std_s=_short(content, "delay_std_s"),
+            value = getattr(self, name)
+            good = (value is None) == (self.matrix is not None)
+            require(good, name, value, "a number above 0, or a matrix in place of both")
+        # with a matrix the step depends on the direction
+        good = self.matrix is None or self.resolution_n is not None
+        require(good, "resolution_n", self.resolution_n, "a number above 0 beside matrix")
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(6, 6) from counts to N and N m."""
+        if self.matrix is not None:
+            return np.array(self.matrix)
+        return np.diag(np.repeat([1 / self.counts_per_n, 1 / self.counts_per_nm], 3))
+
+    def can(self, folder: Path) -> CanConfig:
+        """What the driver needs; `folder` is that of the file."""
+        beside = folder / self.frames
+        description = read_can_description(beside if beside.is_file() else Path(self.frames))
+        if rates := description.commands.rates:
+            require(self.rate_hz in rates, "rate_hz", self.rate_hz, f"one of {sorted(rates)}")
+        # without it the kernel holds small packets back for tens of milliseconds
+        tuned = {"tcp_tune": True} if self.bus["interface"] == "socketcand" else {}
+        return CanConfig(
+            bus={**tuned, **self.bus},
+            description=description,
+            scale=self.scale,
+            stamps=self.stamps,
+            shortest_delay_s=self.shortest_delay_s,
+            delay_std_s=self.delay_std_s,
+        )
+
+
+_KINDS = {"can": _Can, "rtde": _Rtde, "topic": _Topic}
+_POSITIVE = frozenset(
+    {
+        "rate_hz",
+        "noise_rms_n",
+        "range_n",
+        "range_nm",
+        "resolution_n",
+        "counts_per_n",
+        "counts_per_nm",
+    }
+)
+_SHORT = frozenset({"latency_s", "inertia_window_s", "shortest_delay_s", "delay_std_s"})
+
+
+def _config(file: Any, folder: Path) -> ForceConfig:
+    step_n = file.resolution_n
+    return ForceConfig(
+        kind=file.kind,
+        info=ForceInfo(
+            name=file.name or file.kind,
+            rate_hz=file.rate_hz,
+            noise_rms_n=file.noise_rms_n,
+            resolution_n=1 / file.counts_per_n if step_n is None else step_n,
+            range_n=file.range_n,
+            mount=file.mount,
+        ),
+        range_nm=file.range_nm,
+        mounting=Mounting(file.mount, file.frame, file.payload),
+        inertia_window_s=file.inertia_window_s,
+        latency_s=file.latency_s,
+        limits=file.limits,
+        can=file.can(folder) if file.kind == "can" else None,
+        topic=file.topic if file.kind == "topic" else "",
     )
-
-
-def _mounting(content: dict[str, Any], mount: Mount) -> Mounting:
-    part = section(content, "frame", "")
-    known_keys(part, {"position_m", "rotation_rad"}, "frame")
-    pose = Pose(
-        np.array(numbers(part.get("position_m"), "frame.position_m", 3)),
-        np.array(numbers(part.get("rotation_rad"), "frame.rotation_rad", 3)),
-    )
-    payload = None
-    if content.get("payload") is not None:
-        mass = section(content, "payload", "")
-        known_keys(mass, {"mass_kg", "centre_m"}, "payload")
-        centre = vector(numbers(mass.get("centre_m"), "payload.centre_m", 3))
-        payload = Payload(number(mass.get("mass_kg"), "payload.mass_kg"), centre)
-    return Mounting(mount, pose, payload)
-
-
-def _positive(content: dict[str, Any], name: str) -> float:
-    value = number(content.get(name), name)
-    require(value > 0, name, value, "a number above 0")
-    return value
-
-
-def _short(content: dict[str, Any], name: str) -> float:
-    value = number(content.get(name, 0.0), name)
-    require(0 <= value <= LONGEST_S, name, value, f"0 to {LONGEST_S:g} s")
-    return value

@@ -224,18 +224,19 @@ def test_before_its_start_nothing_is_read(make_source):
 
 def test_a_refused_setting_is_named(bench, make_source):
     description = bench.config().can.description
-    odd = replace(description.setup[0], name="filter 7", data=bytes([0x08, 7, 0]))
+    commands = description.commands
+    odd = replace(commands.setup[0], name="filter 7", data=bytes([0x08, 7, 0]))
+    source = make_source(description=replace(description, commands=replace(commands, setup=(odd,))))
     with pytest.raises(ForceError, match="filter 7: out of range") as caught:
-        make_source(description=replace(description, setup=(odd,))).start()
+        source.start()
     assert caught.value.fault is ForceFault.REFUSED
 
 
 def test_wrenches_that_pile_up_are_told_by_their_rate(bench, make_source):
     """A cell that sends half of what its configuration says looks to the driver like a slow interface."""
     description = bench.config().can.description
-    source = make_source(
-        description=replace(description, rates={1000: description.rates[500]}),
-    )
+    slow = replace(description.commands, rates={1000: description.commands.rates[500]})
+    source = make_source(description=replace(description, commands=slow))
     source.start()
     error, ticks = fault_of(bench, source)
     assert error.fault is ForceFault.INCOMPLETE
