@@ -168,14 +168,14 @@ def read_dataclass(cls: type[T], mapping: Any, where: str, **given: object) -> T
         If a key is unknown or missing, a value is not accepted, or the dataclass refuses it.
     """
     mapping = _mapping(mapping, where)
-    wanted = {name: kind for name, kind in _fields(cast(Any, cls)).items() if name not in given}
+    wanted = {key: of for key, of in _fields(cast(Any, cls)).items() if of[0] not in given}
     known_keys(mapping, set(wanted), where)
     values = dict(given)
-    for name, (kind, optional) in wanted.items():
-        if name in mapping:
-            values[name] = read(kind, mapping[name], join(where, name))
+    for key, (name, kind, optional) in wanted.items():
+        if key in mapping:
+            values[name] = read(kind, mapping[key], join(where, key))
         else:
-            require(optional, join(where, name), None, f"{accepted(kind)} (it is missing)")
+            require(optional, join(where, key), None, f"{accepted(kind)} (it is missing)")
     return build(cls, where, **values)
 
 
@@ -243,12 +243,19 @@ def _inside(where: str) -> str:
 
 
 @cache
-def _fields(cls: type) -> dict[str, tuple[Any, bool]]:
-    """Kind of each field of a dataclass, and whether it may be left out."""
+def _fields(cls: type) -> dict[str, tuple[str, Any, bool]]:
+    """By key: name and kind of each field of a dataclass, and whether it may be left out.
+
+    Names are keys, but for a last ``_`` that distinguishes them from Python's own words.
+    """
     hints = get_type_hints(cls, include_extras=True)
     nothing = dataclasses.MISSING
     return {
-        f.name: (hints[f.name], not (f.default is nothing and f.default_factory is nothing))
+        f.name.rstrip("_"): (
+            f.name,
+            hints[f.name],
+            f.default is not nothing or f.default_factory is not nothing,
+        )
         for f in dataclasses.fields(cls)
         if f.init
     }

@@ -7,20 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import (
-    known_keys,
-    number,
-    numbers,
-    read_dataclass,
-    read_yaml,
-    require,
-    section,
-)
+from tactile_resonance.fields import build, read_file, require
 from tactile_resonance.simulation.contact import HertzParameters
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -86,45 +77,46 @@ def read_tissues(path: Path | None = None) -> TissueLibrary:
         If the file cannot be read, or a field is missing, unknown or out of range.
     """
     path = share_path("config/tissues.yaml") if path is None else Path(path)
-    where = path.name
-    content = read_yaml(path)
-    known_keys(content, {"contact", "prony", "tissues"}, where)
-    contact = read_dataclass(
-        HertzParameters, section(content, "contact", where), f"{where}: contact"
-    )
-    prony = section(content, "prony", where)
-    known_keys(prony, {"fast_times_s", "slow_times_s"}, f"{where}: prony")
-    fast = numbers(prony.get("fast_times_s"), f"{where}: prony.fast_times_s")
-    slow = numbers(prony.get("slow_times_s"), f"{where}: prony.slow_times_s")
-    entries = section(content, "tissues", where)
+    file = read_file(_LibraryFile, path)
     tissues = {
-        str(name): _read_tissue(str(name), section(entries, name, f"{where}: tissues"), fast, slow)
-        for name in entries
+        name: build(entry.tissue, f"{path.name}: tissues.{name}", name, file.prony)
+        for name, entry in file.tissues.items()
     }
-    return TissueLibrary(contact, MappingProxyType(tissues))
+    return TissueLibrary(file.contact, MappingProxyType(tissues))
 
 
-def _read_tissue(
-    name: str, entry: Mapping[str, Any], fast: tuple[float, ...], slow: tuple[float, ...]
-) -> Tissue:
-    keys = {"label", "gelatine_percent", "relaxation_modulus_1s_pa", "fast_ratios", "slow_ratios"}
-    where = f"tissues.{name}"
-    known_keys(entry, keys, where)
-    percent = entry.get("gelatine_percent")
-    ratios = numbers(entry.get("fast_ratios"), f"{where}.fast_ratios", len(fast)) + numbers(
-        entry.get("slow_ratios"), f"{where}.slow_ratios", len(slow)
-    )
-    modulus = number(entry.get("relaxation_modulus_1s_pa"), f"{where}.relaxation_modulus_1s_pa")
-    try:
+@dataclass(frozen=True)
+class _Prony:
+    fast_times_s: tuple[float, ...]
+    slow_times_s: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _TissueFields:
+    relaxation_modulus_1s_pa: float
+    fast_ratios: tuple[float, ...]
+    slow_ratios: tuple[float, ...]
+    label: str | None = None
+    gelatine_percent: float | None = None
+
+    def tissue(self, name: str, prony: _Prony) -> Tissue:
+        for field, ratios, times in (
+            ("fast_ratios", self.fast_ratios, prony.fast_times_s),
+            ("slow_ratios", self.slow_ratios, prony.slow_times_s),
+        ):
+            require(len(ratios) == len(times), field, ratios, f"{len(times)} numbers")
         return Tissue(
             name=name,
-            relaxation_modulus_1s_pa=modulus,
-            prony_times_s=fast + slow,
-            prony_ratios=ratios,
-            label=str(entry.get("label", name)),
-            gelatine_percent=(
-                None if percent is None else number(percent, f"{where}.gelatine_percent")
-            ),
+            relaxation_modulus_1s_pa=self.relaxation_modulus_1s_pa,
+            prony_times_s=prony.fast_times_s + prony.slow_times_s,
+            prony_ratios=self.fast_ratios + self.slow_ratios,
+            label=name if self.label is None else self.label,
+            gelatine_percent=self.gelatine_percent,
         )
-    except ValueError as error:
-        raise ValueError(f"{where}.{error}") from error
+
+
+@dataclass(frozen=True)
+class _LibraryFile:
+    contact: HertzParameters
+    prony: _Prony
+    tissues: Mapping[str, _TissueFields]

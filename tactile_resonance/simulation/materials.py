@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_resonance.fields import known_keys, number, numbers, require, section
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.fields import build, require
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.shapes import Point
@@ -161,49 +162,76 @@ def geometric_mixture(first: Tissue, second: Tissue, share: float) -> Tissue:
     return mixture(first, second, share, low ** (1 - share) * high**share)
 
 
-def read_tissue(entry: Mapping[str, Any], library: TissueLibrary, where: str) -> Tissue:
-    """Read the one of ``tissue`` and ``gelatine_percent`` that `entry` has."""
-    given = [key for key in ("tissue", "gelatine_percent") if key in entry]
-    require(len(given) == 1, where, given, "exactly one of tissue, gelatine_percent")
-    try:
-        if given == ["tissue"]:
-            return library[str(entry["tissue"])]
-        return library.gelatine(number(entry["gelatine_percent"], "gelatine_percent"))
-    except ValueError as error:
-        raise ValueError(f"{where}.{error}") from error
+@dataclass(frozen=True, kw_only=True)
+class TissueEntry:
+    """Part of a file: a tissue by its name, or gelatine by its concentration [% w/w]."""
+
+    tissue: str | None = None
+    gelatine_percent: float | None = None
+
+    def tissue_of(self, library: TissueLibrary) -> Tissue:
+        """Return it; ``ValueError`` where neither or both are given, or the library has none such."""
+        name, percent = self.tissue, self.gelatine_percent
+        one = (name is None) != (percent is None)
+        require(one, "tissue", name, "exactly one of tissue, gelatine_percent")
+        return library.gelatine(percent) if percent is not None else library[str(name)]
 
 
-def read_material(entry: Mapping[str, Any], library: TissueLibrary, where: str) -> Material:
-    """Read ``tissue``, ``gelatine_percent`` or ``gradient``, and ``heterogeneity`` where given."""
-    material: Material
-    if "gradient" in entry:
-        both = [key for key in ("tissue", "gelatine_percent") if key in entry]
-        require(not both, where, both, "no tissue beside a gradient")
-        material = _read_gradient(section(entry, "gradient", where), library, f"{where}.gradient")
-    else:
-        material = Uniform(read_tissue(entry, library, where))
-    if "heterogeneity" not in entry:
-        return material
-    fields, where = section(entry, "heterogeneity", where), f"{where}.heterogeneity"
-    known_keys(fields, {"modulus_spread", "correlation_length_m", "seed"}, where)
-    seed = fields.get("seed", 0)
-    require(type(seed) is int, f"{where}.seed", seed, "an integer")
-    spread = number(fields.get("modulus_spread"), f"{where}.modulus_spread")
-    length = number(fields.get("correlation_length_m"), f"{where}.correlation_length_m")
-    try:
-        return Heterogeneous(material, RandomField(length, seed), spread)
-    except ValueError as error:
-        raise ValueError(f"{where}.{error}") from error
+@dataclass(frozen=True, kw_only=True)
+class GradientEntry:
+    """Part of a file: two tissues, and where they are."""
+
+    from_: TissueEntry
+    to: TissueEntry
+    start_m: Vector
+    end_m: Vector
+
+    def __post_init__(self) -> None:
+        apart = self.start_m != self.end_m
+        require(apart, "end_m", self.end_m, "a point other than start_m")
+
+    def gradient_of(self, library: TissueLibrary) -> Gradient:
+        """Return what lies there: gelatine between two of gelatine, else a mixture."""
+        first = build(self.from_.tissue_of, "from", library)
+        second = build(self.to.tissue_of, "to", library)
+        low, high = first.gelatine_percent, second.gelatine_percent
+
+        def between(share: float) -> Tissue:
+            if low is None or high is None:
+                return geometric_mixture(first, second, share)
+            return library.gelatine(low + share * (high - low))
+
+        return Gradient(self.start_m, self.end_m, between)
 
 
-def _read_gradient(fields: Mapping[str, Any], library: TissueLibrary, where: str) -> Gradient:
-    known_keys(fields, {"from", "to", "start_m", "end_m"}, where)
-    first = read_tissue(section(fields, "from", where), library, f"{where}.from")
-    second = read_tissue(section(fields, "to", where), library, f"{where}.to")
-    start, end = (numbers(fields.get(key), f"{where}.{key}", 3) for key in ("start_m", "end_m"))
-    require(start != end, f"{where}.end_m", end, "a point other than start_m")
-    low, high = first.gelatine_percent, second.gelatine_percent
-    if low is not None and high is not None:
-        span = high - low
-        return Gradient(start, end, lambda share: library.gelatine(low + share * span))
-    return Gradient(start, end, lambda share: geometric_mixture(first, second, share))
+@dataclass(frozen=True, kw_only=True)
+class HeterogeneityEntry:
+    """Part of a file: a random field; see `Heterogeneous`."""
+
+    modulus_spread: float
+    correlation_length_m: float
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FillingEntry(TissueEntry):
+    """Part of a file: what a region is filled with."""
+
+    gradient: GradientEntry | None = None
+    heterogeneity: HeterogeneityEntry | None = None
+
+    def material_of(self, library: TissueLibrary) -> Material:
+        """Return it; ``ValueError`` as `TissueEntry.tissue_of`."""
+        material: Material
+        if self.gradient is None:
+            material = Uniform(self.tissue_of(library))
+        else:
+            given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
+            require(not given, "gradient", given, "no tissue beside a gradient")
+            material = build(self.gradient.gradient_of, "gradient", library)
+        varying = self.heterogeneity
+        if varying is None:
+            return material
+        where = "heterogeneity"
+        field = build(RandomField, where, varying.correlation_length_m, varying.seed)
+        return build(Heterogeneous, where, material, field, varying.modulus_spread)

@@ -3,28 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import (
-    known_keys,
-    number,
-    read_dataclass,
-    read_yaml,
-    require,
-    section,
-)
+from tactile_resonance.fields import build, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
-from tactile_resonance.simulation.materials import Material, mixture, read_material, read_tissue
+from tactile_resonance.simulation.materials import FillingEntry, Material, TissueEntry, mixture
 from tactile_resonance.simulation.modal import FloatArray
-from tactile_resonance.simulation.shapes import SHAPES, Shape, read_shape
+from tactile_resonance.simulation.shapes import Shape, ShapeEntry
 from tactile_resonance.simulation.surface_motion import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
@@ -142,51 +134,57 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
         If the file cannot be read, or one of these fields is missing or wrong.
     """
     path = share_path("config/scenes/gelatine_phantoms.yaml") if path is None else Path(path)
-    content, where = read_yaml(path), path.name
-    entries = content.get("regions")
-    good = isinstance(entries, list) and len(entries) > 0
-    require(good, f"{where}: regions", entries, "a list of one region or more")
-    assert isinstance(entries, list)
-    buried = content.get("buried", [])
-    require(isinstance(buried, list), f"{where}: buried", buried, "a list")
-    force = number(content.get("force_n"), f"{where}: force_n")
-    require(force > 0, f"{where}: force_n", force, "a number above 0")
+    content, where = read_yaml(path), f"{path.name}:"
+    ours = {field.name: content[field.name] for field in fields(_BenchPart) if field.name in content}
+    file = read_dataclass(_BenchPart, ours, where)
     return PhantomScene(
-        name=str(content.get("name", path.stem)),
-        force_n=force,
+        name=path.stem if file.name is None else file.name,
+        force_n=file.force_n,
         regions=tuple(
-            _read_region(entry, library, f"{where}: regions[{i}]")
-            for i, entry in enumerate(entries)
+            build(entry.region, f"{where} regions[{i}]", library)
+            for i, entry in enumerate(file.regions)
         ),
         buried=tuple(
-            _read_buried(entry, library, f"{where}: buried[{i}]") for i, entry in enumerate(buried)
+            build(entry.buried, f"{where} buried[{i}]", library)
+            for i, entry in enumerate(file.buried)
         ),
-        motion=(
-            read_dataclass(SurfaceMotion, section(content, "motion", where), f"{where}: motion")
-            if "motion" in content
-            else None
-        ),
+        motion=file.motion,
         tip_radius_m=read_sensor().tip.radius_m,
         poisson_ratio=library.contact.poisson_ratio,
     )
 
 
-def _read_region(entry: object, library: TissueLibrary, where: str) -> Region:
-    require(isinstance(entry, Mapping), where, entry, "a mapping")
-    assert isinstance(entry, Mapping)
-    filling = {"tissue", "gelatine_percent", "gradient", "heterogeneity"}
-    known_keys(entry, {"name", *filling, *SHAPES}, where)
-    material = read_material(entry, library, where)
-    shape = read_shape(entry, where)
-    name = entry.get("name", entry.get("tissue"))
-    if name is None and "gelatine_percent" in entry:
-        name = f"gel{entry['gelatine_percent']:g}"
-    return Region(str("gradient" if name is None else name), shape, material)
+@dataclass(frozen=True, kw_only=True)
+class _RegionEntry(FillingEntry, ShapeEntry):
+    name: str | None = None
+
+    def region(self, library: TissueLibrary) -> Region:
+        percent = self.gelatine_percent
+        called = "gradient" if percent is None else f"gel{percent:g}"
+        name = self.name or self.tissue or called
+        return Region(name, self.shape(), self.material_of(library))
 
 
-def _read_buried(entry: object, library: TissueLibrary, where: str) -> Buried:
-    require(isinstance(entry, Mapping), where, entry, "a mapping")
-    assert isinstance(entry, Mapping)
-    known_keys(entry, {"name", "tissue", "gelatine_percent", "sphere", "box", "half_space"}, where)
-    tissue = read_tissue(entry, library, where)
-    return Buried(str(entry.get("name", tissue.name)), read_shape(entry, where), tissue)
+@dataclass(frozen=True, kw_only=True)
+class _BuriedEntry(TissueEntry, ShapeEntry):
+    name: str | None = None
+
+    def buried(self, library: TissueLibrary) -> Buried:
+        require(self.disc is None, "disc", self.disc, "sphere, box or half_space")
+        tissue = self.tissue_of(library)
+        return Buried(self.name or tissue.name, self.shape(), tissue)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _BenchPart:
+    """What a scene file has for the bench."""
+
+    name: str | None = None
+    force_n: float
+    regions: tuple[_RegionEntry, ...]
+    buried: tuple[_BuriedEntry, ...] = ()
+    motion: SurfaceMotion | None = None
+
+    def __post_init__(self) -> None:
+        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        require(bool(self.regions), "regions", [], "a list of one region or more")

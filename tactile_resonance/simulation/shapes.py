@@ -3,17 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.fields import known_keys, number, numbers, require, section
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.fields import require
 
 Point = tuple[float, ...]
-SHAPES = ("disc", "box", "half_space", "sphere")
 
 
 class Shape(Protocol):
@@ -28,8 +27,11 @@ class Shape(Protocol):
 class Disc:
     """A disc in x, y at any height: the surface of a round dish."""
 
-    center_m: Point
+    center_m: tuple[float, float]
     radius_m: float
+
+    def __post_init__(self) -> None:
+        require(self.radius_m > 0, "radius_m", self.radius_m, "a number above 0")
 
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the edge."""
@@ -43,6 +45,12 @@ class Box:
 
     low_m: Point
     high_m: Point
+
+    def __post_init__(self) -> None:
+        low, high = self.low_m, self.high_m
+        require(len(low) in (2, 3), "low_m", low, "2 or 3 coordinates")
+        above = len(high) == len(low) and all(a < b for a, b in zip(low, high, strict=True))
+        require(above, "high_m", high, f"above low_m = {low} in every coordinate")
 
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the faces."""
@@ -58,6 +66,11 @@ class HalfSpace:
     point_m: Point
     normal: Point
 
+    def __post_init__(self) -> None:
+        require(len(self.point_m) in (2, 3), "point_m", self.point_m, "2 or 3 coordinates")
+        good = len(self.normal) == len(self.point_m) and any(self.normal)
+        require(good, "normal", self.normal, "a vector other than 0, of as many coordinates")
+
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie on the side the normal points away from."""
         position = _coordinates(position_m, len(self.normal))
@@ -68,8 +81,11 @@ class HalfSpace:
 class Sphere:
     """A ball; positions without a height are taken at height 0."""
 
-    center_m: Point
+    center_m: Vector
     radius_m: float
+
+    def __post_init__(self) -> None:
+        require(self.radius_m > 0, "radius_m", self.radius_m, "a number above 0")
 
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the surface."""
@@ -86,47 +102,19 @@ def _coordinates(position_m: NDArray[np.float64], count: int) -> NDArray[np.floa
     return np.concatenate([position_m, np.zeros((*position_m.shape[:-1], missing))], axis=-1)
 
 
-def read_shape(entry: Mapping[str, Any], where: str) -> Shape:
-    """Read the one shape among the fields of `entry`.
+@dataclass(frozen=True, kw_only=True)
+class ShapeEntry:
+    """Part of a file: one shape."""
 
-    Raises
-    ------
-    ValueError
-        If there is none, or more than one, or a field of it is wrong.
-    """
-    forms = [key for key in entry if key in SHAPES]
-    require(len(forms) == 1, where, forms, f"exactly one of {sorted(SHAPES)}")
-    form = forms[0]
-    return _read(form, section(entry, form, where), f"{where}.{form}")
+    disc: Disc | None = None
+    box: Box | None = None
+    half_space: HalfSpace | None = None
+    sphere: Sphere | None = None
 
-
-def _read(form: str, fields: Mapping[str, Any], where: str) -> Shape:
-    def point(key: str, *counts: int) -> Point:
-        value = numbers(fields.get(key), f"{where}.{key}")
-        accepted = " or ".join(str(count) for count in counts)
-        require(len(value) in counts, f"{where}.{key}", value, f"{accepted} coordinates")
-        return value
-
-    def radius() -> float:
-        value = number(fields.get("radius_m"), f"{where}.radius_m")
-        require(value > 0, f"{where}.radius_m", value, "a number above 0")
-        return value
-
-    if form == "disc":
-        known_keys(fields, {"center_m", "radius_m"}, where)
-        return Disc(point("center_m", 2), radius())
-    if form == "sphere":
-        known_keys(fields, {"center_m", "radius_m"}, where)
-        return Sphere(point("center_m", 3), radius())
-    if form == "box":
-        known_keys(fields, {"low_m", "high_m"}, where)
-        low = point("low_m", 2, 3)
-        high = point("high_m", len(low))
-        ordered = all(a < b for a, b in zip(low, high, strict=True))
-        require(ordered, f"{where}.high_m", high, f"above low_m = {low} in every coordinate")
-        return Box(low, high)
-    known_keys(fields, {"point_m", "normal"}, where)
-    origin = point("point_m", 2, 3)
-    normal = point("normal", len(origin))
-    require(any(normal), f"{where}.normal", normal, "a vector other than 0")
-    return HalfSpace(origin, normal)
+    def shape(self) -> Shape:
+        """Return the one that is given; ``ValueError`` if there is none, or more than one."""
+        names = ("disc", "box", "half_space", "sphere")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        require(len(given) == 1, "shape", list(given), f"exactly one of {', '.join(names)}")
+        (shape,) = given.values()
+        return shape
