@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.configuration import share_path
@@ -23,6 +22,7 @@ from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import TouchRequest
+from tactile_resonance.strict_yaml import dump_yaml
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
         changes["positions"] = {"list": poses[:, :3].tolist()}
     content = {**content, **changes}
     scene = replace(parse_scan_scene(content, path), frame_id=frame_id)
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    text = dump_yaml(content)
     if goal.scene and not changes:
         text = path.read_text(encoding="utf-8")
     if len(poses):

@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import known_keys, number, numbers, require, section
+from tactile_resonance.fields import build, number, numbers, one_of, require
 
 FloatArray = npt.NDArray[np.float64]
-FORMS = ("grid", "spiral", "list", "around", "region")
-ORDERS = ("serpentine", "raster")
+Pair = tuple[float, float]
+Order = Literal["serpentine", "raster"]
 MOST_POINTS = 100_000
 FARTHEST_M = 10.0
 """From the origin of its frame: out of the reach of any arm that carries the sensor."""
@@ -85,9 +86,8 @@ def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     ValueError
         If it is none of the known patterns, or a field of it is wrong.
     """
-    known_keys(fields, set(FORMS), where)
-    require(len(fields) == 1, where, sorted(fields), f"exactly one of {', '.join(FORMS)}")
-    positions = _read_form(fields, where)
+    form, pattern = one_of(_FORMS, fields, where)
+    positions = pattern if form == "list" else build(pattern.positions, f"{where}.{form}")
     require_near(positions, where)
     return positions
 
@@ -98,44 +98,6 @@ def require_near(positions_m: FloatArray, where: str) -> None:
     if far.size:
         accepted = f"within {FARTHEST_M:g} m of the frame's origin"
         require(False, f"{where}[{far[0]}]", positions_m[far[0]].tolist(), accepted)
-
-
-def _read_form(fields: Mapping[str, Any], where: str) -> FloatArray:
-    form = next(iter(fields))
-    if form == "list":
-        return read_list(fields["list"], f"{where}.list")
-    content, where = section(fields, form, where), f"{where}.{form}"
-    if form == "around":
-        known_keys(content, {"centres_m", "offsets_m"}, where)
-        centres, offsets = (
-            read_list(content.get(key), f"{where}.{key}") for key in ("centres_m", "offsets_m")
-        )
-        _check_count(float(len(centres)) * len(offsets), f"{where}.offsets_m")
-        return (centres[:, None] + offsets).reshape(-1, 3)  # centre by centre
-    if form == "spiral":
-        known_keys(content, {"center_m", "radius_m", "spacing_m"}, where)
-        center = numbers(content.get("center_m"), f"{where}.center_m", 2)
-        return _flat(
-            spiral(center, _positive(content, "radius_m", where), _spacing(content, where)[0])
-        )
-    order = content.get("order", ORDERS[0])
-    require(order in ORDERS, f"{where}.order", order, f"one of {', '.join(ORDERS)}")
-    if form == "grid":
-        known_keys(content, {"center_m", "size_m", "spacing_m", "order"}, where)
-        center = numbers(content.get("center_m"), f"{where}.center_m", 2)
-        size = numbers(content.get("size_m"), f"{where}.size_m", 2)
-        require(min(size) >= 0, f"{where}.size_m", size, "numbers of 0 or above")
-        return _flat(grid(center, size, _spacing(content, where), order))
-    known_keys(content, {"polygon_m", "spacing_m", "order"}, where)
-    polygon = read_list(content.get("polygon_m"), f"{where}.polygon_m")[:, :2]
-    require(len(polygon) >= 3, f"{where}.polygon_m", len(polygon), "three corners or more")
-    low, high = polygon.min(axis=0), polygon.max(axis=0)
-    whole = grid((low + high) / 2, high - low, _spacing(content, where), order)
-    kept = whole[inside_polygon(whole, polygon)]
-    require(
-        len(kept) > 0, f"{where}.spacing_m", content.get("spacing_m"), "fine enough for a point"
-    )
-    return _flat(kept)
 
 
 def read_list(value: object, where: str) -> FloatArray:
@@ -151,25 +113,73 @@ def read_list(value: object, where: str) -> FloatArray:
     return positions
 
 
+def _read_spacing(value: object, where: str) -> Pair:
+    """Along x and y; one number is both."""
+    both = isinstance(value, (list, tuple))
+    x, y = numbers(value, where, 2) if both else (number(value, where),) * 2
+    require(min(x, y) > 0, where, value, "a number above 0, or two")
+    return x, y
+
+
 def _flat(xy_m: FloatArray) -> FloatArray:
     return np.concatenate([xy_m, np.full((len(xy_m), 1), np.nan)], axis=1)
 
 
-def _positive(content: Mapping[str, Any], key: str, where: str) -> float:
-    value = number(content.get(key), f"{where}.{key}")
-    require(value > 0, f"{where}.{key}", value, "a number above 0")
-    return value
-
-
-def _spacing(content: Mapping[str, Any], where: str) -> tuple[float, float]:
-    value = content.get("spacing_m")
-    if isinstance(value, list):
-        pair = numbers(value, f"{where}.spacing_m", 2)
-        require(min(pair) > 0, f"{where}.spacing_m", value, "numbers above 0")
-        return pair[0], pair[1]
-    spacing = _positive(content, "spacing_m", where)
-    return spacing, spacing
-
-
 def _check_count(count: float, where: str = "spacing_m") -> None:
     require(count <= MOST_POINTS, where, f"{count:.3g} points", f"at most {MOST_POINTS} points")
+
+
+Spacing = Annotated[Pair, _read_spacing]
+Places = Annotated[FloatArray, read_list]
+
+
+@dataclass(frozen=True)
+class _Grid:
+    center_m: Pair
+    size_m: Pair
+    spacing_m: Spacing
+    order: Order = "serpentine"
+
+    def positions(self) -> FloatArray:
+        require(min(self.size_m) >= 0, "size_m", self.size_m, "numbers of 0 or above")
+        return _flat(grid(self.center_m, self.size_m, self.spacing_m, self.order))
+
+
+@dataclass(frozen=True)
+class _Spiral:
+    center_m: Pair
+    radius_m: float
+    spacing_m: Spacing
+
+    def positions(self) -> FloatArray:
+        require(self.radius_m > 0, "radius_m", self.radius_m, "a number above 0")
+        return _flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Around:
+    centres_m: Places
+    offsets_m: Places
+
+    def positions(self) -> FloatArray:
+        _check_count(float(len(self.centres_m)) * len(self.offsets_m), "offsets_m")
+        return (self.centres_m[:, None] + self.offsets_m).reshape(-1, 3)  # centre by centre
+
+
+@dataclass(frozen=True, eq=False)
+class _Region:
+    polygon_m: Places
+    spacing_m: Spacing
+    order: Order = "serpentine"
+
+    def positions(self) -> FloatArray:
+        polygon = self.polygon_m[:, :2]
+        require(len(polygon) >= 3, "polygon_m", len(polygon), "three corners or more")
+        low, high = polygon.min(axis=0), polygon.max(axis=0)
+        whole = grid((low + high) / 2, high - low, self.spacing_m, self.order)
+        kept = whole[inside_polygon(whole, polygon)]
+        require(len(kept) > 0, "spacing_m", self.spacing_m, "fine enough for a point")
+        return _flat(kept)
+
+
+_FORMS = {"grid": _Grid, "spiral": _Spiral, "list": Places, "around": _Around, "region": _Region}

@@ -67,7 +67,7 @@ def prepare(
     facts: dict[str, Any] = {}
     heading_rad, surface = scene.sensor.heading_rad, scene.surface
     if isinstance(surface, TouchRequest):
-        force_n, count = surface.force_n or scene.force_n, len(surface.xy_m)
+        force_n, count = surface.force_n or scene.force_n, len(surface.points_m)
         try:
             found = find_surface(
                 surface, ball_radius_m, heading_rad, lambda point: find(point, force_n, count)

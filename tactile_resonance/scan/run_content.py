@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from tactile_resonance.fields import read_dataclass
 from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
 from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -82,7 +83,8 @@ def read_run(path: Path) -> RunContent:
             raise ValueError(f"its format is not {FORMAT!r}")
         scene = (path / "scene.yaml").read_text(encoding="utf-8")
         points = tuple(
-            ScanPoint.from_json(point, f"points[{i}]") for i, point in enumerate(content["points"])
+            read_dataclass(ScanPoint, point, f"points[{i}]")
+            for i, point in enumerate(content["points"])
         )
         facts = content["facts"]
     except (OSError, ValueError, KeyError, TypeError) as error:

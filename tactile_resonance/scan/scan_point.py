@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from tactile_resonance.fields import known_keys, number, numbers, require
+from tactile_resonance.fields import require
 
 
 @dataclass(frozen=True)
@@ -37,32 +37,15 @@ class ScanPoint:
     label: str = ""
     height_std_m: float = 0.0
 
+    def __post_init__(self) -> None:
+        require(self.index >= 0, "index", self.index, "0 or above")
+
     def as_json(self) -> dict[str, Any]:
-        """Plain values; `from_json` takes them back without loss."""
+        """Plain values; `fields.read_dataclass` takes them back without loss."""
         return {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self).items()
         }
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any], where: str) -> ScanPoint:
-        """Point of `as_json`; ValueError that names what is wrong."""
-        known_keys(content, {field.name for field in fields(cls)}, where)
-        index = content.get("index")
-        require(type(index) is int and index >= 0, f"{where}.index", index, "0 or above")
-        assert isinstance(index, int)
-
-        def vector(name: str, count: int) -> Any:
-            return numbers(content.get(name), f"{where}.{name}", count)
-
-        return cls(
-            index,
-            vector("position_m", 3),
-            vector("normal", 3),
-            vector("orientation_xyzw", 4),
-            str(content.get("label", "")),
-            number(content.get("height_std_m", 0.0), f"{where}.height_std_m"),
-        )
 
 
 @dataclass(frozen=True)

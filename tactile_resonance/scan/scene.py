@@ -9,25 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
+    build,
     known_keys,
-    number,
+    read,
     read_dataclass,
     read_yaml,
     require,
     section,
 )
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.notes import Notes, read_notes
+from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.patterns import read_positions
 from tactile_resonance.scan.surface import (
     NormalRequest,
@@ -44,16 +45,8 @@ from tactile_resonance.tissue.references import (
     read_classes,
 )
 
-E = TypeVar("E", bound=Enum)
-
 # Of the simulated bench: what lies on its table, and how it moves.
 BENCH_KEYS = {"regions", "buried", "motion"}
-_KEYS = {
-    *("name", "frame_id", "force_n", "hold", "sensor", "surface", "positions"),
-    *("outputs", "precision", "blocks", "tissue_classes", "nominal_contact", "on_failure"),
-    *("gate", "time_limits", "drift_limits", "notes", "normals"),
-    *BENCH_KEYS,
-}
 
 
 class Hold(str, Enum):
@@ -222,6 +215,15 @@ class ScanScene:
     normals: NormalRequest | None = None
     notes: Notes = field(default_factory=Notes)
 
+    def __post_init__(self) -> None:
+        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")
+        if self.nominal_contact is not None:
+            nominal_n = self.nominal_contact.force_n
+            good = 0.1 <= nominal_n / self.force_n <= 10
+            accepted = f"a tenth to ten times force_n, {self.force_n:g}"
+            require(good, "nominal_contact.force_n", nominal_n, accepted)
+
 
 def read_scan_scene(path: Path) -> ScanScene:
     """Read a scene file; everything a scan needs has a default but the positions and the force.
@@ -249,105 +251,61 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     ValueError
         One line that names the field, its value and what is accepted.
     """
-    where = path.name
-    for key, value in content.items():
-        require(key in _KEYS, f"{where}: {key}", value, f"one of {sorted(_KEYS)}")
-    force_n = number(content.get("force_n"), f"{where}: force_n")
-    require(force_n > 0, f"{where}: force_n", force_n, "a number above 0")
-    frame_id = content.get("frame_id", "table")
-    good = isinstance(frame_id, str) and bool(frame_id)
-    require(good, f"{where}: frame_id", frame_id, "the name of a frame")
-    classes, nominal = _read_tissues(content, path)
-    if nominal is not None:
-        good = 0.1 <= nominal.force_n / force_n <= 10
-        accepted = f"a tenth to ten times force_n, {force_n:g}"
-        require(good, f"{where}: nominal_contact.force_n", nominal.force_n, accepted)
-    outputs = _read_outputs(content, where)
-    surface: Surface | TouchRequest = Plane()
+    where = f"{path.name}:"
+    keys = {item.name for item in fields(ScanScene)} - {"positions_m"} | {"positions"}
+    known_keys(content, keys | BENCH_KEYS, where)
+    given: dict[str, Any] = {
+        "positions_m": read_positions(section(content, "positions", where), f"{where} positions")
+    }
+    given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, path, where)
+    if "precision" in content:
+        classes = given["tissue_classes"]
+        given["precision"] = _read_precision(content["precision"], classes, f"{where} precision")
     if "surface" in content:
-        surface = read_surface(section(content, "surface", where), path.parent, f"{where}: surface")
-    return ScanScene(
-        name=str(content.get("name", path.stem)),
-        force_n=force_n,
-        positions_m=read_positions(section(content, "positions", where), f"{where}: positions"),
-        frame_id=frame_id,
-        hold=_choice(content, "hold", Hold.FORCE, where),
-        sensor=_part(SensorUse, content, "sensor", where),
-        surface=surface,
-        outputs=outputs,
-        precision=_read_precision(content, classes, where),
-        blocks=_part(BlockLimits, content, "blocks", where),
-        gate=_part(Gate, content, "gate", where) if "gate" in content else None,
-        tissue_classes=classes,
-        nominal_contact=nominal,
-        on_failure=_choice(content, "on_failure", OnFailure.CONTINUE, where),
-        time_limits=_part(TimeLimits, content, "time_limits", where),
-        drift_limits=_part(DriftLimits, content, "drift_limits", where),
-        normals=_part(NormalRequest, content, "normals", where) if "normals" in content else None,
-        notes=read_notes(section({"notes": {}, **content}, "notes", where), f"{where}: notes"),
-    )
-
-
-def _read_outputs(content: Mapping[str, Any], where: str) -> tuple[Output, ...]:
-    names = content.get("outputs", ["poles", "map"])
-    accepted = [output.value for output in Output]
-    good = isinstance(names, list) and len(names) > 0 and all(n in accepted for n in names)
-    require(good, f"{where}: outputs", names, f"a list out of {', '.join(accepted)}")
-    assert isinstance(names, list)
-    return tuple(output for output in Output if output.value in names)
+        surface = section(content, "surface", where)
+        given["surface"] = read_surface(surface, path.parent, f"{where} surface")
+    if "outputs" in content:
+        wanted = read(tuple[Output, ...], content["outputs"], f"{where} outputs")
+        require(bool(wanted), f"{where} outputs", [], "a list of one output or more")
+        given["outputs"] = tuple(output for output in Output if output in wanted)
+    handled = {*given, "positions", *BENCH_KEYS}
+    rest = {key: value for key, value in content.items() if key not in handled}
+    return read_dataclass(ScanScene, {"name": path.stem, **rest}, where, **given)
 
 
 def _read_tissues(
-    content: Mapping[str, Any], path: Path
+    content: Mapping[str, Any], path: Path, where: str
 ) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
     """Classes and the contact to which they refer: given in place, or in a file beside the scene."""
-    given, where = content.get("tissue_classes"), path.name
-    if isinstance(given, str):
-        good = "nominal_contact" not in content
-        require(
-            good, f"{where}: nominal_contact", "one", f"none: it belongs to the classes, in {given}"
-        )
-        return read_classes(path.parent / given)
+    classes = content.get("tissue_classes")
+    if isinstance(classes, str):
+        alone = "nominal_contact" not in content
+        accepted = f"none: it belongs to the classes, in {classes}"
+        require(alone, f"{where} nominal_contact", "one", accepted)
+        return read_classes(path.parent / classes)
     nominal = parse_nominal_contact(content, where)
-    if given is None:
+    if classes is None:
         accepted = "classes, to which nominal_contact belongs (they are missing)"
-        require(nominal is None, f"{where}: tissue_classes", None, accepted)
+        require(nominal is None, f"{where} tissue_classes", None, accepted)
         return (), None
-    return parse_classes(given, f"{where}: tissue_classes"), nominal
+    return parse_classes(classes, f"{where} tissue_classes"), nominal
+
+
+@dataclass(frozen=True)
+class _Separate:
+    separate: tuple[str, str]
+    probability: float
 
 
 def _read_precision(
-    content: Mapping[str, Any], classes: tuple[TissueClass, ...], where: str
-) -> Precise | Separate | None:
-    if "precision" not in content:
-        return None
-    fields = section(content, "precision", where)
-    where = f"{where}: precision"
-    try:
-        if "separate" not in fields:
-            known_keys(fields, {"f0_std_hz", "damping_ratio_std"}, where)
-            require(
-                len(fields) > 0, where, dict(fields), "f0_std_hz, damping_ratio_std or separate"
-            )
-            wanted = {key: number(value, f"{where}.{key}") for key, value in fields.items()}
-            return Precise(**wanted)
-        known_keys(fields, {"separate", "probability"}, where)
-        names, by_name = fields["separate"], {c.name: c for c in classes}
-        good = isinstance(names, list) and len(names) == 2 and all(n in by_name for n in names)
-        require(good, f"{where}.separate", names, f"two out of tissue_classes: {sorted(by_name)}")
-        probability = number(fields.get("probability"), f"{where}.probability")
-        return Separate(by_name[names[0]], by_name[names[1]], probability)
-    except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
-
-
-def _part(cls: type, content: Mapping[str, Any], key: str, where: str) -> Any:
-    return read_dataclass(cls, section({key: {}, **content}, key, where), f"{where}: {key}")
-
-
-def _choice(content: Mapping[str, Any], key: str, default: E, where: str) -> E:
-    value = content.get(key, default.value)
-    accepted = {item.value: item for item in type(default)}
-    require(value in accepted, f"{where}: {key}", value, f"one of {', '.join(accepted)}")
-    return accepted[value]
+    value: object, classes: tuple[TissueClass, ...], where: str
+) -> Precise | Separate:
+    if not (isinstance(value, Mapping) and "separate" in value):
+        require(bool(value), where, value, "f0_std_hz, damping_ratio_std or separate")
+        return read_dataclass(Precise, value, where)
+    wanted, by_name = read_dataclass(_Separate, value, where), {c.name: c for c in classes}
+    good = all(name in by_name for name in wanted.separate)
+    accepted = f"two out of tissue_classes: {sorted(by_name)}"
+    require(good, f"{where}.separate", wanted.separate, accepted)
+    first, second = (by_name[name] for name in wanted.separate)
+    return build(Separate, where, first, second, wanted.probability)

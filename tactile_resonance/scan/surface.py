@@ -3,22 +3,24 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
-from tactile_resonance.fields import known_keys, number, numbers, require, section
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.fields import build, one_of, read, require
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
-FORMS = ("plane", "height_field", "mesh", "touch")
 MOST_SEARCH_M = 0.02
 
 
@@ -145,7 +147,7 @@ class TouchRequest:
 
     Attributes
     ----------
-    xy_m : tuple of (x, y)
+    points_m : tuple of (x, y)
         Where to touch [m].
     form : str
         plane or quadric.
@@ -160,12 +162,20 @@ class TouchRequest:
         above in steps; 0: as far as one contact searches.
     """
 
-    xy_m: tuple[tuple[float, float], ...]
-    form: str
+    points_m: tuple[tuple[float, float], ...]
+    form: Literal["plane", "quadric"] = "plane"
     expected_height_m: float = 0.0
     force_n: float | None = None
     tolerance_m: float = 2e-4
     search_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        least, given = 3 if self.form == "plane" else 6, len(self.points_m)
+        require(given >= least, "points_m", given, f"{least} positions or more for a {self.form}")
+        force_n, tolerance_m = self.force_n, self.tolerance_m
+        require(force_n is None or force_n > 0, "force_n", force_n, "a number above 0")
+        require(tolerance_m > 0, "tolerance_m", tolerance_m, "a number above 0")
+        check_search(self.search_m, "search_m")
 
 
 @dataclass(frozen=True)
@@ -217,67 +227,67 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
     ValueError
         If it is none of the known forms, or a field or file of it is wrong.
     """
-    known_keys(fields, set(FORMS), where)
-    require(len(fields) == 1, where, sorted(fields), f"exactly one of {', '.join(FORMS)}")
-    form = next(iter(fields))
-    content, where = section(fields, form, where), f"{where}.{form}"
-    try:
-        if form == "plane":
-            known_keys(content, {"point_m", "normal"}, where)
-            point = numbers(content.get("point_m", (0.0, 0.0, 0.0)), f"{where}.point_m", 3)
-            normal = numbers(content.get("normal", (0.0, 0.0, 1.0)), f"{where}.normal", 3)
-            return Plane(point, normal)  # type: ignore[arg-type]
-        if form == "height_field":
-            return _read_height_field(content, folder, where)
-        if form == "mesh":
-            known_keys(content, {"file", "unit_m"}, where)
-            unit_m = number(content.get("unit_m"), f"{where}.unit_m")
-            require(unit_m > 0, f"{where}.unit_m", unit_m, "above 0: metres per unit of the file")
-            return TriangleMesh.from_triangles(read_stl(_file(content, folder, where)) * unit_m)
-        return _read_touch(content, where)
-    except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
+    form, entry = one_of(_FORMS, fields, where)
+    if form == "touch":
+        return entry
+    return build(entry.surface, f"{where}.{form}", folder)
 
 
-def _read_height_field(content: Mapping[str, Any], folder: Path, where: str) -> HeightField:
-    if "file" in content:
-        known_keys(content, {"file"}, where)
-        path = _file(content, folder, where)
+@dataclass(frozen=True)
+class _Plane:
+    point_m: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+
+    def surface(self, _: Path) -> Surface:
+        return Plane(self.point_m, self.normal)
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    file: str
+    unit_m: float
+
+    def surface(self, folder: Path) -> Surface:
+        require(self.unit_m > 0, "unit_m", self.unit_m, "above 0: metres per unit of the file")
+        return TriangleMesh.from_triangles(read_stl(folder / self.file) * self.unit_m)
+
+
+@dataclass(frozen=True)
+class _HeightFile:
+    file: str
+
+    def surface(self, folder: Path) -> Surface:
+        path = folder / self.file
         try:
             with np.load(path, allow_pickle=False) as archive:
                 axes = [np.asarray(archive[name], float) for name in ("x_m", "y_m", "z_m")]
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(
-                f"file: got {str(path)!r}; accepted is an .npz with x_m, y_m, z_m ({error})"
-            ) from error
+        except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile, zlib.error) as error:
+            accepted = f"an .npz with x_m, y_m, z_m ({error})"
+            raise ValueError(f"file: got {str(path)!r}; accepted is {accepted}") from error
         return HeightField(*axes)
-    known_keys(content, {"x_m", "y_m", "z_m"}, where)
-    x_m, y_m = (np.array(numbers(content.get(k), f"{where}.{k}")) for k in ("x_m", "y_m"))
-    rows = content.get("z_m")
-    good = isinstance(rows, list) and len(rows) == x_m.size
-    require(good, f"{where}.z_m", rows, f"{x_m.size} rows, one per x")
-    assert isinstance(rows, list)
-    z_m = [numbers(row, f"{where}.z_m[{i}]", y_m.size) for i, row in enumerate(rows)]
-    return HeightField(x_m, y_m, np.array(z_m))
 
 
-def _read_touch(content: Mapping[str, Any], where: str) -> TouchRequest:
-    options = ("expected_height_m", "force_n", "tolerance_m", "search_m")
-    known_keys(content, {"points_m", "form", *options}, where)
-    form = content.get("form", "plane")
-    require(form in ("plane", "quadric"), f"{where}.form", form, "plane or quadric")
-    points = content.get("points_m")
-    least = 3 if form == "plane" else 6
-    good = isinstance(points, list) and len(points) >= least
-    require(good, f"{where}.points_m", points, f"{least} positions or more for a {form}")
-    assert isinstance(points, list)
-    read = [numbers(point, f"{where}.points_m[{i}]", 2) for i, point in enumerate(points)]
-    given = {key: number(content[key], f"{where}.{key}") for key in options if key in content}
-    for key in ("force_n", "tolerance_m"):
-        require(given.get(key, 1.0) > 0, f"{where}.{key}", given.get(key), "a number above 0")
-    check_search(given.get("search_m", 0.0), f"{where}.search_m")
-    return TouchRequest(tuple((x, y) for x, y in read), form, **given)
+@dataclass(frozen=True, eq=False)
+class _Heights:
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+
+    def surface(self, _: Path) -> Surface:
+        return HeightField(self.x_m, self.y_m, self.z_m)
+
+
+def _read_heights(value: object, where: str) -> _HeightFile | _Heights:
+    filed = isinstance(value, Mapping) and "file" in value
+    return read(_HeightFile if filed else _Heights, value, where)
+
+
+_FORMS = {
+    "plane": _Plane,
+    "height_field": Annotated[Any, _read_heights],
+    "mesh": _Mesh,
+    "touch": TouchRequest,
+}
 
 
 def check_search(search_m: float, field: str) -> None:
@@ -286,8 +296,3 @@ def check_search(search_m: float, field: str) -> None:
     require(0 <= search_m <= MOST_SEARCH_M, field, search_m, accepted)
 
 
-def _file(content: Mapping[str, Any], folder: Path, where: str) -> Path:
-    name = content.get("file")
-    require(isinstance(name, str) and bool(name), f"{where}.file", name, "the name of a file")
-    assert isinstance(name, str)
-    return folder / name

@@ -86,7 +86,7 @@ def find_surface(
     """
     turn = tuple(tip_orientation(UP, heading_rad).tolist())
     touches: list[Touch] = []
-    for index, (x, y) in enumerate(request.xy_m):
+    for index, (x, y) in enumerate(request.points_m):
         height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
         label = f"surface, touch {index + 1}"
         search_m = request.search_m if len(touches) < 3 else 0.0
@@ -100,7 +100,7 @@ def find_surface(
     worst = int(np.argmax(np.abs(found.surface.residuals_m)))
     off = float(found.surface.residuals_m[worst])
     if abs(off) > request.tolerance_m:
-        x, y = request.xy_m[worst]
+        x, y = request.points_m[worst]
         raise ValueError(
             f"the touch at x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm lies {1e3 * off:+.2f} mm off "
             f"the {request.form} through all; accepted are {1e3 * request.tolerance_m:g} mm (tolerance_m). "

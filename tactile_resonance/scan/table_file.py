@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
-from tactile_resonance.fields import numbers, read_yaml, require
+from tactile_resonance.contact.vectors import Six, Vector
+from tactile_resonance.fields import read_dataclass, read_yaml, require
+from tactile_resonance.strict_yaml import dump_yaml
 
 if TYPE_CHECKING:  # a launch file needs no fit
     from tactile_resonance.scan.table_calibration import CalibrationRequest, TableCalibration
@@ -54,7 +55,7 @@ def as_text(made: TableCalibration, request: CalibrationRequest, known: Mapping[
         "sensor": request.sensor,
         "touches": touches,  # in the frame of the table as it was known
     }
-    return _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    return _HEADER + dump_yaml(content)
 
 
 def read_table(path: Path, base_frame: str) -> list[float]:
@@ -68,17 +69,20 @@ def read_table(path: Path, base_frame: str) -> list[float]:
     content = read_yaml(path)
     form = content.get("format")
     require(form == FORMAT, f"{path}: format", form, f"{FORMAT!r}, as calibrate_table writes it")
-    table = numbers(content.get("table_in_base"), f"{path}: table_in_base", 6)
-    covariance = content.get("covariance")
-    good = isinstance(covariance, list) and len(covariance) == len(ORDER)
-    require(good, f"{path}: covariance", covariance, f"{len(ORDER)} rows, of {', '.join(ORDER)}")
-    assert isinstance(covariance, list)
-    for index, row in enumerate(covariance):
-        field = f"{path}: covariance[{index}]"
-        variance = numbers(row, field, len(ORDER))[index]
-        require(variance > 0, f"{field}[{index}]", variance, "a variance above 0")
-    base = content.get("base_frame")
-    require(
-        base == base_frame, f"{path}: base_frame", base, f"{base_frame!r}, the robot's base here"
-    )
-    return list(table)
+    read = {item.name: content.get(item.name) for item in fields(_Table)}  # the rest is for people
+    table = read_dataclass(_Table, read, f"{path}:")
+    accepted = f"{base_frame!r}, the robot's base here"
+    require(table.base_frame == base_frame, f"{path}: base_frame", table.base_frame, accepted)
+    return list(table.table_in_base)
+
+
+@dataclass(frozen=True)
+class _Table:
+    table_in_base: Six
+    covariance: tuple[Vector, Vector, Vector]
+    base_frame: str
+
+    def __post_init__(self) -> None:
+        for index, row in enumerate(self.covariance):
+            name = f"covariance[{index}][{index}]"
+            require(row[index] > 0, name, row[index], "a variance above 0")

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import (
+    build,
+    join,
     known_keys,
-    number,
+    read,
     read_dataclass,
     read_yaml,
     require,
-    section,
 )
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples
 from tactile_resonance.tissue.nominal_contact import (
@@ -27,9 +28,87 @@ from tactile_resonance.tissue.nominal_contact import (
 )
 
 FloatArray = npt.NDArray[np.float64]
-_MEASURED = ("f0_hz", "damping_ratio", "f0_std_hz", "damping_ratio_std")
-_CONTACT = {field.name for field in dataclasses.fields(NominalContact)} - {"sensitivity"}
-_SENSITIVITY = ("f0_hz_per_n", "damping_ratio_per_n", "f0_std_hz_per_n", "damping_ratio_std_per_n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Point:
+    """Part of a file: f0 and damping ratio, and their spread."""
+
+    f0_hz: float
+    damping_ratio: float
+    f0_std_hz: float
+    damping_ratio_std: float
+    correlation: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.f0_hz > 0, "f0_hz", self.f0_hz, "a number above 0")
+        damping = self.damping_ratio
+        require(0 < damping < 1, "damping_ratio", damping, "a number above 0, below 1")
+        _check_spread(self, "f0_std_hz", "damping_ratio_std")
+
+    @property
+    def estimate(self) -> FloatArray:
+        """(2,) f0 [Hz] and damping ratio."""
+        return np.array([self.f0_hz, self.damping_ratio])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(2, 2)."""
+        return _covariance(self.f0_std_hz, self.damping_ratio_std, self.correlation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Class(_Point):
+    """Part of a file: a class by its mean and spread."""
+
+    prior: float = 1.0
+
+    def named(self, name: str) -> TissueClass:
+        return TissueClass(name, self.estimate, self.covariance, prior=self.prior)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Samples:
+    """Part of a file: a class by points that were measured."""
+
+    points: FloatArray
+    prior: float = 1.0
+
+    def named(self, name: str) -> TissueClass:
+        return class_from_samples(name, self.points, self.prior)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Preload(_Point):
+    """Part of a file: a point that was measured under a force."""
+
+    force_n: float
+    force_std_n: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        require(self.force_std_n >= 0, "force_std_n", self.force_std_n, "a number of 0 or above")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sensitivity:
+    """Part of a file: how poles change with the force."""
+
+    f0_hz_per_n: float
+    damping_ratio_per_n: float
+    f0_std_hz_per_n: float
+    damping_ratio_std_per_n: float
+    correlation: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_spread(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
+
+    @property
+    def sensitivity(self) -> ForceSensitivity:
+        stds = self.f0_std_hz_per_n, self.damping_ratio_std_per_n
+        per_n = np.array([self.f0_hz_per_n, self.damping_ratio_per_n])
+        return ForceSensitivity(per_n, _covariance(*stds, self.correlation))
 
 
 def read_classes(path: Path) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
@@ -40,9 +119,9 @@ def read_classes(path: Path) -> tuple[tuple[TissueClass, ...], NominalContact | 
     ValueError
         If the file or a field of it is wrong.
     """
-    content, name = read_yaml(Path(path)), Path(path).name
-    classes = parse_classes(content.get("tissue_classes"), f"{name}: tissue_classes")
-    return classes, parse_nominal_contact(content, name)
+    content, where = read_yaml(Path(path)), f"{Path(path).name}:"
+    classes = parse_classes(content.get("tissue_classes"), f"{where} tissue_classes")
+    return classes, parse_nominal_contact(content, where)
 
 
 def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:
@@ -56,10 +135,9 @@ def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:
     ValueError
         If a field is missing or wrong.
     """
-    good = isinstance(content, Mapping) and len(content) > 0
-    require(good, where, content, "a mapping of class names")
-    assert isinstance(content, Mapping)
-    return tuple(_read_class(str(name), section(content, name, where), where) for name in content)
+    entries: dict[str, Any] = read(dict[str, Any], content, where)
+    require(bool(entries), where, content, "a mapping of class names")
+    return tuple(_read_class(name, entries[name], join(where, name)) for name in entries)
 
 
 def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalContact | None:
@@ -77,82 +155,49 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
     """
     if "nominal_contact" not in content:
         return None
-    where = f"{where}: nominal_contact"
-    good = isinstance(content["nominal_contact"], Mapping)
-    require(good, where, content["nominal_contact"], "a mapping")
-    fields = dict(content["nominal_contact"])
-    known_keys(fields, {*_CONTACT, *_SENSITIVITY, "correlation", "preloads"}, where)
-    try:
-        if "preloads" in fields:
-            beside = sorted({*_SENSITIVITY, "correlation"} & set(fields))
-            require(not beside, where, beside, "none of these beside preloads")
-            nominal_n = number(fields.get("force_n"), f"{where}.force_n")
-            sensitivity = _preloads(fields.pop("preloads"), nominal_n, where)
-        else:
-            f0, damping, f0_std, damping_std, correlation = _numbers_of(fields, _SENSITIVITY, where)
-            for key in (*_SENSITIVITY, "correlation"):
-                fields.pop(key, None)
-            spread = _covariance(f0_std, damping_std, correlation)
-            sensitivity = ForceSensitivity(np.array([f0, damping]), spread)
-        return read_dataclass(NominalContact, fields, where, sensitivity=sensitivity)
-    except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error
+    where = f"{where} nominal_contact"
+    entries = read(dict[str, Any], content["nominal_contact"], where)
+    own, direct = ({item.name for item in fields(kind)} for kind in (NominalContact, _Sensitivity))
+    known_keys(entries, own - {"sensitivity"} | direct | {"preloads"}, where)
+    rest = {key: value for key, value in entries.items() if key in own}
+    how = {key: value for key, value in entries.items() if key in direct}
+    if "preloads" in entries:
+        require(not how, where, sorted(how), "none of these beside preloads")
+        nominal_n = read(float, entries.get("force_n"), f"{where}.force_n")
+        at = f"{where}.preloads"
+        sensitivity = build(
+            _between, at, read(tuple[_Preload, _Preload], entries["preloads"], at), nominal_n
+        )
+    else:
+        sensitivity = read_dataclass(_Sensitivity, how, where).sensitivity
+    return read_dataclass(NominalContact, rest, where, sensitivity=sensitivity)
 
 
-def _preloads(rows: object, nominal_n: float, where: str) -> ForceSensitivity:
-    where = f"{where}.preloads"
-    good = isinstance(rows, list) and len(rows) == 2 and all(isinstance(r, Mapping) for r in rows)
-    require(good, where, rows, "a list of two points")
-    assert isinstance(rows, list)
-    keys = ("force_n", "force_std_n", *_MEASURED)
-    values = []
-    for index, row in enumerate(rows):
-        known_keys(row, {*keys, "correlation"}, f"{where}[{index}]")
-        values.append(_numbers_of(row, keys, f"{where}[{index}]"))
-    force_n, force_std_n, f0, damping, f0_std, damping_std, correlation = np.transpose(values)
-    covariances = [_covariance(*row) for row in zip(f0_std, damping_std, correlation, strict=True)]
-    good = 0 < force_n.min() <= nominal_n <= force_n.max()
-    accepted = f"forces above 0 on either side of the nominal one, {nominal_n:g}"
-    require(good, f"{where}.force_n", force_n.tolist(), accepted)
-    estimates = np.transpose([f0, damping])
-    try:
-        return sensitivity_of_preloads(estimates, covariances, force_n, force_std_n)
-    except ValueError as error:
-        raise ValueError(f"{where}.{error}") from error
+def _between(preloads: tuple[_Preload, _Preload], nominal_n: float) -> ForceSensitivity:
+    forces_n = [preload.force_n for preload in preloads]
+    accepted = f"forces on either side of the nominal one, {nominal_n:g}"
+    require(min(forces_n) <= nominal_n <= max(forces_n), "force_n", forces_n, accepted)
+    return sensitivity_of_preloads(
+        [preload.estimate for preload in preloads],
+        [preload.covariance for preload in preloads],
+        forces_n,
+        [preload.force_std_n for preload in preloads],
+    )
 
 
-def _numbers_of(fields: Mapping[str, Any], keys: Sequence[str], where: str) -> list[float]:
-    """Values of these fields, and of ``correlation``; standard deviations are checked."""
-    for key in keys:
-        require(key in fields, f"{where}.{key}", None, "a number (it is missing)")
-    values = [number(fields[key], f"{where}.{key}") for key in keys]
-    for key, value in zip(keys, values, strict=True):
-        require("std" not in key or value >= 0, f"{where}.{key}", value, "a number of 0 or above")
-        good = key not in ("f0_hz", "damping_ratio") or value > 0
-        require(good, f"{where}.{key}", value, "a number above 0")
-        require(key != "damping_ratio" or value < 1, f"{where}.{key}", value, "below 1")
-    correlation = number(fields.get("correlation", 0.0), f"{where}.correlation")
-    require(-1 <= correlation <= 1, f"{where}.correlation", correlation, "-1 to 1")
-    return [*values, correlation]
+def _read_class(name: str, entry: object, where: str) -> TissueClass:
+    kind = _Samples if isinstance(entry, Mapping) and "points" in entry else _Class
+    return build(read(kind, entry, where).named, where, name)
+
+
+def _check_spread(entry: object, *stds: str) -> None:
+    for name in stds:
+        value = getattr(entry, name)
+        require(value >= 0, name, value, "a number of 0 or above")
+    correlation = entry.correlation  # type: ignore[attr-defined]
+    require(-1 <= correlation <= 1, "correlation", correlation, "-1 to 1")
 
 
 def _covariance(first_std: float, second_std: float, correlation: float) -> FloatArray:
     std = np.array([first_std, second_std])
     return np.outer(std, std) * np.array([[1, correlation], [correlation, 1]])
-
-
-def _read_class(name: str, fields: Mapping, where: str) -> TissueClass:
-    where = f"{where}.{name}"
-    prior = number(fields.get("prior", 1.0), f"{where}.prior")
-    try:
-        if "points" in fields:
-            known_keys(fields, {"points", "prior"}, where)
-            return class_from_samples(name, np.array(fields["points"], float), prior)
-        known_keys(fields, {*_MEASURED, "correlation", "prior"}, where)
-        f0, damping, f0_std, damping_std, correlation = _numbers_of(fields, _MEASURED, where)
-        spread = _covariance(f0_std, damping_std, correlation)
-        return TissueClass(name, np.array([f0, damping]), spread, prior=prior)
-    except (ValueError, TypeError) as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(where) else f"{where}.{text}") from error

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.fields import read_dataclass
 from tactile_resonance.multisine import Grid
 from tactile_resonance.scan.measurement import SensorRange, design_measurement
 from tactile_resonance.scan.patterns import grid, inside_polygon, read_positions, spiral
@@ -113,7 +114,7 @@ def test_points_lie_on_the_surface_in_order():
         [[0.01, 0, 0.102], [0.02, 0, 0.104], [0, 0.03, 0.1]],
     )
     for p in plan.points:
-        assert ScanPoint.from_json(p.as_json(), "points") == p
+        assert read_dataclass(ScanPoint, p.as_json(), "points") == p
     # a height that is given wins
     given = make_plan(scene([[0.01, 0, 0.5]], surface=surface))
     assert given.points[0].position_m == (0.01, 0.0, 0.5)
@@ -133,7 +134,7 @@ def test_points_beside_or_too_steep_are_skipped_and_say_what_that_saves():
     with pytest.raises(ValueError, match="1 beside the surface and 0 too steep"):
         make_plan(scene([[1.0, 0]], surface=surface))
     with pytest.raises(ValueError, match="found by touch"):
-        make_plan(scene([[0, 0]], surface=TouchRequest(((0, 0),), "plane")))
+        make_plan(scene([[0, 0]], surface=TouchRequest(((0, 0), (1, 0), (0, 1)))))
 
 
 def test_time_adds_up():

@@ -303,7 +303,7 @@ def test_a_scene_gives_the_sensitivity_by_two_preloads_or_in_numbers():
         for force, x in ((f, poles(force_n=f)) for f in (9e-3, 11e-3))
     ]
     content = {"nominal_contact": {"force_n": FORCE_N, "age_s": AGE_S, "preloads": rows}}
-    measured = parse_nominal_contact(content, "scene.yaml")
+    measured = parse_nominal_contact(content, "scene.yaml:")
     np.testing.assert_allclose(measured.sensitivity.per_n, slope(), rtol=0.02)
     f0_std, damping_std = np.sqrt(np.diag(measured.sensitivity.covariance))
     given = {
@@ -315,7 +315,7 @@ def test_a_scene_gives_the_sensitivity_by_two_preloads_or_in_numbers():
         "damping_ratio_std_per_n": float(damping_std),
         "correlation": float(measured.sensitivity.covariance[0, 1] / f0_std / damping_std),
     }
-    same = parse_nominal_contact({"nominal_contact": given}, "scene.yaml").sensitivity
+    same = parse_nominal_contact({"nominal_contact": given}, "scene.yaml:").sensitivity
     np.testing.assert_allclose(same.covariance, measured.sensitivity.covariance, rtol=1e-9)
 
 
@@ -351,22 +351,22 @@ GIVEN = {
         ({"preload": []}, "nominal_contact.preload: got []"),
         (
             {"preloads": [{}]},
-            "nominal_contact.preloads: got [{}]; accepted is a list of two points",
+            "nominal_contact.preloads: got [{}]; accepted is a list of 2 entries",
         ),
-        ({"preloads": [{}, {}]}, "nominal_contact.preloads[0].force_n: got None"),
+        ({"preloads": [{}, {}]}, "nominal_contact.preloads[0].f0_hz: got None"),
         (
             {"preloads": [], "correlation": 0.0},
             "nominal_contact: got ['correlation']; accepted is none of these beside preloads",
         ),
         (
             {"preloads": preloads(0.011, 0.012)},
-            "nominal_contact.preloads.force_n: got [0.011, 0.012]; accepted is forces above 0 on either side",
+            "nominal_contact.preloads.force_n: got [0.011, 0.012]; accepted is forces on either side",
         ),
     ],
 )
 def test_what_is_wrong_in_it_is_named(changes, message):
     given = {"force_n": 0.01, "age_s": 2.0} if "preloads" in changes else GIVEN
     with pytest.raises(ValueError, match="nominal_contact") as error:
-        parse_nominal_contact({"nominal_contact": given | changes}, "scene.yaml")
+        parse_nominal_contact({"nominal_contact": given | changes}, "scene.yaml:")
     assert str(error.value).startswith(f"scene.yaml: {message}")
     assert str(error.value).count("nominal_contact") == 1
