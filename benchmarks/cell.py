@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.processor import cpu_s
 from tactile_resonance.contact.interfaces import ForceError
 from tactile_resonance.drivers.can_wrench import CanWrench
-from tactile_resonance.drivers.force_config import ForceConfig, read_force_config
+from tactile_resonance.drivers.force_config import CanForce, read_force_config
 
 HOST = "127.0.6.5"
 LOOP_S = 0.002
@@ -64,9 +64,9 @@ def run(output: Path, quick: bool) -> str:
     cell = Cell()
     try:
         config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-        assert config.can is not None
-        bus = {**config.can.bus, "host": HOST, "port": cell.port}
-        config = replace(config, can=replace(config.can, bus=bus))
+        assert isinstance(config, CanForce)
+        bus = {**config.bus, "host": HOST, "port": cell.port}
+        config = replace(config, bus=bus)
         text = _stream(config, cell, seconds) + _faults(config, cell, repeats)
     finally:
         cell.end()
@@ -74,7 +74,7 @@ def run(output: Path, quick: bool) -> str:
     return text
 
 
-def _stream(config: ForceConfig, cell: Cell, seconds: float) -> str:
+def _stream(config: CanForce, cell: Cell, seconds: float) -> str:
     # a stalled machine is measured here, not called a fault
     source = CanWrench(replace(config, limits=replace(config.limits, silent_s=1.0)))
     source.start()
@@ -116,7 +116,7 @@ socketcand on loopback by a loop of 500 Hz. Simulated: nothing here was measured
 """
 
 
-def _faults(config: ForceConfig, cell: Cell, repeats: int) -> str:
+def _faults(config: CanForce, cell: Cell, repeats: int) -> str:
     rows = [
         "From the line that makes the cell faulty to the error in the loop of 500 Hz "
         f"({repeats} times each):\n",

@@ -30,7 +30,7 @@ from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.force_config import read_force_config
+from tactile_resonance.drivers.force_config import CanForce, read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
@@ -101,9 +101,9 @@ def _connected() -> Iterator[ContactLoop]:
         )
     )
     config = read_force_config(Path("can_simulated.yaml"))
-    assert config.can is not None
-    bus = {**config.can.bus, "host": HOST}
-    config = replace(config, can=replace(config.can, bus=bus))
+    assert isinstance(config, CanForce)
+    bus = {**config.bus, "host": HOST}
+    config = replace(config, bus=bus)
     force = force_source(config, arm.state, arm_clock_std_s=lambda: arm.clock_uncertainty_s)
     try:
         arm.connect()

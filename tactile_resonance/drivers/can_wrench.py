@@ -18,7 +18,7 @@ from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceIn
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import Bus, Flow, Frame, SocketcandBus, one_line, open_bus
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, CellCommand
-from tactile_resonance.drivers.force_config import ForceConfig
+from tactile_resonance.drivers.force_config import CanForce
 
 ANSWER_WITHIN_S = 0.25
 """Of a cell, on this machine's clock; of a simulated one on a machine that may be slow:"""
@@ -35,8 +35,7 @@ class CanWrench:
 
     Parameters
     ----------
-    config : ForceConfig
-        Of kind can.
+    config : CanForce
     clock : Clock or None
         On which wrenches are dated; this machine's where it is not given.
 
@@ -46,15 +45,13 @@ class CanWrench:
         Wrenches since `start`.
     """
 
-    def __init__(self, config: ForceConfig, clock: Clock | None = None) -> None:
-        if config.can is None:
-            raise ValueError(f"kind: {config.kind!r}, expected can")
-        self._config, self._can = config, config.can
+    def __init__(self, config: CanForce, clock: Clock | None = None) -> None:
+        self._config = config
         self.clock: Clock = WallClock() if clock is None else clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._bus: Bus | None = None
         self._fault: ForceError | None = None
-        self._scale = [tuple(map(float, row)) for row in config.can.scale]
+        self._scale = [tuple(map(float, row)) for row in config.scale]
         diagonal = [row[k] for k, row in enumerate(self._scale)]
         crosstalk = sum(map(abs, sum(self._scale, ()))) > sum(map(abs, diagonal))
         self._diagonal = None if crosstalk else diagonal
@@ -96,12 +93,12 @@ class CanWrench:
     def _open(self) -> None:
         self._checks.restart()
         self._begin()
-        info, description = self._config.info, self._can.description
+        info, description = self._config.info, self._config.description
         request, commands = None, description.commands
         if commands.request is not None:
             request = (commands.id, commands.request, description.extended_ids, 1 / info.rate_hz)
         look_s = self._config.limits.silent_s / 2
-        self._bus = open_bus(self._can.bus, self._where, request, look_s)
+        self._bus = open_bus(self._config.bus, self._where, request, look_s)
         try:
             self._set_up(self._bus)
         except (can.CanError, OSError) as error:
@@ -149,7 +146,7 @@ class CanWrench:
         if bus is None:
             return
         with contextlib.suppress(can.CanError, OSError):
-            stop = self._can.description.commands.stop
+            stop = self._config.description.commands.stop
             if stop is not None and self._fault is None:
                 self._send(bus, stop)
         with contextlib.suppress(can.CanError, OSError):
@@ -159,13 +156,13 @@ class CanWrench:
 
     @property
     def _where(self) -> str:
-        bus = self._can.bus
+        bus = self._config.bus
         address = ":".join(str(bus[key]) for key in ("host", "port", "channel") if key in bus)
         return f"{self._config.info.name} on {bus['interface']} {address}"
 
     def _begin(self) -> None:
         """Nothing has come yet."""
-        self._tracker = ClockTracker(self._can.shortest_delay_s, self._can.delay_std_s)
+        self._tracker = ClockTracker(self._config.shortest_delay_s, self._config.delay_std_s)
         self._stamp_before_ns = 0
         self._assembler = self._new_assembler()
         self._ahead: list[Frame] = []  # taken from the bus, not yet looked at
@@ -174,25 +171,25 @@ class CanWrench:
 
     def _new_assembler(self) -> Assembler:
         # times of arrival scatter by more than a period: there only the order pairs frames
-        adapter = self._can.stamps == "adapter"
+        adapter = self._config.stamps == "adapter"
         within_s = 0.5 / self._config.info.rate_hz if adapter else math.inf
-        return Assembler(self._can.description.frame_ids, within_s)
+        return Assembler(self._config.description.frame_ids, within_s)
 
     def _clock_uncertainty_s(self) -> float:
-        if self._can.stamps == "arrival":
-            return self._can.delay_std_s
+        if self._config.stamps == "arrival":
+            return self._config.delay_std_s
         try:
             return self._tracker.relation().uncertainty_s
         except ValueError:
             return float("nan")
 
     def _send(self, bus: Bus, data: bytes) -> None:
-        description = self._can.description
+        description = self._config.description
         bus.send(description.commands.id, data, description.extended_ids)
 
     def _set_up(self, bus: Bus) -> None:
         """Stop the cell, set it, start it."""
-        commands, simulated = self._can.description.commands, self.clock.simulated
+        commands, simulated = self._config.description.commands, self.clock.simulated
         within_s = SIMULATED_WITHIN_S if simulated else ANSWER_WITHIN_S
         if commands.stop is not None:
             self._send(bus, commands.stop)
@@ -222,7 +219,7 @@ class CanWrench:
                 raise ForceError(ForceFault.SILENT, f"{self._where}: sends no wrench")
 
     def _await_reply(self, bus: Bus, command: CellCommand, within_s: float) -> None:
-        reply = self._can.description.commands.reply
+        reply = self._config.description.commands.reply
         assert reply is not None
         assembler = self._new_assembler()
         deadline_s = time.monotonic() + within_s
@@ -242,7 +239,7 @@ class CanWrench:
         frames = self._ahead + bus.read()
         self._ahead = []
         samples: list[CellSample] = []
-        silent_s, stamped = self._config.limits.silent_s, self._can.stamps == "adapter"
+        silent_s, stamped = self._config.limits.silent_s, self._config.stamps == "adapter"
         for frame in frames:
             if frame.error:
                 raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
@@ -266,7 +263,7 @@ class CanWrench:
             if not held_up or self._excused:
                 raise self._silence(bus, now_s - self._last_s)
             self._last_s, self._excused = now_s, True
-        streams = self._can.description.commands.request is None
+        streams = self._config.description.commands.request is None
         if streams and self._flow.short(now_s, self.received + self.lost):
             text = f"{self._flow.rate_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
             raise ForceError(
@@ -276,7 +273,7 @@ class CanWrench:
 
     def _silence(self, bus: Bus, since_s: float) -> ForceError:
         """Whether the cell or the link is silent: on a dead link two sends fail."""
-        stop = self._can.description.commands.stop
+        stop = self._config.description.commands.stop
         text = f"{self._where}: silent for {since_s * 1e3:.0f} ms"
         if stop is not None:
             try:
@@ -293,7 +290,7 @@ class CanWrench:
         whole = self._assembler.add(frame.can_id, frame.data, frame.stamp_s)
         if self._assembler.lost > lost:
             self._checks.lost()
-        decoded = None if whole is None else self._can.description.decode(whole)
+        decoded = None if whole is None else self._config.description.decode(whole)
         if decoded is None:
             return None
         counts, full_scale = decoded
@@ -310,7 +307,7 @@ class CanWrench:
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
         """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
-        description = self._can.description
+        description = self._config.description
         return (
             frame.can_id in description.frame_ids
             and frame.extended == description.extended_ids
@@ -320,8 +317,8 @@ class CanWrench:
 
     def _stamp_ns(self, frame: Frame) -> int:
         arrival_ns = self.clock.now_ns() if self.clock.simulated else frame.arrival_ns
-        if self._can.stamps == "arrival":
-            delay_s = self._can.shortest_delay_s + self._config.latency_s
+        if self._config.stamps == "arrival":
+            delay_s = self._config.shortest_delay_s + self._config.latency_s
             # those that were taken together came one after the other
             stamp_ns = max(arrival_ns - round(delay_s * 1e9), self._stamp_before_ns + 1)
             self._stamp_before_ns = stamp_ns

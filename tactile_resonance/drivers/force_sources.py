@@ -9,7 +9,7 @@ from tactile_resonance.clock import Clock
 from tactile_resonance.contact.interfaces import Cell
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_force import TipForce
-from tactile_resonance.drivers.force_config import ForceConfig
+from tactile_resonance.drivers.force_config import CanForce, ForceConfig, TopicForce
 from tactile_resonance.drivers.rtde_wrench import RtdeWrench
 
 
@@ -19,7 +19,7 @@ def force_source(
     *,
     clock: Clock | None = None,
     arm_clock_std_s: Callable[[], float] | None = None,
-    topic: Callable[[ForceConfig], Cell] | None = None,
+    topic: Callable[[TopicForce], Cell] | None = None,
 ) -> TipForce:
     """Make the source; nothing is opened before its `start`.
 
@@ -41,13 +41,13 @@ def force_source(
         If python-can is not installed, or a topic is asked for outside of a node.
     """
     cell: Cell
-    if config.kind == "can":
+    if isinstance(config, CanForce):
         try:
             from tactile_resonance.drivers.can_wrench import CanWrench
         except ImportError as error:
             raise ValueError("kind: can needs python-can: pip install python-can") from error
         cell = CanWrench(config, clock)
-    elif config.kind == "rtde":
+    elif not isinstance(config, TopicForce):
         cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
     elif topic is None:
         raise ValueError("kind: topic is for nodes only")

@@ -12,7 +12,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.interfaces import NodeArm
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
-from tactile_resonance.drivers.force_config import read_force_config
+from tactile_resonance.drivers.force_config import CanForce, read_force_config
 from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.twist_config import TwistConfig, read_twist_config
 from tactile_resonance.drivers.ur_arm import UrArm
@@ -181,9 +181,9 @@ def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
     silent_s = config.limits.silent_s + stalls_s
     config = replace(config, limits=replace(config.limits, silent_s=silent_s))
     if host:
-        if config.can is None:
+        if not isinstance(config, CanForce):
             raise ValueError(f"force_host: {host!r}, expected empty for a force source without CAN")
-        config = replace(config, can=replace(config.can, bus={**config.can.bus, "host": host}))
+        config = replace(config, bus={**config.bus, "host": host})
     if config.kind == "topic" and node.time_server:
         raise ValueError(
             f"force_config: {name!r} is a topic, accepted in simulated time is a cell on CAN"

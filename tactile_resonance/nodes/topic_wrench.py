@@ -13,7 +13,7 @@ from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
-from tactile_resonance.drivers.force_config import ForceConfig
+from tactile_resonance.drivers.force_config import TopicForce
 from tactile_resonance.nodes.lockstep import Arrivals
 from tactile_resonance.nodes.running import SERIES
 from tactile_resonance.recording.messages import time_from_message
@@ -31,14 +31,14 @@ class TopicWrench:
     Parameters
     ----------
     node : Node
-    config : ForceConfig
+    config : TopicForce
         Of kind topic.
     clock : Clock
         On which wrenches are dated and silence is judged; stamps of messages are ROS time. Stamps of simulated
         time are those of its bench, and not judged.
     """
 
-    def __init__(self, node: Node, config: ForceConfig, clock: Clock | None = None) -> None:
+    def __init__(self, node: Node, config: TopicForce, clock: Clock | None = None) -> None:
         if config.kind != "topic":
             raise ValueError(f"kind: {config.kind!r}, expected topic")
         self._node, self._config = node, config

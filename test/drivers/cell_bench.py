@@ -20,8 +20,8 @@ STEP_NS = round(SAMPLE_PERIOD_S * 1e9)
 def cell_config(host, port, **changes):
     """The shipped configuration of a simulated cell, at another address."""
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-    bus = {**config.can.bus, "host": host, "port": port}
-    return replace(config, can=replace(config.can, **{"bus": bus, **changes}))
+    bus = {**config.bus, "host": host, "port": port}
+    return replace(config, **{"bus": bus, **changes})
 
 
 class CellBench:

@@ -73,7 +73,7 @@ def driver_on(bus, monkeypatch):
     return CanWrench(
         replace(
             config,
-            can=replace(config.can, bus={"interface": "busy", "channel": "0"}),
+            bus={"interface": "busy", "channel": "0"},
             limits=replace(config.limits, silent_s=0.3),
         ),
         clock=bus,

@@ -223,7 +223,7 @@ def test_before_its_start_nothing_is_read(make_source):
 
 
 def test_a_refused_setting_is_named(bench, make_source):
-    description = bench.config().can.description
+    description = bench.config().description
     commands = description.commands
     odd = replace(commands.setup[0], name="filter 7", data=bytes([0x08, 7, 0]))
     source = make_source(description=replace(description, commands=replace(commands, setup=(odd,))))
@@ -234,7 +234,7 @@ def test_a_refused_setting_is_named(bench, make_source):
 
 def test_wrenches_that_pile_up_are_told_by_their_rate(bench, make_source):
     """A cell that sends half of what its configuration says looks to the driver like a slow interface."""
-    description = bench.config().can.description
+    description = bench.config().description
     slow = replace(description.commands, rates={1000: description.commands.rates[500]})
     source = make_source(description=replace(description, commands=slow))
     source.start()
@@ -271,15 +271,12 @@ def test_another_make_of_cell_is_a_description(tmp_path):
     base = read_force_config(Path("can_simulated.yaml"))
     config = replace(
         base,
-        info=replace(base.info, rate_hz=500.0),
+        rate_hz=500.0,
         limits=replace(base.limits, stuck_samples=10**6),
-        can=replace(
-            base.can,
-            bus={"interface": "virtual", "channel": "polled"},
-            description=read_can_description(path),
-            scale=matrix,
-            stamps="arrival",
-        ),
+        bus={"interface": "virtual", "channel": "polled"},
+        description=read_can_description(path),
+        **{"counts_per_n": None, "counts_per_nm": None, "matrix": matrix, "resolution_n": 1e-3},
+        stamps="arrival",
     )
     gauges = np.array([100, -200, 300, -40, 50, 60])
     ended = threading.Event()

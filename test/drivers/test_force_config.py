@@ -17,8 +17,8 @@ def test_the_simulated_cell_serves_1_cn():
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
     assert config.info.resolution_n == pytest.approx(2e-4)
     assert config.info.mount is Mount.TABLE
-    assert config.can.bus["tcp_tune"] is True
-    np.testing.assert_allclose(np.diag(config.can.scale), [2e-4] * 3 + [1e-5] * 3)
+    assert config.bus["tcp_tune"] is True
+    np.testing.assert_allclose(np.diag(config.scale), [2e-4] * 3 + [1e-5] * 3)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_description_beside_the_configuration_is_found(tmp_path):
     (tmp_path / "other.yaml").write_text(frames.replace("0x001", "0x011"), encoding="utf-8")
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({**content, "frames": "other.yaml"}), encoding="utf-8")
-    assert read_force_config(path).can.description.frame_ids == (0x11, 0x02)
+    assert read_force_config(path).description.frame_ids == (0x11, 0x02)
 
 
 def test_no_such_file():

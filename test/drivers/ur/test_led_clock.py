@@ -38,8 +38,8 @@ def arm(robot, start_arm):
 def cell(robot):
     """The cell under the tissue."""
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-    bus = {**config.can.bus, "host": robot.host}
-    made = CanWrench(replace(config, can=replace(config.can, bus=bus)))
+    bus = {**config.bus, "host": robot.host}
+    made = CanWrench(replace(config, bus=bus))
     yield made
     made.close()
 
