@@ -10,6 +10,7 @@ arrays of numbers, each of these or None, and ``Annotated[KIND, read_it]``: ``re
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import stat
 import sys
@@ -51,6 +52,27 @@ def require(condition: bool, field: str, value: object, accepted: str) -> None:
     """Raise ``ValueError`` naming field, value and what is accepted, unless `condition` holds."""
     if not condition:
         raise ValueError(f"{field}: got {cut(_SHOWN.repr(value))}; accepted is {accepted}")
+
+
+def within(owner: object, **ranges: tuple[float, float]) -> None:
+    """`require` each named number of a dataclass to be in its range, ends included; None passes."""
+    for name, (low, high) in ranges.items():
+        value = getattr(owner, name)
+        require(value is None or low <= value <= high, name, value, f"{low:g} to {high:g}")
+
+
+def above_zero(owner: object, *names: str) -> None:
+    """`require` each named number of a dataclass to be above 0 and finite; None passes."""
+    for name in names:
+        value = getattr(owner, name)
+        require(value is None or 0 < value < math.inf, name, value, "a number above 0")
+
+
+def not_negative(owner: object, *names: str) -> None:
+    """`require` each named number of a dataclass to be 0 or above and finite; None passes."""
+    for name in names:
+        value = getattr(owner, name)
+        require(value is None or 0 <= value < math.inf, name, value, "a number, 0 or above")
 
 
 def cut(text: str) -> str:

@@ -10,13 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import read_file, require
-
-
-def _positive(owner: object, *names: str) -> None:
-    for name in names:
-        value = getattr(owner, name)
-        require(0.0 < value < float("inf"), name, value, "a number above 0")
+from tactile_resonance.fields import above_zero, not_negative, read_file, require, within
 
 
 @dataclass(frozen=True)
@@ -37,7 +31,7 @@ class BeamParameters:
     mode_count: int
 
     def __post_init__(self) -> None:
-        _positive(
+        above_zero(
             self, "free_length_m", "width_m", "piezo_thickness_m", "shim_thickness_m",
             "piezo_modulus_pa", "shim_modulus_pa", "piezo_density_kg_per_m3",
             "shim_density_kg_per_m3", "relative_permittivity_t33",
@@ -45,7 +39,7 @@ class BeamParameters:
         require(self.d31_m_per_v != 0.0, "d31_m_per_v", self.d31_m_per_v, "a number other than 0")
         zeta = self.modal_damping_ratio
         require(0.0 < zeta < 1.0, "modal_damping_ratio", zeta, "above 0 and below 1")
-        require(1 <= self.mode_count <= 40, "mode_count", self.mode_count, "1 to 40")
+        within(self, mode_count=(1, 40))
 
 
 @dataclass(frozen=True)
@@ -56,8 +50,8 @@ class TipParameters:
     mass_kg: float
 
     def __post_init__(self) -> None:
-        _positive(self, "radius_m")
-        require(self.mass_kg >= 0.0, "mass_kg", self.mass_kg, "0 or above")
+        above_zero(self, "radius_m")
+        not_negative(self, "mass_kg")
 
 
 @dataclass(frozen=True)
@@ -68,7 +62,7 @@ class ElectricParameters:
     feedthrough: float
 
     def __post_init__(self) -> None:
-        _positive(self, "input_resistance_ohm")
+        above_zero(self, "input_resistance_ohm")
         require(0.0 < self.feedthrough < 1.0, "feedthrough", self.feedthrough, "above 0, below 1")
 
 
@@ -97,9 +91,9 @@ class AcquisitionParameters:
     actuator_divider: float = 1.0
 
     def __post_init__(self) -> None:
-        require(self.sensor_noise_v >= 0.0, "sensor_noise_v", self.sensor_noise_v, "0 or above")
-        _positive(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
-        require(8 <= self.adc_bits <= 31, "adc_bits", self.adc_bits, "8 to 31")
+        not_negative(self, "sensor_noise_v")
+        above_zero(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
+        within(self, adc_bits=(8, 31))
 
     def noise_rms_v(self, sample_rate_hz: float) -> float:
         """Return the rms of the sensor noise [V] in the full band of a sample rate."""

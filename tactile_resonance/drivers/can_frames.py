@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 from tactile_resonance.configuration import shared_file
-from tactile_resonance.fields import read, read_file, require
+from tactile_resonance.fields import above_zero, read, read_file, require, within
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
@@ -69,9 +69,7 @@ class Reply:
     errors: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("result_byte", "good", "error_byte"):
-            value = getattr(self, name)
-            require(0 <= value <= 255, name, value, "an integer from 0 to 255")
+        within(self, result_byte=(0, 255), good=(0, 255), error_byte=(0, 255))
 
 
 @dataclass(frozen=True)
@@ -165,8 +163,7 @@ class CanDescription:
         if self.overload is not None:
             name = self.overload.field
             require(name in self.fields, "overload.field", name, "one of fields")
-        counts = self.full_scale_counts
-        require(counts is None or counts > 0, "full_scale_counts", counts, "an integer above 0")
+        above_zero(self, "full_scale_counts")
         command_id, reply = self.commands.id, self.commands.reply
         require(0 <= command_id <= most, "commands.id", command_id, f"0 to {most:#x}")
         for name in ("result_byte", "error_byte") if reply else ():

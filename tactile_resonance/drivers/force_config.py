@@ -19,7 +19,15 @@ from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
-from tactile_resonance.fields import build, read, read_dataclass, read_yaml, require
+from tactile_resonance.fields import (
+    above_zero,
+    build,
+    read,
+    read_dataclass,
+    read_yaml,
+    require,
+    within,
+)
 
 LONGEST_S = 1.0
 """Of delays and filters: with more, no contact is controlled."""
@@ -93,11 +101,8 @@ class ForceConfig:
     resolution_n: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name in _POSITIVE:
-                require(value is None or value > 0, name, value, "a number above 0")
-            if name in _SHORT:
-                require(0 <= value <= LONGEST_S, name, value, f"0 to {LONGEST_S:g} s")
+        above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
+        within(self, latency_s=(0, LONGEST_S), inertia_window_s=(0, LONGEST_S))
         good = self._step_n is not None
         require(good, "resolution_n", None, "a number above 0: not known of this source")
         silent_s = self.limits.silent_s
@@ -180,6 +185,8 @@ class CanForce(ForceConfig):
             value = getattr(self, name)
             good = (value is None) == (self.matrix is not None)
             require(good, name, value, "a number above 0, or a matrix in place of both")
+        above_zero(self, "counts_per_n", "counts_per_nm")
+        within(self, shortest_delay_s=(0, LONGEST_S), delay_std_s=(0, LONGEST_S))
         super().__post_init__()
         rates = self.description.commands.rates
         good = not rates or self.rate_hz in rates
@@ -200,18 +207,6 @@ class CanForce(ForceConfig):
 
 
 _KINDS = {"can": CanForce, "rtde": ForceConfig, "topic": TopicForce}
-_POSITIVE = frozenset(
-    {
-        "rate_hz",
-        "noise_rms_n",
-        "range_n",
-        "range_nm",
-        "resolution_n",
-        "counts_per_n",
-        "counts_per_nm",
-    }
-)
-_SHORT = frozenset({"latency_s", "inertia_window_s", "shortest_delay_s", "delay_std_s"})
 
 
 def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tactile_resonance.fields import known_keys, number, read, read_dataclass, read_file, require
+from tactile_resonance.fields import (
+    above_zero,
+    known_keys,
+    number,
+    read,
+    read_dataclass,
+    read_file,
+    require,
+)
 from tactile_resonance.record import BetweenSamples, InputKind
 
 TERMINALS = {
@@ -31,7 +39,7 @@ class InputChannel:
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ai0")
-        require(self.range_v > 0, "range_v", self.range_v, "a number above 0")
+        above_zero(self, "range_v")
         good = self.terminals in TERMINALS
         require(good, "terminals", self.terminals, f"one of {', '.join(TERMINALS)}")
 
@@ -45,7 +53,7 @@ class OutputChannel:
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ao0")
-        require(self.max_voltage_v > 0, "max_voltage_v", self.max_voltage_v, "a number above 0")
+        above_zero(self, "max_voltage_v")
 
 
 def _read_actuator(value: Any, field: str) -> InputChannel | None:
@@ -94,7 +102,7 @@ class NiDaqConfig:
     def __post_init__(self) -> None:
         taken = self.actuator is not None and self.actuator.channel == self.sensor.channel
         require(not taken, "sensor.channel", self.sensor.channel, "another than actuator.channel")
-        require(self.buffer_s > 0, "buffer_s", self.buffer_s, "a number above 0")
+        above_zero(self, "buffer_s")
 
     @property
     def input_kind(self) -> InputKind:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tactile_resonance.contact.samples import Pose, PoseOfSix
-from tactile_resonance.fields import read_dataclass, read_file, require
+from tactile_resonance.fields import read_dataclass, read_file, require, within
 
 
 def _is_loopback(host: str) -> bool:
@@ -76,20 +76,19 @@ class UrArmConfig:
 
     def __post_init__(self) -> None:
         require(bool(self.host), "host", self.host, "a name or an address")
-        for name, low, high in (
-            ("rate_hz", 25.0, 500.0),
-            ("watchdog_hz", 5.0 if self.simulated else 25.0, 125.0),
-            ("max_state_age_s", 0.004, 1.0),
-            ("owner_timeout_s", 0.005, 1.0),
-            ("connect_timeout_s", 1.0, 120.0),
-            ("max_speed_m_s", 1e-4, 1.5),
-            ("max_turn_rad_s", 1e-4, math.pi),
-            ("max_acceleration_m_s2", 1e-3, 20.0),
-            ("realtime_priority", 0, 99),
-            *([] if self.payload_kg is None else [("payload_kg", 0.0, 50.0)]),
-        ):
-            value = getattr(self, name)
-            require(low <= value <= high, name, value, f"{low:g} to {high:g}")
+        within(
+            self,
+            rate_hz=(25.0, 500.0),
+            watchdog_hz=(5.0 if self.simulated else 25.0, 125.0),
+            max_state_age_s=(0.004, 1.0),
+            owner_timeout_s=(0.005, 1.0),
+            connect_timeout_s=(1.0, 120.0),
+            max_speed_m_s=(1e-4, 1.5),
+            max_turn_rad_s=(1e-4, math.pi),
+            max_acceleration_m_s2=(1e-3, 20.0),
+            realtime_priority=(0, 99),
+            payload_kg=(0.0, 50.0),
+        )
         for name, values in (
             ("payload_cog_m", self.payload_cog_m),
             ("tip_in_flange", self.tip_in_flange.vector.tolist()),

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import above_zero, require
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 
 FloatArray = npt.NDArray[np.float64]
@@ -43,9 +43,7 @@ class Precise:
     damping_ratio_std: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("f0_std_hz", "damping_ratio_std"):
-            value = getattr(self, name)
-            require(value is None or 0 < value < np.inf, name, value, "a number above 0")
+        above_zero(self, "f0_std_hz", "damping_ratio_std")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import build, number, numbers, one_of, require
+from tactile_resonance.fields import above_zero, build, number, numbers, one_of, require
 
 FloatArray = npt.NDArray[np.float64]
 Pair = tuple[float, float]
@@ -152,7 +152,7 @@ class _Spiral:
     spacing_m: Spacing
 
     def positions(self) -> FloatArray:
-        require(self.radius_m > 0, "radius_m", self.radius_m, "a number above 0")
+        above_zero(self, "radius_m")
         return _flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
 
 

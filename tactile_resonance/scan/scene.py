@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
+    above_zero,
     build,
     known_keys,
     read,
@@ -26,6 +27,7 @@ from tactile_resonance.fields import (
     read_yaml,
     require,
     section,
+    within,
 )
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
@@ -100,12 +102,9 @@ class SensorUse:
     def __post_init__(self) -> None:
         known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))
         require(self.name in known, "name", self.name, f"one of config/sensors: {', '.join(known)}")
-        require(self.band_low_hz > 0, "band_low_hz", self.band_low_hz, "a number above 0")
-        good = self.band_high_hz > self.band_low_hz
-        require(
-            good, "band_high_hz", self.band_high_hz, f"above band_low_hz = {self.band_low_hz:g}"
-        )
-        require(self.level_v > 0, "level_v", self.level_v, "a number above 0")
+        above_zero(self, "band_low_hz", "level_v")
+        low, high = self.band_low_hz, self.band_high_hz
+        require(high > low, "band_high_hz", high, f"above band_low_hz = {low:g}")
 
 
 @dataclass(frozen=True)
@@ -116,8 +115,7 @@ class TimeLimits:
     scan_s: float = 3600.0
 
     def __post_init__(self) -> None:
-        for name in ("point_s", "scan_s"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        above_zero(self, "point_s", "scan_s")
 
 
 @dataclass(frozen=True)
@@ -131,8 +129,7 @@ class DriftLimits:
     damping_ratio: float = 5e-5
 
     def __post_init__(self) -> None:
-        for name in ("f0_hz", "damping_ratio"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        above_zero(self, "f0_hz", "damping_ratio")
 
 
 @dataclass(frozen=True)
@@ -154,10 +151,9 @@ class Gate:
     measurements: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("force_rms_n", "force_error_n"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
-        most = self.measurements
-        require(1 <= most <= 100, "measurements", most, "1 to 100")
+        above_zero(self, "force_rms_n")
+        require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
+        within(self, measurements=(1, 100))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +212,7 @@ class ScanScene:
     notes: Notes = field(default_factory=Notes)
 
     def __post_init__(self) -> None:
-        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        above_zero(self, "force_n")
         require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")
         if self.nominal_contact is not None:
             nominal_n = self.nominal_contact.force_n

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import build, one_of, read, require
+from tactile_resonance.fields import above_zero, build, one_of, read, require, within
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
@@ -172,9 +172,8 @@ class TouchRequest:
     def __post_init__(self) -> None:
         least, given = 3 if self.form == "plane" else 6, len(self.points_m)
         require(given >= least, "points_m", given, f"{least} positions or more for a {self.form}")
-        force_n, tolerance_m = self.force_n, self.tolerance_m
-        require(force_n is None or force_n > 0, "force_n", force_n, "a number above 0")
-        require(tolerance_m > 0, "tolerance_m", tolerance_m, "a number above 0")
+        above_zero(self, "force_n")
+        require(self.tolerance_m > 0, "tolerance_m", self.tolerance_m, "a number above 0")
         check_search(self.search_m, "search_m")
 
 
@@ -207,16 +206,15 @@ class NormalRequest:
     tolerance_m: float = 2e-4
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("radius_m", 5e-4, 0.01),
-            ("touches", 3, 12),
-            ("force_n", 0.0, 1.0),
-            ("most_angle_rad", 0.0, 0.8),
-            ("most_std_rad", 1e-3, 0.1),
-            ("tolerance_m", 1e-5, 2e-3),
-        ):
-            value = getattr(self, name)
-            require(low <= value <= high, name, value, f"{low:g} to {high:g}")
+        within(
+            self,
+            radius_m=(5e-4, 0.01),
+            touches=(3, 12),
+            force_n=(0.0, 1.0),
+            most_angle_rad=(0.0, 0.8),
+            most_std_rad=(1e-3, 0.1),
+            tolerance_m=(1e-5, 2e-3),
+        )
 
 
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import build, require
+from tactile_resonance.fields import above_zero, build, not_negative, require, within
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.shapes import Point
@@ -79,12 +79,11 @@ class RandomField:
     """
 
     correlation_length_m: float
-    seed: int
+    seed: int = 0
 
     def __post_init__(self) -> None:
-        length = self.correlation_length_m
-        require(0 < length < np.inf, "correlation_length_m", length, "a number above 0")
-        require(self.seed >= 0, "seed", self.seed, "an integer, 0 or above")
+        above_zero(self, "correlation_length_m")
+        not_negative(self, "seed")
 
     @cached_property
     def _waves(self) -> tuple[FloatArray, FloatArray]:
@@ -117,8 +116,7 @@ class Heterogeneous:
     modulus_spread: float
 
     def __post_init__(self) -> None:
-        spread = self.modulus_spread
-        require(0 <= spread <= 1, "modulus_spread", spread, "0 to 1")
+        within(self, modulus_spread=(0, 1))
 
     def tissue_at(self, position_m: FloatArray) -> Tissue:
         """Return the tissue there, its modulus times the local factor."""
@@ -205,12 +203,10 @@ class GradientEntry:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeterogeneityEntry:
-    """Part of a file: a random field; see `Heterogeneous`."""
+class HeterogeneityEntry(RandomField):
+    """Part of a file: a random field, and how far the modulus follows it; see `Heterogeneous`."""
 
     modulus_spread: float
-    correlation_length_m: float
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,9 +225,7 @@ class FillingEntry(TissueEntry):
             given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
             require(not given, "gradient", given, "no tissue beside a gradient")
             material = build(self.gradient.gradient_of, "gradient", library)
-        varying = self.heterogeneity
-        if varying is None:
+        field = self.heterogeneity
+        if field is None:
             return material
-        where = "heterogeneity"
-        field = build(RandomField, where, varying.correlation_length_m, varying.seed)
-        return build(Heterogeneous, where, material, field, varying.modulus_spread)
+        return build(Heterogeneous, "heterogeneity", material, field, field.modulus_spread)

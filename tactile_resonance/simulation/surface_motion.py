@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import not_negative, within
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,9 @@ class SurfaceMotion:
     phase_seed: int = 1
 
     def __post_init__(self) -> None:
-        for name, most in (("breath_m", 0.02), ("heart_m", 0.005)):
-            value = getattr(self, name)
-            require(0 <= value <= most, name, value, f"0 to {most:g} (peak to peak)")
-        for name, least, most in (("breath_hz", 0.05, 2.0), ("heart_hz", 0.3, 10.0)):
-            value = getattr(self, name)
-            require(least <= value <= most, name, value, f"{least:g} to {most:g}")
-        require(self.breath_power in (1, 2, 3), "breath_power", self.breath_power, "1, 2 or 3")
-        require(self.phase_seed >= 0, "phase_seed", self.phase_seed, "0 or above")
+        within(self, breath_m=(0, 0.02), heart_m=(0, 0.005))  # peak to peak
+        within(self, breath_hz=(0.05, 2.0), heart_hz=(0.3, 10.0), breath_power=(1, 3))
+        not_negative(self, "phase_seed")
 
     @cached_property
     def phases_rad(self) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import above_zero, not_negative, require
 
 FloatArray = npt.NDArray[np.float64]
 NAN = float("nan")
@@ -97,13 +97,9 @@ class NominalContact:
     unknown_age_factor: float = NAN
 
     def __post_init__(self) -> None:
-        for name in ("force_n", "age_s"):
-            value = getattr(self, name)
-            require(0 < value < math.inf, name, value, "a number above 0")
+        above_zero(self, "force_n", "age_s")
         require(0 <= self.creep < 1, "creep", self.creep, "0 or above, below 1")
-        for name in ("creep_std", "force_scale_std"):
-            value = getattr(self, name)
-            require(0 <= value < math.inf, name, value, "a number of 0 or above")
+        not_negative(self, "creep_std", "force_scale_std")
         value = self.unknown_force_std_n
         require(not value <= 0, "unknown_force_std_n", value, "a number above 0")
         value = self.unknown_age_factor

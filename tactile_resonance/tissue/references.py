@@ -12,13 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import (
+    above_zero,
     build,
     join,
     known_keys,
+    not_negative,
     read,
     read_dataclass,
     read_yaml,
     require,
+    within,
 )
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples
 from tactile_resonance.tissue.nominal_contact import (
@@ -41,10 +44,11 @@ class _Point:
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
-        require(self.f0_hz > 0, "f0_hz", self.f0_hz, "a number above 0")
+        above_zero(self, "f0_hz")
         damping = self.damping_ratio
         require(0 < damping < 1, "damping_ratio", damping, "a number above 0, below 1")
-        _check_spread(self, "f0_std_hz", "damping_ratio_std")
+        not_negative(self, "f0_std_hz", "damping_ratio_std")
+        within(self, correlation=(-1, 1))
 
     @property
     def estimate(self) -> FloatArray:
@@ -87,8 +91,8 @@ class _Preload(_Point):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
-        require(self.force_std_n >= 0, "force_std_n", self.force_std_n, "a number of 0 or above")
+        above_zero(self, "force_n")
+        not_negative(self, "force_std_n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +106,8 @@ class _Sensitivity:
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_spread(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
+        not_negative(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
+        within(self, correlation=(-1, 1))
 
     @property
     def sensitivity(self) -> ForceSensitivity:
@@ -188,14 +193,6 @@ def _between(preloads: tuple[_Preload, _Preload], nominal_n: float) -> ForceSens
 def _read_class(name: str, entry: object, where: str) -> TissueClass:
     kind = _Samples if isinstance(entry, Mapping) and "points" in entry else _Class
     return build(read(kind, entry, where).named, where, name)
-
-
-def _check_spread(entry: object, *stds: str) -> None:
-    for name in stds:
-        value = getattr(entry, name)
-        require(value >= 0, name, value, "a number of 0 or above")
-    correlation = entry.correlation  # type: ignore[attr-defined]
-    require(-1 <= correlation <= 1, "correlation", correlation, "-1 to 1")
 
 
 def _covariance(first_std: float, second_std: float, correlation: float) -> FloatArray:
