@@ -71,6 +71,7 @@ setup(
         "compiled": ["numba>=0.68.1,<0.69"],
         "robot": ["ur-rtde>=1.6.5,<1.7"],
         "can": ["python-can>=4.5,<5"],
+        "mesh": ["trimesh>=4.5,<6"],
         "recording": ["rosbags>=0.11.1,<0.12"],
     },
     entry_points={

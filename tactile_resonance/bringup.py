@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.fields import require
+from tactile_resonance.fields import numbers, read_text, require
 from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.simulation.plant_defaults import HOST, STALLS_S, TABLE_IN_BASE
+from tactile_resonance.strict_yaml import parse_yaml
 
 NODES = (
     "fake_hardware_node",
@@ -100,10 +100,11 @@ def read_parameter_file(path: str | Path) -> dict[str, Parameters]:
     """
     sections: dict[str, Parameters] = {}
     try:
-        loader = yaml.SafeLoader(Path(path).read_text(encoding="utf-8"))
+        # not strict: as ROS reads it, so that both mean the same
+        loader = yaml.SafeLoader(read_text(Path(path)))
         for name, parameters in _sections(loader, loader.get_single_node(), ""):
             sections.setdefault(name, {}).update(parameters)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"params_file: {path}: {error}") from error
     return sections
 
@@ -302,11 +303,9 @@ def _table_or_file(text: str, base_frame: str) -> list[float]:
 
 def _table(value: object) -> list[float]:
     """Six finite numbers."""
-    try:
-        table = np.array(yaml.safe_load(value) if isinstance(value, str) else value, dtype=float)
-    except (TypeError, ValueError, yaml.YAMLError):
-        table = np.empty(0)
-    good = table.shape == (6,) and bool(np.all(np.isfinite(table)))
     accepted = "[x, y, z, rx, ry, rz] in m and rad, or (launch argument) the file of a calibration"
-    require(good, "table_in_base", value, accepted)
-    return [float(number) for number in table]
+    try:
+        given = parse_yaml(value) if isinstance(value, str) else value
+        return list(numbers(given, "table_in_base", 6))
+    except ValueError as error:
+        raise ValueError(f"table_in_base: got {value!r}; accepted is {accepted}") from error

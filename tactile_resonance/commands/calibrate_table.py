@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from tactile_resonance.commands.bench_scan import Job, node_parameters, require_packages
-from tactile_resonance.fields import numbers, require
+from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 from tactile_resonance.simulation.plant_defaults import HOST, TABLE_IN_BASE
+from tactile_resonance.strict_yaml import parse_yaml
 
 if TYPE_CHECKING:
     from tactile_resonance.client import CalibrationOutcome
@@ -103,11 +103,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _points(text: str | None) -> list[tuple[float, ...]]:
     try:
-        content = yaml.safe_load(text or "")
-    except yaml.YAMLError:
-        content = text
-    require(isinstance(content, list), "--points", text, "'[[x, y], [x, y], [x, y]]' in metres")
-    return [numbers(point, f"--points[{index}]", 2) for index, point in enumerate(content)]
+        return list(read(tuple[tuple[float, float], ...], parse_yaml(text or ""), "--points"))
+    except ValueError as error:
+        accepted = "'[[x, y], [x, y], [x, y]]' in metres"
+        raise ValueError(f"--points: got {text!r}; accepted is {accepted}") from error
 
 
 def ask(

@@ -22,6 +22,7 @@ from tactile_resonance.scan.references import SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits, ScanScene, read_scan_scene
 from tactile_resonance.scan.silent_reference import read_silent
+from tactile_resonance.strict_yaml import parse_yaml
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;
@@ -254,8 +255,8 @@ def _scene_of(run: RunContent) -> ScanScene | None:
 
 def _scene_name(run: RunContent) -> str:
     try:
-        content = yaml.safe_load(run.scene)
-    except yaml.YAMLError:
+        content = parse_yaml(run.scene)
+    except ValueError:
         content = None
     named = content.get("name") if isinstance(content, dict) else None
     return str(named or run.path.name)

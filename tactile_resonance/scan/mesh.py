@@ -3,21 +3,17 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import cut, require
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-_BINARY = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_NUMBER = rb"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
-_VERTEX = re.compile(rb"vertex\s+" + rb"\s+".join([_NUMBER] * 3))
 _INSIDE = 1e-9  # of the barycentric coordinates: points on a shared edge belong to both triangles
 
 
@@ -120,24 +116,19 @@ def read_stl(path: Path) -> FloatArray:
     Raises
     ------
     ValueError
-        If it cannot be read or holds no triangle.
+        If it cannot be read or holds no triangle, or trimesh is not installed.
     """
     try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise ValueError(f"file: {path} cannot be read ({error.strerror})") from error
-    count = int.from_bytes(content[80:84], "little")
-    if len(content) >= 84 and len(content) == 84 + _BINARY.itemsize * count:
-        corners = np.frombuffer(content, _BINARY, count, offset=84)["corners"].astype(float)
-    else:
-        numbers = _VERTEX.findall(content) if content.lstrip()[:5] == b"solid" else []
-        if len(numbers) % 3:
-            raise ValueError(
-                f"file: {path} has {len(numbers)} corners; accepted are three per face"
-            )
-        corners = np.array(numbers, dtype=float).reshape(-1, 3, 3)
-    if len(corners) == 0:
-        raise ValueError(f"file: {path} holds no triangle; accepted is STL, binary or text")
+        import trimesh  # of the extra `mesh`
+    except ImportError as error:
+        need = "trimesh, which reads STL: pip install trimesh"
+        raise ValueError(f"file: got {path.name!r}; accepted with {need}") from error
+    try:
+        mesh = trimesh.load_mesh(path, file_type="stl", process=False)
+    except Exception as error:  # whatever its readers meet in a damaged file
+        raise ValueError(f"file: {path} cannot be read as STL ({cut(str(error))})") from error
+    corners = np.asarray(mesh.triangles, float)
+    require(len(corners) > 0, "file", str(path), "STL, binary or text, with a triangle or more")
     return corners
 
 

@@ -2,6 +2,7 @@
 """Heights and normals against surfaces with closed forms; a touched surface against its own statistics."""
 
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -107,12 +108,20 @@ def test_stl_text_and_binary_are_the_same(tmp_path):
     np.testing.assert_array_equal(read_stl(text).astype(np.float32), triangles)
     surface = read_surface({"mesh": {"file": "b.stl", "unit_m": 0.001}}, tmp_path, "surface")
     assert surface.height_m([0.0, 0.0]) == pytest.approx(0.05e-3, rel=1e-6)
-    for content, reason in ((b"solid x\nendsolid", "no triangle"), (b"\0" * 90, "no triangle")):
+    for content, reason in ((b"solid x\nendsolid", "a triangle or more"), (b"\0" * 90, "a triangle or more")):
         binary.write_bytes(content)
         with pytest.raises(ValueError, match=reason):
             read_stl(binary)
-    with pytest.raises(ValueError, match="cannot be read"):
-        read_stl(tmp_path / "none.stl")
+    binary.write_bytes(b"solid misleading".ljust(80) + struct.pack("<I", len(triangles)) + rows[:-7])
+    for path in (binary, tmp_path / "none.stl"):
+        with pytest.raises(ValueError, match="cannot be read"):
+            read_stl(path)
+
+
+def test_without_its_library_a_mesh_names_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(ValueError, match="file: got 'a.stl'; accepted with .*pip install trimesh"):
+        read_stl(tmp_path / "a.stl")
 
 
 def test_a_mesh_wound_both_ways_is_refused():
