@@ -19,12 +19,10 @@ from tactile_resonance.analysis import (
     write_whole,
 )
 from tactile_resonance.frf.estimate import METHODS
+from tactile_resonance.front import read_record
 from tactile_resonance.identification.order_choice import CANDIDATES
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.recording.files import read_recording
-from tactile_resonance.recording.recording import Recording
-from tactile_resonance.recording.store_recording import read_store_recording, recording_of
 from tactile_resonance.silent import silent_record
 
 MOST_HARMONICS = 10**7
@@ -129,18 +127,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run)
 
 
-def _read_folder(options: argparse.Namespace) -> Recording:
-    """One measurement of a store of records, or of a scan's run."""
-    if not (options.record / "run.json").is_file():
-        return read_store_recording(options.record, options.measurement, options.periods)
-    try:
-        from tactile_resonance.scan.recorded import read_recorded
-    except ImportError as error:
-        raise ValueError(f"analyze: {error.name} not found; pip install rosbags") from error
-    measurement = read_recorded(options.record, options.measurement)
-    return recording_of(measurement, options.periods)
-
-
 def parse_order(text: str) -> int | None:
     """'4' as 4, 'auto' as None."""
     if text == "auto":
@@ -185,24 +171,17 @@ def run(options: argparse.Namespace) -> int:
     _check_outputs(options)
     if options.periods is not None and options.periods < 1:
         raise ValueError(f"periods: {options.periods}, expected at least 1")
-    if options.record.is_dir():
-        for name in ("sample_rate", "samples_per_period", "segments", "harmonics"):
-            if getattr(options, name) is not None:
-                raise ValueError(f"{name}: not for a folder of records, which say it themselves")
-        recording = _read_folder(options)
-    else:
-        if options.measurement is not None:
-            raise ValueError("measurement: only for a folder of records")
-        recording = read_recording(
-            options.record,
-            u=options.u,
-            y=options.y,
-            sample_rate_hz=options.sample_rate,
-            samples_per_period=options.samples_per_period,
-            periods=options.periods,
-            segments=options.segments,
-            excited_harmonics=options.harmonics,
-        )
+    recording = read_record(
+        options.record,
+        options.measurement,
+        u=options.u,
+        y=options.y,
+        sample_rate_hz=options.sample_rate,
+        samples_per_period=options.samples_per_period,
+        periods=options.periods,
+        segments=options.segments,
+        excited_harmonics=options.harmonics,
+    )
     band_hz = _band(options.band, recording.sample_rate_hz)
     if options.silent:
         for name in ("json", "plot"):

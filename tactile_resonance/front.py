@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One call per stage, for users of the library: a recording, its frequency response, its poles.
+
+The names are those of the package itself (``import tactile_resonance as tr``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.analysis import analyse
+from tactile_resonance.frf import estimate as frf_stage
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.identification import identify as poles_stage
+from tactile_resonance.identification.result import Poles
+from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.recording.files import read_recording
+from tactile_resonance.recording.recording import Recording
+from tactile_resonance.recording.store_recording import read_store_recording, recording_of
+
+
+def read_record(
+    path: str | PathLike[str],
+    measurement_id: int | None = None,
+    *,
+    u: str = "u",
+    y: str = "y",
+    sample_rate_hz: float | None = None,
+    samples_per_period: int | None = None,
+    periods: int | None = None,
+    segments: Sequence[tuple[int, int]] | None = None,
+    excited_harmonics: npt.ArrayLike | None = None,
+) -> Recording:
+    """Read whole periods of both channels.
+
+    Parameters
+    ----------
+    path : path
+        A file (``.npz``, ``.mat``, ``.csv``), a folder of records that the nodes stored, or the run of a
+        scan.
+    measurement_id : int, optional
+        Which one of a folder or run that holds several.
+    u, y : str
+        Names of the actuator and the sensor field of a file.
+    sample_rate_hz, samples_per_period, segments, excited_harmonics
+        Of a file, and win over what it says: see `recording.recording.make_recording`.
+    periods : int, optional
+        Use the first so many.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+    OSError
+        If it cannot be opened.
+
+    Examples
+    --------
+    >>> recording = tr.read_record("runs/demo", measurement_id=3)  # doctest: +SKIP
+    """
+    path = Path(path)
+    if not path.is_dir():
+        if measurement_id is not None:
+            raise ValueError("measurement: only for a folder of records")
+        return read_recording(
+            path,
+            u=u,
+            y=y,
+            sample_rate_hz=sample_rate_hz,
+            samples_per_period=samples_per_period,
+            periods=periods,
+            segments=segments,
+            excited_harmonics=excited_harmonics,
+        )
+    given = {
+        "sample_rate": sample_rate_hz,
+        "samples_per_period": samples_per_period,
+        "segments": segments,
+        "harmonics": excited_harmonics,
+    }
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name}: not for a folder of records, which say it themselves")
+    if not (path / "run.json").is_file():
+        return read_store_recording(path, measurement_id, periods)
+    try:
+        from tactile_resonance.scan.recorded import read_recorded
+    except ImportError as error:
+        raise ValueError(f"{path}: {error.name} not found; pip install rosbags") from error
+    return recording_of(read_recorded(path, measurement_id), periods)
+
+
+def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> FRF:
+    """Frequency response at the excited lines, with the covariances that the recording allows.
+
+    Parameters
+    ----------
+    recording : Recording
+        Its excited lines are found from the input spectrum where it does not name them.
+    method : {"local polynomial", "average"}
+        See `frf.estimate.estimate_frf`.
+
+    Raises
+    ------
+    ValueError
+        For another method, or a channel that does not move.
+
+    Examples
+    --------
+    Four periods of a resonance at 250 Hz with a damping ratio of 2 %, in the steady state:
+
+    >>> import numpy as np
+    >>> import tactile_resonance as tr
+    >>> multisine = tr.design_multisine(
+    ...     sample_rate_hz=5e3, samples_per_period=2000, band_hz=(200.0, 300.0), seed=1
+    ... )
+    >>> period = multisine.period()
+    >>> s, w0 = 2j * np.pi * np.fft.rfftfreq(2000, 1 / 5e3), 2 * np.pi * 250
+    >>> g = 0.04 * w0**2 / (s**2 + 2 * 0.02 * w0 * s + w0**2)
+    >>> u = np.tile(period, (4, 1))
+    >>> y = np.tile(np.fft.irfft(g * np.fft.rfft(period)), (4, 1))
+    >>> y = y + 1e-3 * np.random.default_rng(0).standard_normal(y.shape)
+    >>> recording = tr.make_recording(u, y, sample_rate_hz=5e3, excited_harmonics=multisine.harmonics)
+    >>> frf = tr.estimate_frf(recording)
+    >>> frf.g.shape, frf.status.value
+    ((41,), 'ok')
+    >>> poles = tr.identify_poles(recording, band_hz=(200, 300))
+    >>> print(f"{poles.main.f0_hz:.2f} Hz, {poles.main.damping_ratio:.4f}, {poles.status.value}")
+    250.00 Hz, 0.0200, ok
+    >>> bool(np.all(np.abs(poles.main.estimate - [250, 0.02]) < 4 * poles.main.std))
+    True
+    """
+    recording.require_driven()
+    harmonics = recording.excited_harmonics
+    if harmonics is None:
+        harmonics = find_excited_harmonics(recording.u)
+    return frf_stage.estimate_frf(
+        recording.u,
+        recording.y,
+        sample_rate_hz=recording.sample_rate_hz,
+        harmonics=np.asarray(harmonics),
+        method=method,
+    )
+
+
+def identify_poles(
+    data: Recording | FRF,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+) -> Poles:
+    """Poles of the model of one band, with their covariance.
+
+    Parameters
+    ----------
+    data : Recording or FRF
+        From a recording: all bins of the band, the transient of each realisation estimated along; from a
+        frequency response: its lines, weighted with their variance. Spectra with a noise covariance:
+        `identify_spectra`; many points of one kind: `PoleEstimator`, `identify_batch`.
+    band_hz : (low, high), optional
+        When absent, around the strongest resonance of a recording, or all lines of a response.
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+
+    Returns
+    -------
+    Poles
+        Its `status` says what it is worth; ``main`` is the mode with the highest peak and
+        ``best_covariance`` the covariance that counts.
+
+    Raises
+    ------
+    ValueError
+        If the band holds too few lines for the model.
+
+    Examples
+    --------
+    From a response of your own, with the variance of its errors, a mean over eight periods:
+
+    >>> import numpy as np
+    >>> import tactile_resonance as tr
+    >>> frequency_hz = np.arange(200.0, 300.1, 2.5)
+    >>> s, w0 = 2j * np.pi * frequency_hz, 2 * np.pi * 250
+    >>> g = 0.04 * w0**2 / (s**2 + 2 * 0.02 * w0 * s + w0**2)
+    >>> noise = np.random.default_rng(0).standard_normal((2, g.size))
+    >>> g = g + 1e-3 * (noise[0] + 1j * noise[1]) / np.sqrt(2)
+    >>> frf = tr.FRF(frequency_hz, g, variance_noise=np.full(g.size, 1e-6), noise_dof=7)
+    >>> poles = tr.identify_poles(frf)
+    >>> print(f"{poles.main.f0_hz:.3f} Hz +- {poles.main.std[0]:.3f}, {poles.status.value}")
+    249.999 Hz +- 0.004, ok
+    """
+    if isinstance(data, FRF):
+        return poles_stage.identify_poles(data, band_hz, structure)
+    return analyse(data, band_hz=band_hz, structure=structure).poles
