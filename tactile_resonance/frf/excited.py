@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, ndimage, special
+from scipy import ndimage, special
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance.frf.spectra import FloatArray, IntArray, Spectrum, power
 
 GAP_DB = 15.0
 """A step this large between neighbouring sorted levels parts excited lines from distortion [dB]."""
@@ -21,7 +20,7 @@ _FEWEST_BELOW = (
 _STRAY_SHARE = 0.03  # even lines, relative to the odd ones, up to which a grid is called odd
 
 
-def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntArray:
+def find_excited_harmonics(record: Spectrum, *, gap_db: float = GAP_DB) -> IntArray:
     """Excited harmonics of a multisine, from its input record alone.
 
     A line is a candidate if it stands above the noise around it. The candidates, sorted by level,
@@ -32,9 +31,8 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
 
     Parameters
     ----------
-    u : (..., P, N) float
-        Input: P consecutive periods of N samples. All leading axes (realisations) excite the same
-        lines; their powers are averaged.
+    record : Spectrum
+        All leading axes (realisations) excite the same lines; their powers are averaged.
     gap_db : float
         Smallest step in level between excited lines and distortion [dB].
 
@@ -62,26 +60,23 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     at least four lines of noise, which noise alone does in less than one record of a hundred
     thousand. Coloured noise above the level of the lines cannot then be distinguished from excitation.
     """
-    u = np.asarray(u)
-    if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:
-        raise ValueError(f"u: shape {u.shape}, expected (..., P, N) with N >= 4")
-    if not np.all(np.isfinite(u)):
+    periods, samples = record.periods, record.samples_per_period
+    if samples < 4:
+        raise ValueError(f"u: {samples} samples in a period, expected 4 or more")
+    u = record.bins[..., 1, :]  # (..., P N // 2 + 1)
+    if not np.all(np.isfinite(u[..., 0])):  # one sample that is missing makes all bins NaN
         raise ValueError("u: holds samples that are not finite, expected a complete record")
     if not gap_db > 0:
         raise ValueError(f"gap_db: {gap_db}, expected a positive step in decibels")
-    periods, samples = u.shape[-2:]
-    record = u.reshape(-1, periods * samples)  # (M, P N)
-    # a large offset would cost precision where samples are float32
-    record = record - np.mean(record, axis=-1, keepdims=True)
-    spectrum = fft.rfft(record, axis=-1)  # (M, P N // 2 + 1)
-    power = np.mean(spectrum.real.astype(float) ** 2 + spectrum.imag.astype(float) ** 2, axis=0)
+    u = u.reshape(-1, u.shape[-1])
+    power_of_bins = np.mean(power(u), axis=0)
     harmonics = np.arange(1, (samples - 1) // 2 + 1)  # (H,)
-    line_power = power[harmonics * periods]  # (H,)
-    records = record.shape[0]
+    line_power = power_of_bins[harmonics * periods]  # (H,)
+    records = u.shape[0]
     threshold = (
         _noise_threshold_single_period(line_power, records)
         if periods == 1
-        else _noise_threshold_between(power, harmonics, periods, records)
+        else _noise_threshold_between(power_of_bins, harmonics, periods, records)
     )
     candidate = line_power > threshold
     level_db = 10 * np.log10(np.maximum(line_power, np.finfo(float).tiny))

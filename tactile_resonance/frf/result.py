@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
-import numpy as np
-import numpy.typing as npt
-
 from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
+PER_LINE = (
+    *("frequency_hz", "g", "variance_noise", "variance_total"),
+    *("spectra", "spectra_covariance"),
+)
+"""Fields of an `FRF` whose last axis are its lines."""
 
 
 class FrfStatus(Enum):
@@ -81,26 +82,22 @@ class FRF:
         """Degrees of freedom of `variance`."""
         return self.noise_dof if self.variance_total is None else self.total_dof
 
+    @property
+    def variance_distortion(self) -> FloatArray | None:
+        """(..., F) variance of the stochastic nonlinear distortion of the FRF of *one* realisation.
+
+        ``M (total - noise)`` for M realisations. Unbiased, hence negative at some lines where
+        distortion is lost in noise: average over lines before taking a root. None where either is
+        unknown.
+        """
+        if self.variance_noise is None or self.variance_total is None:
+            return None
+        return self.realisations * (self.variance_total - self.variance_noise)
+
     def band(self, low_hz: float, high_hz: float) -> FRF:
         """The lines from `low_hz` to `high_hz`, ends included."""
         inside = (self.frequency_hz >= low_hz) & (self.frequency_hz <= high_hz)
-
-        def cut(array):
-            return None if array is None else array[..., inside]
-
-        return FRF(
-            frequency_hz=self.frequency_hz[inside],
-            g=self.g[..., inside],
-            variance_noise=cut(self.variance_noise),
-            variance_total=cut(self.variance_total),
-            noise_dof=self.noise_dof,
-            total_dof=self.total_dof,
-            spectra=cut(self.spectra),
-            spectra_covariance=cut(self.spectra_covariance),
-            bins=self.bins,
-            periods=self.periods,
-            realisations=self.realisations,
-            method=self.method,
-            status=self.status,
-            message=self.message,
+        arrays = {name: getattr(self, name) for name in PER_LINE}
+        return replace(
+            self, **{name: x[..., inside] for name, x in arrays.items() if x is not None}
         )

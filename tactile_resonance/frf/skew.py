@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.fast import fast_frf
-from tactile_resonance.frf.fault_types import Fault, FaultKind
-from tactile_resonance.frf.result import FRF, ComplexArray, FloatArray
-from tactile_resonance.frf.spectra import averaged_spectra
+from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.faults import Fault, FaultKind
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray, Spectrum, averaged_spectra
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def skew_from_loopback(
     ValueError
         For fewer than three lines, or channels that do not see the same signal.
     """
-    frf = fast_frf(averaged_spectra(u, y, harmonics), sample_rate_hz=sample_rate_hz)
+    frf = fast_frf(averaged_spectra(Spectrum.of(u, y), harmonics), sample_rate_hz=sample_rate_hz)
     f = frf.frequency_hz
     if f.size < 3:
         raise ValueError(f"harmonics: {f.size} lines, expected at least 3 to fit a delay")

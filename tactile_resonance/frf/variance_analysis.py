@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.detection import decibel
-from tactile_resonance.frf.result import ComplexArray, FloatArray
+from tactile_resonance.frf.distortion import decibel
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
 PAPER_AXES = ("preparation", "position", "repetition", "period")
 """Sources of figure 9 of arXiv 1805.00682, outermost first."""

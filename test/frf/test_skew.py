@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.fast import fast_frf
-from tactile_resonance.frf.fault_types import FaultKind
+from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.faults import FaultKind
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.skew import correct_skew, skew_from_loopback, suspected_skew
-from tactile_resonance.frf.spectra import averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 
 SAMPLES, RATE = 1000, 10e3
 LINES = np.arange(3, 400)
@@ -55,7 +55,7 @@ def test_correction_restores_the_response(multisine):
     delay, response = 37e-6, 1 / (1 + 1j * F_HZ / 800)
     records = [loopback(np.random.default_rng(4), multisine, d, 1, response) for d in (0, delay)]
     plan = LocalPolynomialPlan(LINES, SAMPLES, 3)
-    true, skewed = (fast_frf(plan(u, y), sample_rate_hz=RATE) for u, y in records)
+    true, skewed = (fast_frf(plan(Spectrum.of(u, y)), sample_rate_hz=RATE) for u, y in records)
     corrected = correct_skew(skewed, delay)
     scatter = np.sqrt(true.variance_noise)
     assert np.max(np.abs(skewed.g - true.g) / scatter) > 5
@@ -79,7 +79,7 @@ def test_skew_is_suspected_where_a_flat_response_has_straight_phase(multisine):
     mode = 1 + 0.2 / (1 - (F_HZ / 300) ** 2 + 0.04j * F_HZ / 300)
     frf = {
         delay: fast_frf(
-            averaged_spectra(*loopback(rng, multisine, delay, 1, mode), LINES),
+            averaged_spectra(Spectrum.of(*loopback(rng, multisine, delay, 1, mode)), LINES),
             sample_rate_hz=RATE,
         )
         for delay in (0.0, 20e-6)
@@ -100,6 +100,6 @@ def test_refusals(multisine):
     resonance = signal.lfilter([1], [1, -1.8, 0.95], y, axis=-1)
     with pytest.raises(ValueError, match="expected a loop-back"):
         skew_from_loopback(u, resonance, sample_rate_hz=RATE, harmonics=LINES)
-    frf = fast_frf(averaged_spectra(u, y, LINES), sample_rate_hz=RATE)
+    frf = fast_frf(averaged_spectra(Spectrum.of(u, y), LINES), sample_rate_hz=RATE)
     with pytest.raises(ValueError, match="delay_s: nan"):
         correct_skew(frf, float("nan"))
