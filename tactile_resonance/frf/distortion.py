@@ -38,8 +38,8 @@ class DetectionLines:
         Mean spectra Y and U [V].
     corrected : complex
         ``Y - G U``: the output without what the input's own distortion causes linearly.
-    output_variance, input_variance, corrected_variance : float or None
-        Noise variance of these means; None for single periods.
+    corrected_variance : float or None
+        Its noise variance; None for single periods.
     linear_output_power, excited_input_power : (..., L) float
         Power of output and input at the excited lines around, averaged over realisations: what the
         levels refer to. NaN outside the excited band.
@@ -52,8 +52,6 @@ class DetectionLines:
     output: ComplexArray
     input: ComplexArray
     corrected: ComplexArray
-    output_variance: FloatArray | None
-    input_variance: FloatArray | None
     corrected_variance: FloatArray | None
     linear_output_power: FloatArray
     excited_input_power: FloatArray
@@ -138,8 +136,6 @@ class Distortion:
     frequency_hz : (F,) float
     output, input : (..., M, F) complex
         Mean spectra at the excited lines [V].
-    output_variance, input_variance : (..., M, F) float or None
-        Their noise variance.
     even, odd : DetectionLines
         `odd` has no lines for a grid that excites every odd harmonic.
     realisations, periods : int
@@ -149,8 +145,6 @@ class Distortion:
     frequency_hz: FloatArray
     output: ComplexArray
     input: ComplexArray
-    output_variance: FloatArray | None
-    input_variance: FloatArray | None
     even: DetectionLines
     odd: DetectionLines
     realisations: int
@@ -252,8 +246,6 @@ def nonlinear_distortion(
         frequency_hz=excited.frequency_hz(sample_rate_hz),
         output=y,
         input=u,
-        output_variance=_variance(excited, 0),
-        input_variance=_variance(excited, 1),
         even=_detection_lines(spectra.at(detection[detection % 2 == 0]), excited, sample_rate_hz),
         odd=_detection_lines(spectra.at(detection[detection % 2 == 1]), excited, sample_rate_hz),
         realisations=spectra.spectra.shape[-3],
@@ -280,19 +272,11 @@ def _detection_lines(
         output=y,
         input=u,
         corrected=y - g * u,
-        output_variance=_variance(lines, 0),
-        input_variance=_variance(lines, 1),
         corrected_variance=corrected_variance,
         linear_output_power=at_lines(np.mean(np.abs(y_excited) ** 2, axis=-2)),
         excited_input_power=at_lines(np.mean(np.abs(u_excited) ** 2, axis=-2)),
         noise_dof=lines.noise_dof,
     )
-
-
-def _variance(spectra: PeriodicSpectra, channel: int) -> FloatArray | None:
-    if spectra.covariance is None:
-        return None
-    return spectra.covariance[..., channel, channel, :].real
 
 
 def _interpolate(x: IntArray, values: npt.NDArray, at: IntArray) -> npt.NDArray:

@@ -87,7 +87,7 @@ def mean_spectra(
     samples, periods = record.samples_per_period, record.periods
     lines = checked_harmonics(harmonics, samples)
     if periods > 1 and method == "local polynomial":
-        return kept_plan(lines, samples, periods, order, dof)(record)
+        return kept_plan(lines.tobytes(), samples, periods, order, dof)(record)
     return averaged_spectra(record, lines, unsettled_periods=1 if periods > 2 else 0)
 
 

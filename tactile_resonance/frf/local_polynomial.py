@@ -144,17 +144,11 @@ class LocalPolynomialPlan:
         )
 
 
-def kept_plan(
-    harmonics: IntArray, samples_per_period: int, periods: int, order: int, dof: int
-) -> LocalPolynomialPlan:
-    """A `LocalPolynomialPlan`; the latest are kept, because one measurement is like the next."""
-    return _kept_plan(harmonics.tobytes(), samples_per_period, periods, order, dof)
-
-
 @lru_cache(maxsize=16)
-def _kept_plan(
+def kept_plan(
     harmonics: bytes, samples_per_period: int, periods: int, order: int, dof: int
 ) -> LocalPolynomialPlan:
+    """Plan of one of the latest kinds, because one measurement is like the next; bytes of int64."""
     lines = np.frombuffer(harmonics, np.int64)
     return LocalPolynomialPlan(lines, samples_per_period, periods, order, dof)
 
