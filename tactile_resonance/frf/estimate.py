@@ -16,6 +16,7 @@ from tactile_resonance.frf.spectra import (
     Spectrum,
     averaged_spectra,
     checked_harmonics,
+    conditional_variance,
     error_variance,
     power,
     ratio,
@@ -60,8 +61,7 @@ def estimate_frf(
     -------
     FRF
         ``variance_noise`` needs two periods used, ``variance_total`` two realisations; what is
-        missing is None and said in the status. Mean spectra are given for one realisation only:
-        those of several have different phases and no mean.
+        missing is None and said in the status.
 
     Raises
     ------
@@ -130,17 +130,18 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     input is not well above its noise: the relative bias is ``-exp(-|U|^2 / var U)`` for
     Gaussian noise, below 5e-5 at 10 dB (Pintelon & Schoukens 2012, chapter 2).
     """
-    variance = None
+    variance = given = None
     if spectra.covariance is not None:
         variance = ratio_variance(spectra.spectra, spectra.covariance)
+        given = conditional_variance(spectra.covariance)
     status, message = response_status(spectra.spectra, spectra.covariance)
     return FRF(
         frequency_hz=spectra.frequency_hz(sample_rate_hz),
         g=ratio(spectra.spectra),
         variance_noise=variance,
         noise_dof=spectra.noise_dof,
-        spectra=spectra.spectra,
-        spectra_covariance=spectra.covariance,
+        actuator_amplitude=np.abs(spectra.spectra[..., 1, :]),
+        sensor_variance_given_actuator=given,
         periods=spectra.periods,
         method=spectra.method,
         status=status,

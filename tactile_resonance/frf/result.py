@@ -11,7 +11,7 @@ from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
 PER_LINE = (
     *("frequency_hz", "g", "variance_noise", "variance_total"),
-    *("spectra", "spectra_covariance"),
+    *("actuator_amplitude", "sensor_variance_given_actuator"),
 )
 """Fields of an `FRF` whose last axis are its lines."""
 
@@ -43,10 +43,12 @@ class FRF:
         From noise and stochastic nonlinear distortion; needs two realisations.
     noise_dof, total_dof : int
         Degrees of freedom of either; 0 where unknown.
-    spectra : (..., 2, F) complex or None
-        Mean sensor and actuator spectra, row order [Y; U] [V], scaled by 1/N.
-    spectra_covariance : (..., 2, 2, F) complex or None
-        Noise covariance of these means [V^2].
+    actuator_amplitude : (..., F) float or None
+        Magnitude of the mean spectrum U, scaled by 1/N: a cosine of peak a gives a/2 [V]. Of one
+        realisation.
+    sensor_variance_given_actuator : (..., F) float or None
+        Noise variance of the mean spectrum Y that is not noise of U, which the generator makes:
+        ``C_YY - |C_YU|^2 / C_UU`` [V^2]. Of one realisation.
     bins : BandBins or None
         All bins of a band of the records behind G, where asked for: of as many realisations.
     periods, realisations : int
@@ -63,8 +65,8 @@ class FRF:
     variance_total: FloatArray | None = None
     noise_dof: int = 0
     total_dof: int = 0
-    spectra: ComplexArray | None = None
-    spectra_covariance: ComplexArray | None = None
+    actuator_amplitude: FloatArray | None = None
+    sensor_variance_given_actuator: FloatArray | None = None
     bins: BandBins | None = None
     periods: int = 1
     realisations: int = 1

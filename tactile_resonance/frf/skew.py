@@ -87,20 +87,11 @@ def correct_skew(frf: FRF, delay_s: float) -> FRF:
     Returns
     -------
     FRF
-        Response, sensor spectrum and its covariance with the actuator turned; variances unchanged.
+        Variances are the same.
     """
     if not np.isfinite(delay_s):
         raise ValueError(f"delay_s: {delay_s}, expected a finite delay in seconds")
-    turn = np.exp(2j * np.pi * frf.frequency_hz * delay_s)  # (F,)
-    spectra, covariance = frf.spectra, frf.spectra_covariance
-    if spectra is not None:
-        spectra = spectra * np.stack([turn, np.ones_like(turn)])
-    if covariance is not None:
-        ones = np.ones_like(turn)
-        covariance = covariance * np.stack(
-            [np.stack([ones, turn]), np.stack([turn.conj(), ones])]
-        )  # rows and columns [Y; U]
-    return replace(frf, g=frf.g * turn, spectra=spectra, spectra_covariance=covariance)
+    return replace(frf, g=frf.g * np.exp(2j * np.pi * frf.frequency_hz * delay_s))
 
 
 def suspected_skew(frf: FRF) -> Fault | None:

@@ -269,3 +269,10 @@ def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
     """
     input_power = power(mean[..., 1, :])
     return error_variance(ratio(mean), covariance) / np.where(input_power == 0, np.nan, input_power)
+
+
+def conditional_variance(covariance: ComplexArray) -> FloatArray:
+    """(..., F) variance of Y given U, for noise of covariance (..., 2, 2, F), [Y; U]."""
+    u = covariance[..., 1, 1, :].real
+    explained = power(covariance[..., 0, 1, :]) / np.where(u == 0, np.inf, u)
+    return np.asarray(covariance[..., 0, 0, :].real - explained)

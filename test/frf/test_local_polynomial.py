@@ -171,7 +171,7 @@ def test_a_single_period_has_no_covariance(multisine):
     frf = fast_frf(averaged_spectra(Spectrum.of(u, 2 * u), [3, 5]), sample_rate_hz=100.0)
     assert frf.status is FrfStatus.NO_COVARIANCE
     assert frf.variance is None
-    assert frf.spectra_covariance is None
+    assert frf.sensor_variance_given_actuator is None
     assert np.allclose(frf.g, 2)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.measurement import MeasurementFrf, mean_force
-from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.frf.result import PER_LINE, FrfStatus
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Channel, Contact, Origin, Record
 
@@ -68,7 +68,7 @@ def test_block_by_block_is_all_at_once(channels, band_hz, order, dof):
 
 
 def assert_equal(frf, expected):
-    for name in ("frequency_hz", "g", "spectra", "variance_noise", "variance_total"):
+    for name in PER_LINE:
         mine, theirs = getattr(frf, name), getattr(expected, name)
         assert (mine is None) == (theirs is None), name
         if mine is not None:

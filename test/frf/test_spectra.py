@@ -6,7 +6,7 @@ import pytest
 import scipy.fft
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.frf.spectra import Spectrum, conditional_variance
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.recording.recording import Recording
 
@@ -53,6 +53,12 @@ def test_shapes_must_fit():
         ValueError, match=r"samples: shape \(1, 2, 10\), expected \(\.\.\., 2, P, N\)"
     ):
         Spectrum(x[None])
+
+
+def test_noise_of_the_generator_is_no_variance_given_the_actuator():
+    g, u, own = np.array([2 - 1j, 0.5j, 3.0]), np.array([0.7, 2.0, 0.0]), np.array([0.1, 1.0, 0.2])
+    covariance = np.array([[np.abs(g) ** 2 * u + own, g * u], [g.conj() * u, u]])
+    np.testing.assert_allclose(conditional_variance(covariance), own, rtol=1e-12)
 
 
 @pytest.mark.parametrize("harmonics_known", [False, True])
