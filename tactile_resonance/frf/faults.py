@@ -57,15 +57,23 @@ class Fault:
         How bad; the message says in which unit. Larger is worse.
     spoils : bool
         The FRF cannot be trusted because of it; otherwise it is worth knowing only.
-    message : str
-        A sentence for people.
+    text : str
+        What to tell people; no full stop.
+    seen_in : str
+        In how many of several records; empty where there was one.
     """
 
     kind: FaultKind
     channel: str
     value: float
     spoils: bool
-    message: str
+    text: str
+    seen_in: str = ""
+
+    @property
+    def message(self) -> str:
+        """A sentence for people."""
+        return f"{self.text}{self.seen_in and ' ' + self.seen_in}."
 
 
 @dataclass(frozen=True)
@@ -179,8 +187,7 @@ def worst_of(per_record: Iterable[list[Fault]]) -> FaultReport:
     for same in found.values():
         worst = max(same, key=lambda fault: (fault.spoils, fault.value))
         if len(records) > 1:
-            message = f"{worst.message[:-1]} (in {len(same)} of {len(records)} records)."
-            worst = replace(worst, message=message)
+            worst = replace(worst, seen_in=f"(in {len(same)} of {len(records)} records)")
         merged.append(worst)
     return FaultReport(tuple(merged))
 
@@ -202,15 +209,15 @@ class _Channel:
     def periods(self) -> int:
         return self.samples.shape[0]
 
-    def fault(self, kind: FaultKind, value: float, spoils: bool, message: str) -> Fault:
-        return Fault(kind, self.name, float(value), spoils, message)
+    def fault(self, kind: FaultKind, value: float, spoils: bool, text: str) -> Fault:
+        return Fault(kind, self.name, float(value), spoils, text)
 
 
 def missing_samples(x: _Channel) -> Fault | None:
     """Samples that are not finite, or one value held over a whole cycle of the fastest line."""
     bad = int(np.count_nonzero(~np.isfinite(x.samples)))
     if bad:
-        text = f"{bad} samples of the {x.name} are missing (not finite)."
+        text = f"{bad} samples of the {x.name} are missing (not finite)"
         return x.fault(FaultKind.MISSING_SAMPLES, bad, True, text)
     record = x.samples.ravel()
     starts, lengths = _runs(record)
@@ -223,7 +230,7 @@ def missing_samples(x: _Channel) -> Fault | None:
     if not np.any(held):
         return None
     total = int(lengths[held].sum())
-    text = f"The {x.name} stands still for {total} samples: a gap filled with the last value."
+    text = f"The {x.name} stands still for {total} samples: a gap filled with the last value"
     return x.fault(FaultKind.MISSING_SAMPLES, total, True, text)
 
 
@@ -240,7 +247,7 @@ def saturation(x: _Channel) -> Fault | None:
         where = "on flat tops"
     if count == 0:
         return None
-    text = f"The {x.name} is saturated: {count} samples {where}."
+    text = f"The {x.name} is saturated: {count} samples {where}"
     return x.fault(FaultKind.SATURATION, count, True, text)
 
 
@@ -250,7 +257,7 @@ def offset(x: _Channel) -> Fault | None:
     mean = float(np.mean(x.samples))
     if abs(mean) <= LARGE_OFFSET * rms:
         return None
-    text = f"The {x.name} has an offset of {mean:.3g} V beside {rms:.3g} V rms."
+    text = f"The {x.name} has an offset of {mean:.3g} V beside {rms:.3g} V rms"
     return x.fault(FaultKind.OFFSET, abs(mean), False, text)
 
 
@@ -261,7 +268,7 @@ def drift(x: _Channel) -> Fault | None:
     spread = float(np.ptp(means))
     if x.periods < 2 or spread <= LARGE_DRIFT * rms:
         return None
-    text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record."
+    text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record"
     return x.fault(FaultKind.DRIFT, spread, x.transient_spoils, text)
 
 
@@ -311,7 +318,7 @@ def hum(x: _Channel) -> Fault | None:
         return None
     rms = float(np.sqrt(sum(line[1] for line in found)))
     names = ", ".join(f"{line[0]:g}" for line in found)
-    text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms."
+    text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms"
     return x.fault(FaultKind.HUM, rms, any(line[2] for line in found), text)
 
 
@@ -341,7 +348,7 @@ def lost_samples(x: _Channel) -> Fault | None:
     if not np.any(shift):
         return None
     worst = int(shift[np.argmax(np.abs(shift))])
-    text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between."
+    text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between"
     return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
 
 
@@ -361,7 +368,7 @@ def unsettled(x: _Channel) -> Fault | None:
     if difference <= 2 * limit * (noise + rounding):
         return None
     level = 10 * np.log10(difference / np.sum(np.abs(mean) ** 2))
-    text = f"The first period of the {x.name} has not settled: {level:.0f} dB off the others."
+    text = f"The first period of the {x.name} has not settled: {level:.0f} dB off the others"
     return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), x.transient_spoils, text)
 
 

@@ -222,23 +222,22 @@ def neighbourhoods(
             f"order, dof: {order}, {dof} need {count} bins between harmonics, a record of "
             f"{periods} x {samples_per_period} samples has {available}; lower either or record more"
         )
-    inner = _nearest(0, -count * 2, count * 2, periods, count)
-    centre = harmonics.astype(np.int64) * periods
-    is_inner = (centre + inner.min() >= 1) & (centre + inner.max() <= last)
-    patterns: dict[tuple[int, ...], list[int]] = {}
-    for line in np.flatnonzero(~is_inner):
-        offsets = _nearest(int(centre[line]), 1, last, periods, count)
-        patterns.setdefault(tuple(offsets), []).append(int(line))
-    groups = [(inner, np.flatnonzero(is_inner))] if np.any(is_inner) else []
-    groups += [(np.array(offsets), np.array(lines)) for offsets, lines in patterns.items()]
-    return tuple(
-        Neighbourhood(
-            lines=lines.astype(np.int64),
-            bins=centre[lines] + np.concatenate([[0], offsets])[:, None],
-            projector=extrapolation_projector(offsets, order),
-        )
-        for offsets, lines in groups
-    )
+    # the nearest first, the lower of two as near; on one side alone every second may be a harmonic
+    offsets = np.arange(-2 * count, 2 * count + 1)
+    offsets = offsets[offsets % periods != 0]
+    offsets = offsets[np.argsort(np.abs(offsets), kind="stable")]
+    centre = harmonics * periods
+    there = (centre[:, None] + offsets >= 1) & (centre[:, None] + offsets <= last)
+    nearest = there & (np.cumsum(there, axis=1) <= count)  # (F, offsets)
+    lines_of: dict[bytes, list[int]] = {}
+    for line, pattern in enumerate(nearest):
+        lines_of.setdefault(pattern.tobytes(), []).append(line)
+    groups = []
+    for lines in map(np.array, lines_of.values()):
+        neighbours = np.sort(offsets[nearest[lines[0]]])
+        bins = centre[lines] + np.concatenate([[0], neighbours])[:, None]
+        groups.append(Neighbourhood(lines, bins, extrapolation_projector(neighbours, order)))
+    return tuple(groups)
 
 
 def extrapolation_projector(offsets: npt.NDArray[np.integer], order: int) -> FloatArray:
@@ -277,13 +276,3 @@ def extrapolation_projector(offsets: npt.NDArray[np.integer], order: int) -> Flo
     projector[0, 1:] = -extrapolation
     projector[1:, 1:] = residual_basis.T * np.sqrt(mean_variance / residual_dof)
     return projector
-
-
-def _nearest(centre: int, first: int, last: int, periods: int, count: int) -> IntArray:
-    """Offsets of the `count` bins of first..last nearest to `centre` that are no harmonic."""
-    # enough even when all lie on one side and every second is a harmonic
-    reach = 2 * count + periods
-    bins = np.arange(max(first, centre - reach), min(last, centre + reach) + 1)
-    bins = bins[bins % periods != 0]
-    order = np.argsort(np.abs(bins - centre), kind="stable")[:count]
-    return np.sort(bins[order] - centre)

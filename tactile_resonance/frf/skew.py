@@ -113,7 +113,7 @@ def suspected_skew(frf: FRF) -> Fault | None:
         return None
     text = (
         f"The phase looks like a delay of {delay * 1e6:.3g} us between the channels: measure it "
-        "with a loop-back."
+        "with a loop-back"
     )
     return Fault(FaultKind.CHANNEL_SKEW, "both", abs(float(delay)), False, text)
 
