@@ -169,7 +169,7 @@ def find_faults(
             missing = missing_samples(channel)
             if missing is not None:
                 faults.append(missing)
-            if np.all(np.isfinite(channel.samples)):  # else nothing more can be told
+            if channel.complete:  # else nothing more can be told
                 found = (check(channel) for check in CHECKS)
                 faults += [fault for fault in found if fault is not None]
         reports.append(faults)
@@ -209,19 +209,27 @@ class _Channel:
     def periods(self) -> int:
         return self.samples.shape[0]
 
+    @property
+    def complete(self) -> bool:
+        """False where a sample is missing, which makes all bins NaN."""
+        return bool(np.isfinite(self.bins[0]))
+
     def fault(self, kind: FaultKind, value: float, spoils: bool, text: str) -> Fault:
         return Fault(kind, self.name, float(value), spoils, text)
 
 
 def missing_samples(x: _Channel) -> Fault | None:
     """Samples that are not finite, or one value held over a whole cycle of the fastest line."""
-    bad = int(np.count_nonzero(~np.isfinite(x.samples)))
-    if bad:
+    if not x.complete:
+        bad = int(np.count_nonzero(~np.isfinite(x.samples)))
         text = f"{bad} samples of the {x.name} are missing (not finite)"
         return x.fault(FaultKind.MISSING_SAMPLES, bad, True, text)
     record = x.samples.ravel()
-    starts, lengths = _runs(record)
     cycle = max(8, -(-x.samples.shape[1] // int(np.max(x.harmonics))))
+    some = record[:: cycle // 2]
+    if not np.any(some[1:] == some[:-1]):
+        return None  # of what is held for longer than a cycle, two of these are neighbours
+    starts, lengths = _runs(record)
     value = record[starts]
     # a clipped peak is held too, but that is saturation
     held = (lengths > cycle) & (value != record.max()) & (value != record.min())
