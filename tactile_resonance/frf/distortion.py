@@ -132,23 +132,18 @@ class Distortion:
 
     Attributes
     ----------
-    excited_harmonics : (F,) int
     frequency_hz : (F,) float
     output, input : (..., M, F) complex
         Mean spectra at the excited lines [V].
     even, odd : DetectionLines
         `odd` has no lines for a grid that excites every odd harmonic.
-    realisations, periods : int
     """
 
-    excited_harmonics: IntArray
     frequency_hz: FloatArray
     output: ComplexArray
     input: ComplexArray
     even: DetectionLines
     odd: DetectionLines
-    realisations: int
-    periods: int
 
     def summary(self) -> str:
         """A sentence per parity, for people; the worst of all batches."""
@@ -242,14 +237,11 @@ def nonlinear_distortion(
         )
     y, u = excited.spectra[..., 0, :], excited.spectra[..., 1, :]  # (..., M, F)
     return Distortion(
-        excited_harmonics=excited.harmonics,
         frequency_hz=excited.frequency_hz(sample_rate_hz),
         output=y,
         input=u,
         even=_detection_lines(spectra.at(detection[detection % 2 == 0]), excited, sample_rate_hz),
         odd=_detection_lines(spectra.at(detection[detection % 2 == 1]), excited, sample_rate_hz),
-        realisations=spectra.spectra.shape[-3],
-        periods=spectra.periods,
     )
 
 

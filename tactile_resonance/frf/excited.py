@@ -14,9 +14,8 @@ GAP_DB = 15.0
 
 _FALSE_ALARM = 1e-4  # probability that any pure-noise line of a record passes for a signal
 _NOISE_BINS = 16  # bins wanted for the noise level at a line
-_FEWEST_BELOW = (
-    4  # lines of noise whose weakest four are 15 dB below the next: once in 31^4 records
-)
+# lines of noise: their weakest four are 15 dB below the next once in 31^4 records
+_FEWEST_BELOW = 4
 _STRAY_SHARE = 0.03  # even lines, relative to the odd ones, up to which a grid is called odd
 
 
