@@ -96,6 +96,18 @@ def test_lost_samples(record):
     assert fault.spoils
 
 
+@pytest.mark.parametrize(("lost", "last", "found"), [(1, 200, False), (2, 170, True), (2, 200, True)])
+def test_few_lost_samples_show_where_lines_reach_far_enough(multisine, lost, last, found):
+    """Unshifted periods correlate to sin(x) / x, x = 2 pi lost last / samples: .76, .40, .23 of the most."""
+    rng = np.random.default_rng(4)
+    lines = np.arange(5, last, 2)
+    u = np.tile(multisine(lines, SAMPLES, rng, amplitude=0.1), 4)
+    cut = np.append(np.delete(u, np.arange(2500, 2500 + lost)), u[:lost])
+    u, cut = (x.reshape(4, SAMPLES) + 1e-4 * rng.standard_normal((4, SAMPLES)) for x in (u, cut))
+    report = find_faults(Spectrum.of(cut, u), sample_rate_hz=RATE, harmonics=lines)
+    assert (FaultKind.LOST_SAMPLES in report.kinds) is found
+
+
 def test_offset_and_drift(record):
     u, y = record
     fault = only(check(u, y + 1), FaultKind.OFFSET, "sensor")
