@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from tactile_resonance.frf.fast import fast_frf
+from tactile_resonance.frf.estimate import fast_frf, robust_frf
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.robust import robust_frf
-from tactile_resonance.frf.spectra import averaged_spectra
-from tactile_resonance.frf.streaming import FrfStream
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 from tactile_resonance.multisine import Excitation, design_multisine
+from tactile_resonance.record import Channel, Record
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -113,40 +113,47 @@ def measure_timing(repetitions: int) -> dict[str, tuple[float, Array, float | No
     def transform() -> tuple:
         return scipy.fft.rfft(u.ravel()), scipy.fft.rfft(y.ravel())
 
-    def stream(band_hz: tuple[float, float] | None) -> tuple[Callable, Callable]:
-        stream = FrfStream(lines, SAMPLES, sample_rate_hz=RATE_HZ, band_hz=band_hz)
+    excitation = design_multisine(
+        sample_rate_hz=RATE_HZ, samples_per_period=SAMPLES, periods=PERIODS
+    )
+    blocks = [
+        Record(Channel(u[k]), Channel(y[k]), RATE_HZ, SAMPLES, block_index=k)
+        for k in range(PERIODS)
+    ]
+    live: list[MeasurementFrf] = []
 
-        def refill() -> None:
-            if stream.periods:
-                stream.next_realisation()
-            for period in range(PERIODS - 1):
-                stream.add_period(u[period], y[period])
+    def begin() -> None:
+        live[:] = [MeasurementFrf(1, bins_band_hz=BAND_HZ)]
+        for block in blocks[:-1]:
+            live[0].add(block, excitation)
 
-        return refill, lambda: stream.add_period(u[-1], y[-1])
-
-    spectrum = plan.transformed(u, y)
+    record = Spectrum.of(u, y)
+    plan(record)
     nothing: Callable = lambda: None  # noqa: E731
     tasks: dict[str, tuple[Callable, Callable, float | None]] = {
         "bare real FFT, 2 channels": (nothing, transform, None),
-        "transform by periods, 2 channels": (nothing, lambda: plan.transformed(u, y), None),
-        "local polynomial part alone": (nothing, lambda: plan.from_transform(spectrum), 0.15),
+        "spectra of the record, 2 channels": (nothing, lambda: Spectrum.of(u, y).bins, None),
+        "local polynomial part alone": (nothing, lambda: plan(record), None),
         "whole FRF with covariance": (
             nothing,
-            lambda: fast_frf(plan(u, y), sample_rate_hz=RATE_HZ),
+            lambda: fast_frf(plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ),
             1.3,
         ),
         "the same from float32 records": (
             nothing,
-            lambda: fast_frf(plan(u_single, y_single), sample_rate_hz=RATE_HZ),
+            lambda: fast_frf(plan(Spectrum.of(u_single, y_single)), sample_rate_hz=RATE_HZ),
             1.3,
         ),
         "FRF of 200-300 Hz": (
             nothing,
-            lambda: fast_frf(band_plan(u, y), sample_rate_hz=RATE_HZ),
-            1.1,
+            lambda: fast_frf(band_plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ),
+            1.3,
         ),
-        "streaming, 8th period, all lines": (*stream(None), 1.3),
-        "streaming, 8th period, 200-300 Hz": (*stream(BAND_HZ), 0.5),
+        "live, 8th block: FRF, bins of 200-300 Hz, faults": (
+            begin,
+            lambda: live[0].add(blocks[-1], excitation),
+            None,
+        ),
     }
     seconds: dict[str, list[float]] = {name: [] for name in tasks}
     ratios: dict[str, list[float]] = {name: [] for name in tasks}
@@ -192,17 +199,20 @@ def measure_accuracy(
         u, y = plant.records(rng, PERIODS)
         estimates: dict[str, FRF] = {
             f"mean of {PERIODS - skip} periods" + (", the first dropped" if skip else ""): fast_frf(
-                averaged_spectra(u, y, lines, unsettled_periods=skip), sample_rate_hz=RATE_HZ
+                averaged_spectra(Spectrum.of(u, y), lines, unsettled_periods=skip),
+                sample_rate_hz=RATE_HZ,
             )
             for skip in (0, 1)
         }
         for order, plan in plans.items():
-            estimates[f"fast, order {order}"] = fast_frf(plan(u, y), sample_rate_hz=RATE_HZ)
+            estimates[f"fast, order {order}"] = fast_frf(
+                plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ
+            )
         halves = [p.records(rng, PERIODS // 2) for p in plants]
         u, y = (np.stack(channel) for channel in zip(*halves, strict=True))
         estimates[f"robust, 2 realisations of {PERIODS // 2} periods, order 2"] = robust_frf(
-            short(u, y), sample_rate_hz=RATE_HZ
-        ).frf
+            short(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ
+        )
         for name, frf in estimates.items():
             variance = frf.variance_noise
             assert variance is not None  # every method here has two periods or more

@@ -84,14 +84,16 @@ def local_polynomial_spectra(
     line_hz = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD
     harmonics = np.arange(round(band_hz[0] / line_hz), round(band_hz[1] / line_hz) + 1)
     plan = LocalPolynomialPlan(harmonics, SAMPLES_PER_PERIOD, plant.periods)
-    samples = SAMPLES_PER_PERIOD * plant.periods
-    pair = np.stack([y, u], axis=1) * samples  # (runs, 2, K); the plan divides again
-    groups = []
-    for group in plan.groups:
-        where = group.centre_bins + group.offsets[:, None] - bins[0]  # (W, L)
-        groups.append(np.ascontiguousarray(np.moveaxis(pair[:, :, where], 1, 2)))
-    result = plan.from_bins(groups)
-    return harmonics * line_hz, result.spectra, result.covariance, result.noise_dof
+    whole = np.zeros((2, SAMPLES_PER_PERIOD * plant.periods // 2 + 1), complex)
+    results = []
+    for pair in np.stack(
+        [y, u], axis=1
+    ):  # (2, K), one run after the other: whole spectra are large
+        whole[:, bins] = pair
+        results.append(plan.from_bins(whole))
+    spectra = np.stack([of.spectra for of in results])
+    covariance = np.stack([of.covariance for of in results])
+    return harmonics * line_hz, spectra, covariance, plan.noise_dof
 
 
 def compare_methods(quick: bool) -> list[Method]:

@@ -7,22 +7,24 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.distortion import Distortion
-from tactile_resonance.frf.estimate import estimate_distortion, estimate_frf
+from tactile_resonance.frf.band_bins import band_bins
+from tactile_resonance.frf.distortion import Distortion, estimate_distortion
+from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.identification.band import strongest_resonance_band
 from tactile_resonance.identification.estimator import POLES_METHODS, second_attempt
 from tactile_resonance.identification.identify import identify_poles
-from tactile_resonance.identification.joint_records import identify_poles_from_records
+from tactile_resonance.identification.joint_records import identify_poles_from_bins
 from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
@@ -94,28 +96,22 @@ def analyse(
     if poles_method not in POLES_METHODS:
         raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
     recording.require_driven()
+    if poles_method == "joint" and channel_delay_s:
+        raise ValueError("method: joint takes no channel delay, use frf")
     structure = structure or ModelStructure()
     warnings = list(recording.notes)
+    record = Spectrum.of(recording.u, recording.y)
+    rate_hz, harmonics = recording.sample_rate_hz, recording.excited_harmonics
     start = time.perf_counter()
-    harmonics = recording.excited_harmonics
     if harmonics is None:
-        harmonics = find_excited_harmonics(recording.u)
+        harmonics = find_excited_harmonics(record)
         warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
     found = time.perf_counter()
-    frf = estimate_frf(
-        recording.u,
-        recording.y,
-        sample_rate_hz=recording.sample_rate_hz,
-        harmonics=harmonics,
-        method=frf_method,
+    spectra = mean_spectra(record, harmonics, method=frf_method)
+    frf = frf_of_realisations(spectra, sample_rate_hz=rate_hz)
+    faults = find_faults(
+        record, sample_rate_hz=rate_hz, harmonics=harmonics, transient_removed=record.periods > 1
     )
-    frf = find_faults(
-        recording.u,
-        recording.y,
-        sample_rate_hz=recording.sample_rate_hz,
-        harmonics=harmonics,
-        transient_removed=recording.u.shape[-2] > 1,
-    ).marked(frf)
     estimated = time.perf_counter()
     if channel_delay_s:
         frf = correct_skew(frf, channel_delay_s)
@@ -131,28 +127,31 @@ def analyse(
     if poles_method == "auto":
         poles_method = "frf" if channel_delay_s else "joint"
 
+    bins = None
+    if poles_method == "joint":
+        bins = band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
+    # what is to be said about the FRF is said once, below
+    silent = replace(faults.marked(frf), message="")
+
     def fit(structure: ModelStructure) -> Poles:
-        return _poles(recording, harmonics, frf, poles_method, band_hz, structure, channel_delay_s)
+        if bins is None:
+            return identify_poles(silent, band_hz, structure)
+        poles = identify_poles_from_bins(bins, band_hz, structure)
+        return second_attempt(poles, silent, band_hz, structure)
 
     poles = choose_among(fit, candidates).best if candidates else fit(structure)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:
         distortion = estimate_distortion(
-            recording.u,
-            recording.y,
-            sample_rate_hz=recording.sample_rate_hz,
-            harmonics=harmonics,
-            method=frf_method,
+            record, sample_rate_hz=rate_hz, harmonics=harmonics, method=frf_method
         )
     if poles.status is PolesStatus.TOO_FEW_LINES:
         raise ValueError(f"band: {poles.message}")
-    if frf.message:
-        warnings.append(f"frf: {frf.message}")
-    # the poles repeat what the FRF has to say
-    of_the_poles = poles.message.replace(frf.message, "") if frf.message else poles.message
-    if of_the_poles.strip("; "):
-        warnings.append(f"poles: {of_the_poles.strip('; ')}")
+    frf = faults.marked(frf)
+    warnings += [
+        f"{name}: {of.message}" for name, of in (("frf", frf), ("poles", poles)) if of.message
+    ]
     return Analysis(
         frf,
         poles,
@@ -164,30 +163,6 @@ def analyse(
             "poles": identified - estimated,
         },
     )
-
-
-def _poles(
-    recording: Recording,
-    harmonics: npt.NDArray[np.int64],
-    frf: FRF,
-    method: str,
-    band_hz: tuple[float, float],
-    structure: ModelStructure,
-    channel_delay_s: float,
-) -> Poles:
-    if method == "joint" and channel_delay_s:
-        raise ValueError("method: joint takes no channel delay, use frf")
-    if method == "frf":
-        return identify_poles(frf, band_hz, structure)
-    poles = identify_poles_from_records(
-        recording.u,
-        recording.y,
-        sample_rate_hz=recording.sample_rate_hz,
-        harmonics=harmonics,
-        band_hz=band_hz,
-        structure=structure,
-    )
-    return second_attempt(poles, frf, band_hz, structure)
 
 
 def analysis_as_json(analysis: Analysis) -> str:

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.frf import estimate as frf_stage
+from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.identification import identify as poles_stage
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.identification.structure import ModelStructure
@@ -137,16 +137,12 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     True
     """
     recording.require_driven()
+    record = Spectrum.of(recording.u, recording.y)
     harmonics = recording.excited_harmonics
     if harmonics is None:
-        harmonics = find_excited_harmonics(recording.u)
-    return frf_stage.estimate_frf(
-        recording.u,
-        recording.y,
-        sample_rate_hz=recording.sample_rate_hz,
-        harmonics=np.asarray(harmonics),
-        method=method,
-    )
+        harmonics = find_excited_harmonics(record)
+    spectra = mean_spectra(record, harmonics, method=method)
+    return frf_of_realisations(spectra, sample_rate_hz=recording.sample_rate_hz)
 
 
 def identify_poles(

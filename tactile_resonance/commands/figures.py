@@ -72,13 +72,14 @@ def _simulation(output: Path) -> None:
 
 
 def _distortion(output: Path) -> None:
-    from tactile_resonance.frf.estimate import estimate_distortion
+    from tactile_resonance.frf.distortion import estimate_distortion
+    from tactile_resonance.frf.spectra import Spectrum
     from tactile_resonance.report.distortion_figure import draw_distortion, draw_distortion_levels
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.simulation.experiments import records_at_levels
 
     cases = {
-        level_v: estimate_distortion(u, y, sample_rate_hz=rate_hz, harmonics=harmonics)
+        level_v: estimate_distortion(Spectrum.of(u, y), sample_rate_hz=rate_hz, harmonics=harmonics)
         for level_v, (u, y, harmonics, rate_hz) in records_at_levels(
             (1.0, 2.0, 3.0, 4.0), progress=_progress
         ).items()
@@ -97,14 +98,15 @@ def _distortion(output: Path) -> None:
 
 
 def _variance(output: Path) -> None:
-    from tactile_resonance.frf.spectra import period_spectra
+    from tactile_resonance.frf.spectra import Spectrum
     from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.report.variance_figure import draw_variance
     from tactile_resonance.simulation.experiments import repeated_records
 
     u, y, harmonics, rate_hz = repeated_records(progress=_progress)
-    g = period_spectra(y, harmonics) / period_spectra(u, harmonics)
+    lines = Spectrum.of(u, y).by_period[..., harmonics]  # (..., 2, P, F)
+    g = lines[..., 0, :, :] / lines[..., 1, :, :]
     frequency_hz = harmonics * rate_hz / u.shape[-1]
     inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
     whole = analyse_variance(g, frequency_hz, axes=PAPER_AXES)

@@ -14,6 +14,7 @@ import numpy as np
 
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.recording.files import read_recording
@@ -267,7 +268,7 @@ def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:
     """The recording of a file as if a device had taken it; ids are 0, times unknown."""
     harmonics = recording.excited_harmonics
     if harmonics is None:
-        harmonics = find_excited_harmonics(recording.u)
+        harmonics = find_excited_harmonics(Spectrum.of(recording.u, recording.y))
     realisations, periods, n = recording.u.shape
     excitations, records = [], []
     for realisation in range(realisations):

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance.frf.spectra import ComplexArray, IntArray, Spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +68,13 @@ class BandBins:
         return first * self.resolution_hz, (first + self.count - 1) * self.resolution_hz
 
 
-def stacked_bins(realisations: Sequence[BandBins]) -> BandBins | None:
-    """Of several realisations; None where they differ in lines or periods."""
-    first = realisations[0]
-    for other in realisations[1:]:
+def stacked_bins(realisations: Sequence[BandBins | None]) -> BandBins | None:
+    """Of several realisations; None where they differ in lines or periods, or one has none."""
+    each = [bins for bins in realisations if bins is not None]
+    if len(each) < len(realisations):
+        return None
+    first = each[0]
+    for other in each[1:]:
         alike = (
             other.periods == first.periods
             and other.samples_per_period == first.samples_per_period
@@ -86,6 +87,47 @@ def stacked_bins(realisations: Sequence[BandBins]) -> BandBins | None:
             return None
     return replace(
         first,
-        u=np.concatenate([each.u for each in realisations]),
-        y=np.concatenate([each.y for each in realisations]),
+        u=np.concatenate([bins.u for bins in each]),
+        y=np.concatenate([bins.y for bins in each]),
+    )
+
+
+def band_bins(
+    record: Spectrum,
+    harmonics: IntArray,
+    *,
+    sample_rate_hz: float,
+    band_hz: tuple[float, float],
+) -> BandBins | None:
+    """Of a record of M realisations; None where the band holds no excited line.
+
+    Parameters
+    ----------
+    record : Spectrum
+        Of samples (2, P, N) or (M, 2, P, N).
+    harmonics : (F,) int
+        All excited lines.
+    sample_rate_hz : float
+    band_hz : (low, high)
+        Of it the bins above zero and below half the sample rate.
+
+    Raises
+    ------
+    ValueError
+        If the band is not 0 <= low < high.
+    """
+    low_hz, high_hz = band_hz
+    if not 0 <= low_hz < high_hz:
+        raise ValueError(f"bins: band {low_hz:g} to {high_hz:g} Hz, expected 0 <= low < high")
+    periods, samples = record.periods, record.samples_per_period
+    low, high = (hz * samples / sample_rate_hz for hz in band_hz)
+    lines = harmonics[(harmonics >= low - 1e-9) & (harmonics <= high + 1e-9)]
+    if lines.size == 0:
+        return None
+    first = max(1, int(np.ceil(low * periods - 1e-9)))
+    last = min((periods * samples - 1) // 2, int(np.floor(high * periods + 1e-9)))
+    # copies: the whole spectrum need not be kept for them
+    bins = record.bins[..., first : last + 1].reshape(-1, 2, last + 1 - first)
+    return BandBins(
+        first, bins[:, 1].copy(), bins[:, 0].copy(), lines, sample_rate_hz, samples, periods
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The FRF of a whole record: which estimator serves which record."""
+"""The FRF of a record: mean spectra, their ratio, its covariances, and whether it can be relied on."""
 
 from __future__ import annotations
 
@@ -8,19 +8,33 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.distortion import Distortion, nonlinear_distortion
-from tactile_resonance.frf.fast import fast_frf
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
-from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.robust import robust_frf
-from tactile_resonance.frf.spectra import IntArray, PeriodicSpectra, averaged_spectra
+from tactile_resonance.frf.local_polynomial import kept_plan
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.spectra import (
+    ComplexArray,
+    PeriodicSpectra,
+    Spectrum,
+    averaged_spectra,
+    checked_harmonics,
+    conditional_variance,
+    error_variance,
+    power,
+    ratio,
+    ratio_variance,
+)
 
 METHODS = ("local polynomial", "average")
 
+WEAK_INPUT_DB = 10.0
+"""Input signal-to-noise ratio of a mean spectrum below which Y/U is biased [dB]."""
+
+# Chance alone makes realisations of one period look like a transient once in ten thousand times.
+TRANSIENT_SCORE = 3.7
+
 
 def estimate_frf(
-    u: npt.NDArray[np.floating],
-    y: npt.NDArray[np.floating],
+    u: npt.ArrayLike,
+    y: npt.ArrayLike,
     *,
     sample_rate_hz: float,
     harmonics: npt.ArrayLike,
@@ -47,69 +61,226 @@ def estimate_frf(
     -------
     FRF
         ``variance_noise`` needs two periods used, ``variance_total`` two realisations; what is
-        missing is None and said in the status. Mean spectra are given for one realisation only:
-        those of several have different phases and no mean.
+        missing is None and said in the status.
 
     Raises
     ------
     ValueError
         For another method, or shapes that do not fit.
     """
-    spectra = _spectra(u, y, np.asarray(harmonics, np.int64), method, order, dof)
-    if u.shape[-3] > 1:
-        return robust_frf(spectra, sample_rate_hz=sample_rate_hz).frf
-    return fast_frf(_only_realisation(spectra), sample_rate_hz=sample_rate_hz)
+    record = Spectrum.of(u, y)
+    spectra = mean_spectra(record, harmonics, method=method, order=order, dof=dof)
+    return frf_of_realisations(spectra, sample_rate_hz=sample_rate_hz)
 
 
-def estimate_distortion(
-    u: npt.NDArray[np.floating],
-    y: npt.NDArray[np.floating],
-    *,
-    sample_rate_hz: float,
+def mean_spectra(
+    record: Spectrum,
     harmonics: npt.ArrayLike,
+    *,
     method: str = "local polynomial",
     order: int = 2,
     dof: int = 6,
-) -> Distortion:
-    """Even and odd distortion at the lines of the excited band that are not excited.
-
-    Parameters are those of `estimate_frf`; see `distortion.nonlinear_distortion`.
-
-    Raises
-    ------
-    ValueError
-        If an even line is excited or none is left out.
-    """
-    excited = np.asarray(harmonics, np.int64)
-    band = np.arange(excited.min(), excited.max() + 1)
-    spectra = _spectra(u, y, band, method, order, dof)
-    return nonlinear_distortion(spectra, excited, sample_rate_hz=sample_rate_hz)
-
-
-def _spectra(
-    u: npt.NDArray[np.floating],
-    y: npt.NDArray[np.floating],
-    harmonics: IntArray,
-    method: str,
-    order: int,
-    dof: int,
 ) -> PeriodicSpectra:
-    """Mean spectra (..., M, 2, F) of each realisation."""
+    """Mean spectra (..., 2, F) of a record; parameters are those of `estimate_frf`."""
     if method not in METHODS:
         raise ValueError(f"method: {method!r}, accepted are {', '.join(METHODS)}")
-    if u.ndim < 3 or u.shape != y.shape:
-        raise ValueError(f"u, y: shapes {u.shape}, {y.shape}, expected the same (..., M, P, N)")
-    periods, samples = u.shape[-2:]
+    samples, periods = record.samples_per_period, record.periods
+    lines = checked_harmonics(harmonics, samples)
     if periods > 1 and method == "local polynomial":
-        return LocalPolynomialPlan(harmonics, samples, periods, order, dof)(u, y)
-    unsettled = 1 if periods > 2 else 0
-    return averaged_spectra(u, y, harmonics, unsettled_periods=unsettled)
+        return kept_plan(lines.tobytes(), samples, periods, order, dof)(record)
+    return averaged_spectra(record, lines, unsettled_periods=1 if periods > 2 else 0)
 
 
-def _only_realisation(spectra: PeriodicSpectra) -> PeriodicSpectra:
+def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
+    """FRF from mean spectra (..., M, 2, F), of one realisation or of several."""
+    if spectra.spectra.ndim < 3:
+        raise ValueError(
+            f"spectra: shape {spectra.spectra.shape}, expected (..., M, 2, F) with realisations M"
+        )
+    if spectra.spectra.shape[-3] > 1:
+        return robust_frf(spectra, sample_rate_hz=sample_rate_hz)
     covariance = spectra.covariance
-    return replace(
+    only = replace(
         spectra,
         spectra=spectra.spectra[..., 0, :, :],
         covariance=None if covariance is None else covariance[..., 0, :, :, :],
     )
+    return fast_frf(only, sample_rate_hz=sample_rate_hz)
+
+
+def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
+    """FRF and its noise variance from the mean spectra of one realisation.
+
+    Parameters
+    ----------
+    spectra : PeriodicSpectra
+        From `local_polynomial.LocalPolynomialPlan` (transient removed) or
+        `averaged_spectra`.
+    sample_rate_hz : float
+
+    Returns
+    -------
+    FRF
+        Status NO_COVARIANCE for a single period; SUSPECT where the input is too weak at a line for
+        the ratio Y/U to be unbiased.
+
+    Notes
+    -----
+    With noise on the input the ratio is biased and its variance formula too small where the mean
+    input is not well above its noise: the relative bias is ``-exp(-|U|^2 / var U)`` for
+    Gaussian noise, below 5e-5 at 10 dB (Pintelon & Schoukens 2012, chapter 2).
+    """
+    variance = given = None
+    if spectra.covariance is not None:
+        variance = ratio_variance(spectra.spectra, spectra.covariance)
+        given = conditional_variance(spectra.covariance)
+    status, message = response_status(spectra.spectra, spectra.covariance)
+    return FRF(
+        frequency_hz=spectra.frequency_hz(sample_rate_hz),
+        g=ratio(spectra.spectra),
+        variance_noise=variance,
+        noise_dof=spectra.noise_dof,
+        actuator_amplitude=np.abs(spectra.spectra[..., 1, :]),
+        sensor_variance_given_actuator=given,
+        periods=spectra.periods,
+        method=spectra.method,
+        status=status,
+        message=message,
+    )
+
+
+def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
+    """Best linear approximation from the mean spectra of M realisations.
+
+    Each gives its own FRF, ``G_m = Y_m / U_m``; G is their mean. Several phase realisations tell
+    stochastic nonlinear distortion from noise: `FRF.variance_distortion`.
+
+    Parameters
+    ----------
+    spectra : PeriodicSpectra
+        With spectra (..., M, 2, F), M >= 2, from `local_polynomial.LocalPolynomialPlan` (transient
+        removed) or `averaged_spectra` (steady state; a single period is enough).
+    sample_rate_hz : float
+
+    Raises
+    ------
+    ValueError
+        For fewer than two realisations.
+
+    Notes
+    -----
+    The noise variance is that of the mean noise covariance over realisations, at the mean G, over
+    the mean input power, ``(C_YY + |G|^2 C_UU - 2 Re(C_YU conj G)) / (M^2 mean |U|^2)``, sums over
+    m understood; the total variance is the sample variance over realisations. Random phases and
+    equal amplitude spectra of all realisations are presumed. `total_dof` is M - 1: the total
+    variance of few realisations is itself uncertain.
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    chapter 4; Pintelon, Barbe, Vandersteen & Schoukens, MSSP 25 (2011) 2683-2704 (with
+    transients).
+    """
+    each = spectra.spectra  # (..., M, 2, F)
+    if each.ndim < 3 or each.shape[-3] < 2:
+        raise ValueError(
+            f"spectra: shape {each.shape}, expected (..., M, 2, F) with M >= 2 realisations; "
+            "one realisation cannot tell distortion from the system"
+        )
+    realisations = each.shape[-3]
+    g_each = ratio(each)  # (..., M, F)
+    g = g_each.mean(axis=-2)
+    variance_total = np.var(g_each, axis=-2, ddof=1) / realisations
+    variance_noise = None
+    if spectra.covariance is not None:
+        noise = spectra.covariance.mean(axis=-4) / realisations  # (..., 2, 2, F)
+        variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
+    status, message = _robust_status(each, spectra.covariance, g)
+    return FRF(
+        frequency_hz=spectra.frequency_hz(sample_rate_hz),
+        g=g,
+        variance_noise=variance_noise,
+        variance_total=variance_total,
+        noise_dof=realisations * spectra.noise_dof,
+        total_dof=realisations - 1,
+        periods=spectra.periods,
+        realisations=realisations,
+        method=f"robust method, {spectra.method}",
+        status=status,
+        message=message,
+    )
+
+
+def response_status(
+    spectra: ComplexArray, covariance: ComplexArray | None
+) -> tuple[FrfStatus, str]:
+    """Whether the ratio Y/U of mean spectra can be relied on.
+
+    Parameters
+    ----------
+    spectra : (..., 2, F) complex
+        [Y; U].
+    covariance : (..., 2, 2, F) complex or None
+        Noise covariance of these.
+    """
+    if covariance is None:
+        return FrfStatus.NO_COVARIANCE, "one period of one realisation: no covariance"
+    input_power = power(spectra[..., 1, :])  # (..., F)
+    silent = int(np.count_nonzero(input_power == 0))
+    if silent:
+        return (
+            FrfStatus.SUSPECT,
+            f"no input at {silent} of {input_power.size} lines: no response there",
+        )
+    weak = input_power < 10 ** (WEAK_INPUT_DB / 10) * covariance[..., 1, 1, :].real
+    if np.any(weak):
+        return (
+            FrfStatus.SUSPECT,
+            f"input less than {WEAK_INPUT_DB:g} dB above its noise at {np.count_nonzero(weak)} of "
+            f"{weak.size} lines: their response is biased",
+        )
+    return FrfStatus.OK, ""
+
+
+def _robust_status(
+    each: ComplexArray, covariance: ComplexArray | None, g: ComplexArray
+) -> tuple[FrfStatus, str]:
+    if covariance is not None:
+        return response_status(each, covariance)
+    if transient_score(each, g) > TRANSIENT_SCORE:
+        return (
+            FrfStatus.SUSPECT,
+            "a transient: what the realisations differ by is alike on neighbouring lines, which noise "
+            "and distortion are not; record two periods or more of each, or wait before the record",
+        )
+    return (
+        FrfStatus.OK,
+        "one period per realisation: noise cannot be told from distortion, the variance over "
+        "realisations holds both",
+    )
+
+
+def transient_score(each: ComplexArray, g: ComplexArray) -> float:
+    """How alike neighbouring lines of ``Y_m - G U_m`` are, in standard deviations of chance.
+
+    Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
+    smooth. Every product of neighbours has mean zero then and brings its own variance, so that lines
+    may differ in noise.
+
+    Parameters
+    ----------
+    each : (..., M, 2, F) complex
+        Spectra [Y; U] of the realisations.
+    g : (..., F) complex
+        Mean response.
+
+    Returns
+    -------
+    float
+        The largest over the leading axes; NaN for fewer than two lines.
+    """
+    error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
+    product = np.real(error[..., 1:] * error[..., :-1].conj())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        score = product.sum(axis=(-2, -1)) / np.sqrt(np.sum(product**2, axis=(-2, -1)))
+    return float(np.max(score))

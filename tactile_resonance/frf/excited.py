@@ -5,38 +5,33 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft, ndimage, special
+from scipy import ndimage, special
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance.frf.spectra import FloatArray, IntArray, Spectrum, power
 
 GAP_DB = 15.0
 """A step this large between neighbouring sorted levels parts excited lines from distortion [dB]."""
 
 _FALSE_ALARM = 1e-4  # probability that any pure-noise line of a record passes for a signal
 _NOISE_BINS = 16  # bins wanted for the noise level at a line
-_FEWEST_BELOW = (
-    4  # lines of noise whose weakest four are 15 dB below the next: once in 31^4 records
-)
+# lines of noise: their weakest four are 15 dB below the next once in 31^4 records
+_FEWEST_BELOW = 4
 _STRAY_SHARE = 0.03  # even lines, relative to the odd ones, up to which a grid is called odd
 
 
-def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntArray:
+def find_excited_harmonics(record: Spectrum) -> IntArray:
     """Excited harmonics of a multisine, from its input record alone.
 
     A line is a candidate if it stands above the noise around it. The candidates, sorted by level,
-    are then cut at the first step of `gap_db` from the top: what lies below is distortion of the
+    are then cut at the first step of `GAP_DB` from the top: what lies below is distortion of the
     input (generator, amplifier), not excitation. So the levels of excited lines may span any range
-    as long as no step between two neighbouring levels reaches `gap_db`. Where nearly all of these
+    as long as no step between two neighbouring levels reaches `GAP_DB`. Where nearly all of these
     lines are odd (97 %), the grid is odd, and the few even lines are interference (mains hum).
 
     Parameters
     ----------
-    u : (..., P, N) float
-        Input: P consecutive periods of N samples. All leading axes (realisations) excite the same
-        lines; their powers are averaged.
-    gap_db : float
-        Smallest step in level between excited lines and distortion [dB].
+    record : Spectrum
+        All leading axes (realisations) excite the same lines; their powers are averaged.
 
     Returns
     -------
@@ -47,7 +42,7 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     ------
     ValueError
         If samples are not finite, no line is above the noise, or, for a single period, no step of
-        `gap_db` parts lines from noise.
+        `GAP_DB` parts lines from noise.
 
     Notes
     -----
@@ -58,59 +53,54 @@ def find_excited_harmonics(u: npt.ArrayLike, *, gap_db: float = GAP_DB) -> IntAr
     for one at a resonance. Lines less than some 14 dB above the noise on a bin are missed.
 
     For P = 1 there are no such bins: the noise level is that of the weaker half of the lines. Where
-    more than half are excited nothing stands above that; then a step of `gap_db` must part them from
+    more than half are excited nothing stands above that; then a step of `GAP_DB` must part them from
     at least four lines of noise, which noise alone does in less than one record of a hundred
     thousand. Coloured noise above the level of the lines cannot then be distinguished from excitation.
     """
-    u = np.asarray(u)
-    if u.ndim < 2 or u.shape[-1] < 4 or u.size == 0:
-        raise ValueError(f"u: shape {u.shape}, expected (..., P, N) with N >= 4")
-    if not np.all(np.isfinite(u)):
+    periods, samples = record.periods, record.samples_per_period
+    if samples < 4:
+        raise ValueError(f"u: {samples} samples in a period, expected 4 or more")
+    u = record.bins[..., 1, :]  # (..., P N // 2 + 1)
+    if not np.all(np.isfinite(u[..., 0])):  # one sample that is missing makes all bins NaN
         raise ValueError("u: holds samples that are not finite, expected a complete record")
-    if not gap_db > 0:
-        raise ValueError(f"gap_db: {gap_db}, expected a positive step in decibels")
-    periods, samples = u.shape[-2:]
-    record = u.reshape(-1, periods * samples)  # (M, P N)
-    # a large offset would cost precision where samples are float32
-    record = record - np.mean(record, axis=-1, keepdims=True)
-    spectrum = fft.rfft(record, axis=-1)  # (M, P N // 2 + 1)
-    power = np.mean(spectrum.real.astype(float) ** 2 + spectrum.imag.astype(float) ** 2, axis=0)
+    u = u.reshape(-1, u.shape[-1])
+    power_of_bins = np.mean(power(u), axis=0)
     harmonics = np.arange(1, (samples - 1) // 2 + 1)  # (H,)
-    line_power = power[harmonics * periods]  # (H,)
-    records = record.shape[0]
+    line_power = power_of_bins[harmonics * periods]  # (H,)
+    records = u.shape[0]
     threshold = (
         _noise_threshold_single_period(line_power, records)
         if periods == 1
-        else _noise_threshold_between(power, harmonics, periods, records)
+        else _noise_threshold_between(power_of_bins, harmonics, periods, records)
     )
     candidate = line_power > threshold
     level_db = 10 * np.log10(np.maximum(line_power, np.finfo(float).tiny))
     if periods == 1 and not np.any(candidate):
-        candidate = _above_a_step(level_db, gap_db)
+        candidate = _above_a_step(level_db)
     if not np.any(candidate):
         raise ValueError(
             "u: no line stands above the noise, expected a multisine; give the excited harmonics"
         )
     odd = harmonics % 2 == 1
     # an odd grid is looked for first, so that hum on an even line cannot pass for excitation
-    cut_db = _cut_level(level_db, candidate, odd, gap_db, needs_step=periods == 1)
+    cut_db = _cut_level(level_db, candidate, odd, needs_step=periods == 1)
     if cut_db is not None:
         excited = candidate & (level_db > cut_db)
         if np.sum(excited & ~odd) <= _STRAY_SHARE * np.sum(excited & odd):
             return harmonics[excited & odd].astype(np.int64)
-    cut_db = _cut_level(level_db, candidate, np.ones_like(odd), gap_db, needs_step=periods == 1)
+    cut_db = _cut_level(level_db, candidate, np.ones_like(odd), needs_step=periods == 1)
     if cut_db is None:
         raise ValueError(
-            f"u: a single period, and no step of {gap_db:g} dB between excited lines and noise; "
+            f"u: a single period, and no step of {GAP_DB:g} dB between excited lines and noise; "
             "give the excited harmonics"
         )
     return harmonics[candidate & (level_db > cut_db)].astype(np.int64)
 
 
-def _above_a_step(level_db: FloatArray, gap_db: float) -> npt.NDArray[np.bool_]:
-    """(H,) lines above the last step of `gap_db` that has `_FEWEST_BELOW` lines or more below it."""
+def _above_a_step(level_db: FloatArray) -> npt.NDArray[np.bool_]:
+    """(H,) lines above the last step of `GAP_DB` that has `_FEWEST_BELOW` lines or more below it."""
     order = np.argsort(level_db)
-    steps = np.flatnonzero(np.diff(level_db[order]) >= gap_db)
+    steps = np.flatnonzero(np.diff(level_db[order]) >= GAP_DB)
     above = np.zeros(level_db.size, bool)
     if steps.size and steps[-1] + 1 >= _FEWEST_BELOW:
         above[order[steps[-1] + 1 :]] = True
@@ -121,11 +111,10 @@ def _cut_level(
     level_db: FloatArray,
     candidate: npt.NDArray[np.bool_],
     among: npt.NDArray[np.bool_],
-    gap_db: float,
     *,
     needs_step: bool,
 ) -> float | None:
-    """Middle of the first step of `gap_db` from the top [dB], among some of the lines.
+    """Middle of the first step of `GAP_DB` from the top [dB], among some of the lines.
 
     Without such a step every candidate is excited (minus infinity), or, where the noise level is
     only guessed (`needs_step`), nothing can be told (None).
@@ -135,7 +124,7 @@ def _cut_level(
         return None
     if needs_step and np.any(among & ~candidate):
         sorted_db = np.append(sorted_db, np.max(level_db[among & ~candidate]))
-    steps = np.flatnonzero(-np.diff(sorted_db) >= gap_db)
+    steps = np.flatnonzero(-np.diff(sorted_db) >= GAP_DB)
     if steps.size:
         return float(np.mean(sorted_db[steps[0] : steps[0] + 2]))
     return None if needs_step else -np.inf

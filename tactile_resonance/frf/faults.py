@@ -3,16 +3,119 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from enum import Enum
+
 import numpy as np
 import numpy.typing as npt
+import scipy.fft
+from scipy import special
 
-from tactile_resonance.frf import record_checks as checks
-from tactile_resonance.frf.fault_types import Fault, FaultReport, worst_of
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray, Spectrum
+from tactile_resonance.tones import MAINS_HZ, ROUNDING
+
+SHARE_AT_TOP = 1 / np.sqrt(2)
+"""Largest share of a quantised peak's two topmost values that is at the top: a parabola's, cut at both."""
+GRID_SAMPLES, FEW_ALIKE = 2000, 0.98
+"""Samples of a converter that counts repeat each other; these many tell."""
+LARGE_OFFSET = 0.1
+"""Mean against the rms of the rest."""
+LARGE_DRIFT = 0.05
+"""Spread of the means of the periods against the rms of the rest."""
+MAINS_HARMONICS = 5
+_HUM_FLOOR_BINS = (10, 40)  # distance from the mains frequency at which the floor is taken
+_FALSE_ALARM = 1e-4
+
+
+class FaultKind(Enum):
+    """What is wrong with a record."""
+
+    MISSING_SAMPLES = "missing samples"
+    LOST_SAMPLES = "samples lost between periods"
+    SATURATION = "saturation"
+    OFFSET = "offset"
+    DRIFT = "drift"
+    HUM = "mains hum"
+    UNSETTLED = "first period not settled"
+    CHANNEL_SKEW = "channel skew suspected"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of one channel.
+
+    Attributes
+    ----------
+    kind : FaultKind
+    channel : str
+        ``actuator``, ``sensor``, or ``both`` where it lies between them.
+    value : float
+        How bad; the message says in which unit. Larger is worse.
+    spoils : bool
+        The FRF cannot be trusted because of it; otherwise it is worth knowing only.
+    text : str
+        What to tell people; no full stop.
+    seen_in : str
+        In how many of several records; empty where there was one.
+    """
+
+    kind: FaultKind
+    channel: str
+    value: float
+    spoils: bool
+    text: str
+    seen_in: str = ""
+
+    @property
+    def message(self) -> str:
+        """A sentence for people."""
+        return f"{self.text}{self.seen_in and ' ' + self.seen_in}."
+
+
+@dataclass(frozen=True)
+class FaultReport:
+    """All faults seen.
+
+    Attributes
+    ----------
+    faults : tuple of Fault
+        One per kind and channel, the worst over all records.
+    """
+
+    faults: tuple[Fault, ...] = ()
+
+    @property
+    def kinds(self) -> frozenset[FaultKind]:
+        """Kinds of fault present."""
+        return frozenset(fault.kind for fault in self.faults)
+
+    @property
+    def suspect(self) -> bool:
+        """True where a fault spoils the FRF."""
+        return any(fault.spoils for fault in self.faults)
+
+    @property
+    def message(self) -> str:
+        """All sentences."""
+        return " ".join(fault.message for fault in self.faults)
+
+    def marked(self, frf: FRF) -> FRF:
+        """The FRF with what was found in its message, and SUSPECT where a fault spoils it."""
+        if not self.faults:
+            return frf
+        status = frf.status
+        if self.suspect and status is not FrfStatus.FAILED:
+            status = FrfStatus.SUSPECT
+        message = "; ".join(filter(None, [frf.message, self.message]))
+        return replace(frf, status=status, message=message)
 
 
 def find_faults(
-    u: npt.NDArray[np.floating],
-    y: npt.NDArray[np.floating],
+    record: Spectrum,
     *,
     sample_rate_hz: float,
     harmonics: npt.NDArray[np.integer],
@@ -24,8 +127,7 @@ def find_faults(
 
     Parameters
     ----------
-    u, y : (..., P, N) float
-        Actuator and sensor [V].
+    record : Spectrum
     sample_rate_hz : float
     harmonics : (F,) int
         Excited lines.
@@ -39,35 +141,275 @@ def find_faults(
     -------
     FaultReport
 
-    Raises
-    ------
-    ValueError
-        If shapes differ.
-
     Notes
     -----
-    What is looked for, per record: `record_checks`. A channel skew needs a loop-back measurement
+    What is looked for, per record: `CHECKS`. A channel skew needs a loop-back measurement
     (`skew.skew_from_loopback`); from an FRF it can only be suspected (`skew.suspected_skew`).
     """
-    u, y = np.asarray(u), np.asarray(y)
-    if u.ndim < 2 or u.shape != y.shape:
-        raise ValueError(f"u, y: shapes {u.shape}, {y.shape}, expected the same (..., P, N)")
-    shape = u.shape[-2:]
+    batch = record.samples.ndim - 3
+    samples, bins, by_period = (
+        values.reshape(-1, *values.shape[batch:])
+        for values in (record.samples, record.bins, record.by_period)
+    )
     reports = []
-    for record_u, record_y in zip(u.reshape(-1, *shape), y.reshape(-1, *shape), strict=True):
+    for index in range(len(samples)):
         faults: list[Fault] = []
-        for x, channel, range_v in (
-            (record_u, "actuator", u_range_v),
-            (record_y, "sensor", y_range_v),
-        ):
-            faults += checks.missing_samples(x, channel, harmonics)
-            if not np.all(np.isfinite(x)):
-                continue  # nothing else can be told
-            faults += checks.saturation(x, channel, range_v)
-            faults += checks.offset(x, channel)
-            faults += checks.drift(x, channel, spoils=not transient_removed)
-            faults += checks.hum(x, channel, sample_rate_hz, harmonics)
-            faults += checks.lost_samples(x, channel, harmonics)
-            faults += checks.unsettled(x, channel, harmonics, spoils=not transient_removed)
+        for row, name, range_v in ((1, "actuator", u_range_v), (0, "sensor", y_range_v)):
+            of = (index, row)
+            channel = _Channel(
+                name,
+                samples[of],
+                bins[of],
+                by_period[of],
+                sample_rate_hz,
+                np.asarray(harmonics),
+                range_v,
+                transient_spoils=not transient_removed,
+            )
+            missing = missing_samples(channel)
+            if missing is not None:
+                faults.append(missing)
+            if channel.complete:  # else nothing more can be told
+                found = (check(channel) for check in CHECKS)
+                faults += [fault for fault in found if fault is not None]
         reports.append(faults)
     return worst_of(reports)
+
+
+def worst_of(per_record: Iterable[list[Fault]]) -> FaultReport:
+    """One report from the faults of each record: the worst of each kind and channel."""
+    records = list(per_record)
+    found: dict[tuple[FaultKind, str], list[Fault]] = defaultdict(list)
+    for faults in records:
+        for fault in faults:
+            found[fault.kind, fault.channel].append(fault)
+    merged = []
+    for same in found.values():
+        worst = max(same, key=lambda fault: (fault.spoils, fault.value))
+        if len(records) > 1:
+            worst = replace(worst, seen_in=f"(in {len(same)} of {len(records)} records)")
+        merged.append(worst)
+    return FaultReport(tuple(merged))
+
+
+@dataclass(frozen=True, eq=False)
+class _Channel:
+    """One channel of one record: samples (P, N), bins (K,), harmonics of each period (P, N // 2 + 1)."""
+
+    name: str
+    samples: FloatArray
+    bins: ComplexArray
+    by_period: ComplexArray
+    sample_rate_hz: float
+    harmonics: npt.NDArray[np.integer]
+    range_v: tuple[float, float] | None
+    transient_spoils: bool
+
+    @property
+    def periods(self) -> int:
+        return self.samples.shape[0]
+
+    @property
+    def complete(self) -> bool:
+        """False where a sample is missing, which makes all bins NaN."""
+        return bool(np.isfinite(self.bins[0]))
+
+    def fault(self, kind: FaultKind, value: float, spoils: bool, text: str) -> Fault:
+        return Fault(kind, self.name, float(value), spoils, text)
+
+
+def missing_samples(x: _Channel) -> Fault | None:
+    """Samples that are not finite, or one value held over a whole cycle of the fastest line."""
+    if not x.complete:
+        bad = int(np.count_nonzero(~np.isfinite(x.samples)))
+        text = f"{bad} samples of the {x.name} are missing (not finite)"
+        return x.fault(FaultKind.MISSING_SAMPLES, bad, True, text)
+    record = x.samples.ravel()
+    cycle = max(8, -(-x.samples.shape[1] // int(np.max(x.harmonics))))
+    some = record[:: cycle // 2]
+    if not np.any(some[1:] == some[:-1]):
+        return None  # of what is held for longer than a cycle, two of these are neighbours
+    starts, lengths = _runs(record)
+    value = record[starts]
+    # a clipped peak is held too, but that is saturation
+    held = (lengths > cycle) & (value != record.max()) & (value != record.min())
+    if record.max() == record.min():
+        held = lengths > cycle
+    if not np.any(held):
+        return None
+    total = int(lengths[held].sum())
+    text = f"The {x.name} stands still for {total} samples: a gap filled with the last value"
+    return x.fault(FaultKind.MISSING_SAMPLES, total, True, text)
+
+
+def saturation(x: _Channel) -> Fault | None:
+    """Samples at the ends of the range, or flat tops where the range is not known."""
+    record = x.samples.ravel()
+    if x.range_v is not None:
+        low, high = x.range_v
+        margin = 1e-6 * (high - low)
+        count = int(np.count_nonzero((record <= low + margin) | (record >= high - margin)))
+        where = f"at the ends of its range ({low:g} to {high:g} V)"
+    else:
+        count = sum(_clipped(sign * record, x.periods) for sign in (1, -1))
+        where = "on flat tops"
+    if count == 0:
+        return None
+    text = f"The {x.name} is saturated: {count} samples {where}"
+    return x.fault(FaultKind.SATURATION, count, True, text)
+
+
+def offset(x: _Channel) -> Fault | None:
+    """A mean that is large against the signal. It harms no line, but takes up range."""
+    rms = float(np.std(x.samples))
+    mean = float(np.mean(x.samples))
+    if abs(mean) <= LARGE_OFFSET * rms:
+        return None
+    text = f"The {x.name} has an offset of {mean:.3g} V beside {rms:.3g} V rms"
+    return x.fault(FaultKind.OFFSET, abs(mean), False, text)
+
+
+def drift(x: _Channel) -> Fault | None:
+    """Period means that wander. A single period cannot tell drift from its slowest lines."""
+    means = x.samples.mean(axis=-1)
+    rms = float(np.std(x.samples - means[:, None]))
+    spread = float(np.ptp(means))
+    if x.periods < 2 or spread <= LARGE_DRIFT * rms:
+        return None
+    text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record"
+    return x.fault(FaultKind.DRIFT, spread, x.transient_spoils, text)
+
+
+def hum(x: _Channel) -> Fault | None:
+    """Mains frequency and its harmonics, at bins that are not excited.
+
+    Spoils the FRF only where an excited line lies within the bins that the local polynomial method
+    draws on. Hum that falls exactly on a harmonic of several periods cannot be seen: it looks like
+    excitation or distortion.
+    """
+    periods, samples = x.samples.shape
+    resolution = x.sample_rate_hz / (periods * samples)
+    highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
+    power = 2 * np.abs(x.bins[: math.ceil(highest) + 1]) ** 2  # mean square per bin
+    rounding = ROUNDING * float(np.var(x.samples))
+    excited = np.zeros(power.size, bool)
+    lines = x.harmonics * periods
+    excited[lines[lines < power.size]] = True
+    usable = ~excited
+    if periods > 1:
+        usable[::periods] = False  # harmonics not excited may hold distortion
+    found: list[tuple[float, float, bool]] = []
+    for mains in MAINS_HZ:
+        peaks = []
+        for k in range(1, MAINS_HARMONICS + 1):
+            centre = round(k * mains / resolution)
+            # the floor is taken where leakage of the hum has died out
+            away = np.arange(*_HUM_FLOOR_BINS)
+            around = centre + np.concatenate([-away, away])
+            around = around[(around > 0) & (around < power.size)]
+            around = around[usable[around]]
+            peak = centre + np.arange(-1, 2)
+            peak = peak[(peak > 0) & (peak < power.size)]
+            peak = peak[usable[peak]]
+            if around.size < 8 or peak.size == 0:
+                continue
+            floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
+            # the floor of a few bins is itself uncertain
+            limit = special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size)
+            if power[peak].max() > max(2 * limit * floor, rounding):
+                near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
+                peaks.append((k * mains, float(power[peak].sum()), near))
+        # the fundamental may be hidden, a single high harmonic may be anything
+        if peaks and (peaks[0][0] == mains or len(peaks) > 1):
+            found += peaks
+    if not found:
+        return None
+    rms = float(np.sqrt(sum(line[1] for line in found)))
+    names = ", ".join(f"{line[0]:g}" for line in found)
+    text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms"
+    return x.fault(FaultKind.HUM, rms, any(line[2] for line in found), text)
+
+
+def lost_samples(x: _Channel) -> Fault | None:
+    """Periods shifted against each other: samples were lost between them."""
+    # the first period may hold a transient: with three others it is left out
+    start = 1 if x.periods > 2 else 0
+    if x.periods - start < 2:
+        return None
+    lines = x.by_period[start:, x.harmonics]
+    cross = lines[1:] * lines[0].conj()
+    magnitude = np.abs(cross)
+    # all lines alike, so that the peak of the correlation is sharp
+    cross = np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0)
+    if np.all(2 * np.abs(cross.real.sum(axis=-1)) >= np.count_nonzero(cross, axis=-1)):
+        return None  # the correlation at no shift is at least half of what it can be at any
+    spectra = np.zeros((cross.shape[0], x.by_period.shape[1]), complex)
+    spectra[:, x.harmonics] = cross
+    samples = x.samples.shape[1]
+    correlation = scipy.fft.irfft(spectra, samples, axis=-1)
+    shift = np.argmax(correlation, axis=-1)
+    shift = np.where(shift > samples // 2, shift - samples, shift)
+    unshifted = correlation[:, 0]
+    # a shift that explains the data no better than none is chance
+    clear = np.max(correlation, axis=-1) > 2 * np.abs(unshifted)
+    shift = np.where(clear, shift, 0)
+    if not np.any(shift):
+        return None
+    worst = int(shift[np.argmax(np.abs(shift))])
+    text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between"
+    return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
+
+
+def unsettled(x: _Channel) -> Fault | None:
+    """Whether the first period differs from the others by more than noise; needs three periods."""
+    periods = x.periods
+    if periods < 3:
+        return None
+    spectra = x.by_period[:, x.harmonics]  # (P, F)
+    mean = spectra[1:].mean(axis=0)
+    noise = np.sum(np.abs(spectra[1:] - mean) ** 2) / (periods - 2)
+    difference = np.sum(np.abs(spectra[0] - mean) ** 2) / (1 + 1 / (periods - 1))
+    dof = 2 * x.harmonics.size
+    limit = special.fdtri(dof, dof * (periods - 2), 1 - _FALSE_ALARM)
+    rounding = np.finfo(float).eps ** 2 * np.sum(np.abs(mean) ** 2)
+    # twice the limit: noise of few lines may dominate and vary
+    if difference <= 2 * limit * (noise + rounding):
+        return None
+    level = 10 * np.log10(difference / np.sum(np.abs(mean) ** 2))
+    text = f"The first period of the {x.name} has not settled: {level:.0f} dB off the others"
+    return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), x.transient_spoils, text)
+
+
+CHECKS = (saturation, offset, drift, hum, lost_samples, unsettled)
+"""What is looked for in each channel that lacks no sample."""
+
+
+def _clipped(record: FloatArray, periods: int) -> int:
+    """How many samples stand at the largest value, if suspiciously many, else 0.
+
+    Without clipping the values thin out towards the largest; of a quantised sine at most 2.4 times
+    as many stand at the largest value as at the next. A few more may by chance (binomial test).
+    """
+    largest = record.max()
+    rest = record[record < largest]
+    if rest.size == 0:
+        return 0
+    top = record.size - rest.size
+    following = np.count_nonzero(rest == rest.max())
+    some = record[:GRID_SAMPLES]
+    some = some[(some < largest) & (some > record.min())]
+    if np.unique(some).size > FEW_ALIKE * some.size:
+        # not quantised: equal values are no chance, unless a period without noise is repeated
+        spans = record.reshape(periods, -1)
+        repeated = periods if np.array_equal(spans[1:], spans[:-1]) else 1
+        return top if top >= 4 * repeated else 0
+    # probability of so many or more out of both; periods repeat each other, one counts
+    one, next_one = top // periods, -(-following // periods)
+    chance = special.bdtrc(one - 1, one + next_one, SHARE_AT_TOP) if one else 1.0
+    return top if chance < _FALSE_ALARM else 0
+
+
+def _runs(record: FloatArray) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First index and length of each run of equal samples."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(record) != 0) + 1])
+    return starts, np.diff(np.append(starts, record.size))

@@ -11,19 +11,23 @@ all lines.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.neighbours import Neighbourhood, neighbourhoods
-from tactile_resonance.frf.record_transform import PairSpectrum, PairTransform, Place
-from tactile_resonance.frf.result import ComplexArray
-from tactile_resonance.frf.spectra import IntArray, PeriodicSpectra, checked_harmonics
+from tactile_resonance.frf.spectra import (
+    NOT_FINITE,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    PeriodicSpectra,
+    Spectrum,
+    checked_harmonics,
+)
 
 
-@dataclass(frozen=True, eq=False)
 class LocalPolynomialPlan:
     """Everything of the fast local polynomial method that does not depend on the samples.
 
@@ -44,15 +48,11 @@ class LocalPolynomialPlan:
 
     Attributes
     ----------
-    transform : PairTransform
-        From records to the bins near harmonics.
     groups : tuple of Neighbourhood
         Lines by pattern of neighbouring bins.
     noise_dof : int
         Degrees of freedom of the covariance: the neighbours are the nearest
         ``2 ceil((dof + order + 1) / 2)`` bins between harmonics, less ``order + 1``.
-    correlation_lines : int
-        See `PeriodicSpectra`.
 
     Raises
     ------
@@ -62,7 +62,7 @@ class LocalPolynomialPlan:
     Examples
     --------
     >>> plan = LocalPolynomialPlan(np.arange(4, 4001), samples_per_period=20000, periods=8)
-    >>> result = plan(u, y)  # u, y: (8, 20000)
+    >>> spectra = plan(Spectrum.of(u, y))  # u, y: (8, 20000)
 
     Notes
     -----
@@ -75,132 +75,64 @@ class LocalPolynomialPlan:
     chapter 7; Pintelon, Barbe, Vandersteen & Schoukens, MSSP 25 (2011) 2683-2704.
     """
 
-    harmonics: IntArray
-    samples_per_period: int
-    periods: int
-    order: int = 2
-    dof: int = 6
-    transform: PairTransform = field(init=False)
-    groups: tuple[Neighbourhood, ...] = field(init=False)
-    noise_dof: int = field(init=False)
-    correlation_lines: int = field(init=False)
-    _places: tuple[tuple[tuple[Place, Place], ...], ...] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        harmonics = checked_harmonics(self.harmonics, self.samples_per_period)
-        if self.periods < 2:
+    def __init__(
+        self,
+        harmonics: npt.ArrayLike,
+        samples_per_period: int,
+        periods: int,
+        order: int = 2,
+        dof: int = 6,
+    ) -> None:
+        self.harmonics: IntArray = checked_harmonics(harmonics, samples_per_period)
+        if periods < 2:
             raise ValueError(
-                f"periods: {self.periods}, expected at least 2: a single period has no bins "
+                f"periods: {periods}, expected at least 2: a single period has no bins "
                 "between harmonics to tell noise and transient from"
             )
-        if self.order < 0:
-            raise ValueError(f"order: {self.order}, expected at least 0")
-        if self.dof < 1:
-            raise ValueError(f"dof: {self.dof}, expected at least 1")
-        groups = neighbourhoods(
-            harmonics,
-            self.samples_per_period,
-            self.periods,
-            self.order,
-            self.dof,
-            scale=1 / (self.samples_per_period * self.periods),
-        )
-        transform = PairTransform(
-            self.samples_per_period,
-            self.periods,
-            np.unique(np.concatenate([group.offsets for group in groups])),
-        )
-        places = tuple(transform.places(group.centre_bins, group.offsets) for group in groups)
-        object.__setattr__(self, "harmonics", harmonics)
-        object.__setattr__(self, "transform", transform)
-        object.__setattr__(self, "_places", places)
-        object.__setattr__(self, "groups", groups)
-        object.__setattr__(self, "noise_dof", groups[0].projector.shape[0] - 1)
-        object.__setattr__(self, "correlation_lines", _correlation_lines(harmonics, groups))
+        if order < 0:
+            raise ValueError(f"order: {order}, expected at least 0")
+        if dof < 1:
+            raise ValueError(f"dof: {dof}, expected at least 1")
+        self.samples_per_period, self.periods, self.order = samples_per_period, periods, order
+        self.groups = neighbourhoods(self.harmonics, samples_per_period, periods, order, dof)
+        self.noise_dof = self.groups[0].projector.shape[0] - 1
 
-    def __call__(self, u: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> PeriodicSpectra:
-        """Spectra of records.
+    def __call__(self, record: Spectrum) -> PeriodicSpectra:
+        """Mean spectra of records.
 
         Parameters
         ----------
-        u, y : (..., P, N) float
-            Actuator and sensor, P consecutive periods of N samples from the first sample on. All is
-            computed in double precision; float32 records need no copy for that.
+        record : Spectrum
 
         Raises
         ------
         ValueError
             If the shapes do not fit the plan or a sample is not finite.
         """
-        return self.from_transform(self.transformed(u, y))
-
-    def transformed(self, u: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> PairSpectrum:
-        """First half of a call: `transform` of records (..., P, N); ValueError where none fits."""
         shape = (self.periods, self.samples_per_period)
-        for name, x in (("u", u), ("y", y)):
-            if np.shape(x)[-2:] != shape:
-                raise ValueError(
-                    f"{name}: shape {np.shape(x)}, expected (..., {shape[0]}, {shape[1]})"
-                )
-        return self.transform(np.asarray(y), np.asarray(u))
+        if record.samples.shape[-2:] != shape:
+            raise ValueError(
+                f"record: shape {record.samples.shape}, expected (..., 2, {shape[0]}, {shape[1]})"
+            )
+        return self.from_bins(record.bins)
 
-    def from_transform(self, spectrum: PairSpectrum) -> PeriodicSpectra:
-        """Second half of a call: the method itself."""
-
-        def channels() -> Iterator[tuple[ComplexArray, ComplexArray]]:
-            for group, places in zip(self.groups, self._places, strict=True):
-                # the projector is real: it may as well work before the records are told apart
-                if group.folded is None:
-                    mixed = group.project(spectrum.gather(places))  # (..., 1 + dof, 2, L)
-                else:
-                    mixed = group.project_folded(*spectrum.gather_folded(places))
-                direct, mirrored = mixed[..., 0, :], mixed[..., 1, :]
-                np.conjugate(mirrored, out=mirrored)
-                y = direct + mirrored
-                yield y, np.subtract(direct, mirrored, out=direct)
-
-        return self._assembled(channels(), 0.5, -0.5j / spectrum.scale)
-
-    def from_bins(self, bins: Iterable[ComplexArray]) -> PeriodicSpectra:
-        """Same as a call, from the bins around the lines.
-
-        Parameters
-        ----------
-        bins : iterable over `groups` of (..., W, 2, L) complex
-            Output and input, not scaled, at ``group.centre_bins + group.offsets[:, None]``.
-        """
-
-        def channels() -> Iterator[tuple[ComplexArray, ComplexArray]]:
-            for group, group_bins in zip(self.groups, bins, strict=True):
-                projected = group.project(group_bins)  # (..., 1 + dof, 2, L)
-                yield projected[..., 0, :], projected[..., 1, :]
-
-        return self._assembled(channels(), 1.0, 1.0)
-
-    def _assembled(
-        self,
-        channels: Iterable[tuple[ComplexArray, ComplexArray]],
-        unit_y: complex,
-        unit_u: complex,
-    ) -> PeriodicSpectra:
-        """Result from the projected bins of both channels (..., 1 + dof, L), in the units given."""
-        spectra = covariance = np.empty(0, complex)
-        for group, (y, u) in zip(self.groups, channels, strict=True):
-            if spectra.size == 0:
-                spectra = np.empty((*y.shape[:-2], 2, self.harmonics.size), complex)
-                covariance = np.empty((*y.shape[:-2], 2, 2, self.harmonics.size), complex)
-            where = group.where
-            spectra[..., 0, where] = unit_y * y[..., 0, :]
-            spectra[..., 1, where] = unit_u * u[..., 0, :]
-            y, u = y[..., 1:, :], u[..., 1:, :]  # residuals
-            covariance[..., 0, 0, where] = abs(unit_y) ** 2 * _sum_of_squares(y)
-            covariance[..., 1, 1, where] = abs(unit_u) ** 2 * _sum_of_squares(u)
-            products = np.multiply(y, np.conjugate(u, out=u), out=u)  # in place: u is done with
-            cross = unit_y * np.conj(unit_u) * products.sum(axis=-2)  # (..., L)
-            covariance[..., 0, 1, where] = cross
-            covariance[..., 1, 0, where] = cross.conj()
+    def from_bins(self, bins: ComplexArray) -> PeriodicSpectra:
+        """The same from bins (..., 2, P N // 2 + 1), as `Spectrum.bins`."""
+        batch = bins.shape[:-2]
+        spectra = np.empty((*batch, 2, self.harmonics.size), complex)
+        covariance = np.empty((*batch, 2, 2, self.harmonics.size), complex)
+        for group in self.groups:
+            lines = group.where
+            projected = group.project(bins)  # (..., 2, 1 + dof, L)
+            spectra[..., lines] = projected[..., 0, :]
+            y, u = projected[..., 0, 1:, :], projected[..., 1, 1:, :]  # residuals
+            covariance[..., 0, 0, lines] = _sum_of_squares(y)
+            covariance[..., 1, 1, lines] = _sum_of_squares(u)
+            cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
+            covariance[..., 0, 1, lines] = cross
+            covariance[..., 1, 0, lines] = cross.conj()
         if not np.isfinite(spectra.sum()):  # one number tells, at half the cost of looking at all
-            raise ValueError("u, y: samples are not finite, expected a complete record")
+            raise ValueError(NOT_FINITE)
         return PeriodicSpectra(
             harmonics=self.harmonics,
             samples_per_period=self.samples_per_period,
@@ -208,24 +140,139 @@ class LocalPolynomialPlan:
             spectra=spectra,
             covariance=covariance,
             noise_dof=self.noise_dof,
-            correlation_lines=self.correlation_lines,
             method=f"fast local polynomial method, order {self.order}",
         )
 
 
-def _sum_of_squares(residual: ComplexArray) -> npt.NDArray[np.floating]:
+@lru_cache(maxsize=16)
+def kept_plan(
+    harmonics: bytes, samples_per_period: int, periods: int, order: int, dof: int
+) -> LocalPolynomialPlan:
+    """Plan of one of the latest kinds, because one measurement is like the next; bytes of int64."""
+    lines = np.frombuffer(harmonics, np.int64)
+    return LocalPolynomialPlan(lines, samples_per_period, periods, order, dof)
+
+
+def _sum_of_squares(residual: ComplexArray) -> FloatArray:
     """(..., L) sum of absolute squares of residuals (..., dof, L)."""
-    parts = residual.view(residual.real.dtype)  # (..., dof, 2 L), real and imaginary alternate
+    parts = residual.view(float)  # (..., dof, 2 L), real and imaginary alternate
     squares = np.einsum("...ij,...ij->...j", parts, parts)  # no complex product, no root
-    return squares[..., 0::2] + squares[..., 1::2]
+    return np.asarray(squares[..., 0::2] + squares[..., 1::2])
 
 
-def _correlation_lines(harmonics: IntArray, groups: tuple[Neighbourhood, ...]) -> int:
-    """Largest distance, in lines, between two lines that share a bin."""
-    low = np.empty(harmonics.size, np.int64)
-    high = np.empty(harmonics.size, np.int64)
-    for group in groups:
-        low[group.lines] = group.centre_bins + group.offsets.min()
-        high[group.lines] = group.centre_bins + group.offsets.max()
-    # the first bin of a line's neighbourhood rises with the line
-    return int(np.max(np.searchsorted(low, high, side="right") - 1 - np.arange(harmonics.size)))
+@dataclass(frozen=True, eq=False)
+class Neighbourhood:
+    """Lines that share one pattern of neighbouring bins, hence one projector.
+
+    Attributes
+    ----------
+    lines : (L,) int
+        Indices of these lines among the plan's harmonics, ascending.
+    bins : (W, L) int
+        The line itself, then its neighbours, in the spectrum of the whole record.
+    projector : (1 + dof, W) float
+        Its first row takes the bins to the line without its transient; the others to residuals
+        whose sum of products is the covariance of that.
+    """
+
+    lines: IntArray
+    bins: IntArray
+    projector: FloatArray
+
+    @cached_property
+    def where(self) -> slice | IntArray:
+        """`lines` as an index, a slice where they are contiguous: that writes faster."""
+        first, last = int(self.lines[0]), int(self.lines[-1])
+        return slice(first, last + 1) if last - first + 1 == self.lines.size else self.lines
+
+    def project(self, bins: ComplexArray) -> ComplexArray:
+        """(..., 1 + dof, L) lines and residuals, from bins (..., K)."""
+        # a real matrix times complex numbers: real and imaginary parts are columns of their own
+        columns = np.take(bins, self.bins, axis=-1).view(float)  # (..., W, 2 L)
+        return np.matmul(self.projector, columns).view(complex)
+
+
+def neighbourhoods(
+    harmonics: IntArray, samples_per_period: int, periods: int, order: int, dof: int
+) -> tuple[Neighbourhood, ...]:
+    """Group lines by their neighbouring bins.
+
+    Neighbours are the nearest bins that are no harmonic. Harmonics that are not excited do not
+    count: they carry the periodic part of nonlinear distortion, which is not noise. Zero frequency,
+    the Nyquist bin and whatever lies beyond do not count either (beyond, the spectrum only repeats
+    itself), so lines at the ends of the spectrum have more neighbours on one side.
+
+    Parameters
+    ----------
+    harmonics : (F,) int
+        Excited lines, ascending.
+    samples_per_period, periods, order, dof : int
+        See `LocalPolynomialPlan`.
+
+    Raises
+    ------
+    ValueError
+        If the record has too few bins between harmonics.
+    """
+    count = 2 * -(-(dof + order + 1) // 2)  # as many on either side
+    last = (periods * samples_per_period - 1) // 2  # below the Nyquist bin
+    available = last - last // periods
+    if available < count:
+        raise ValueError(
+            f"order, dof: {order}, {dof} need {count} bins between harmonics, a record of "
+            f"{periods} x {samples_per_period} samples has {available}; lower either or record more"
+        )
+    # the nearest first, the lower of two as near; on one side alone every second may be a harmonic
+    offsets = np.arange(-2 * count, 2 * count + 1)
+    offsets = offsets[offsets % periods != 0]
+    offsets = offsets[np.argsort(np.abs(offsets), kind="stable")]
+    centre = harmonics * periods
+    there = (centre[:, None] + offsets >= 1) & (centre[:, None] + offsets <= last)
+    nearest = there & (np.cumsum(there, axis=1) <= count)  # (F, offsets)
+    lines_of: dict[bytes, list[int]] = {}
+    for line, pattern in enumerate(nearest):
+        lines_of.setdefault(pattern.tobytes(), []).append(line)
+    groups = []
+    for lines in map(np.array, lines_of.values()):
+        neighbours = np.sort(offsets[nearest[lines[0]]])
+        bins = centre[lines] + np.concatenate([[0], neighbours])[:, None]
+        groups.append(Neighbourhood(lines, bins, extrapolation_projector(neighbours, order)))
+    return tuple(groups)
+
+
+def extrapolation_projector(offsets: npt.NDArray[np.integer], order: int) -> FloatArray:
+    """Projector of a polynomial fit to neighbouring bins, extrapolated to the line.
+
+    Parameters
+    ----------
+    offsets : (B,) int
+        Bins relative to the line.
+    order : int
+        Order of the polynomial.
+
+    Returns
+    -------
+    (1 + B - order - 1, 1 + B) float
+        Row 0: the line minus the extrapolated polynomial. Rows i > 0: residuals, scaled so that
+        ``sum_i r_i conj(s_i)`` is an unbiased covariance of row 0 applied to two channels. For
+        white noise of variance v per bin that is ``v (1 + c)``, c from the extrapolation.
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    chapter 7 (local polynomial method, periodic signals); Pintelon, Barbe, Vandersteen &
+    Schoukens, MSSP 25 (2011) 2683-2704.
+    """
+    position = offsets / np.max(np.abs(offsets))  # well conditioned powers
+    powers = position[:, None] ** np.arange(order + 1)  # (B, order + 1)
+    q, r = np.linalg.qr(powers, mode="complete")
+    extrapolation = q[:, : order + 1] @ np.linalg.solve(r[: order + 1].T, np.eye(order + 1)[0])
+    residual_basis = q[:, order + 1 :]
+    residual_dof = offsets.size - order - 1
+    # variance of the line's own noise (1) and of the extrapolated polynomial
+    mean_variance = 1 + extrapolation @ extrapolation
+    projector = np.zeros((1 + residual_dof, 1 + offsets.size))
+    projector[0, 0] = 1
+    projector[0, 1:] = -extrapolation
+    projector[1:, 1:] = residual_basis.T * np.sqrt(mean_variance / residual_dof)
+    return projector

@@ -10,22 +10,33 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.contact.force_spread import joined_spread
-from tactile_resonance.frf.band_bins import BandBins, stacked_bins
-from tactile_resonance.frf.band_bins_stream import MOST_BINS, BandBinsStream
-from tactile_resonance.frf.fault_types import Fault, FaultKind, FaultReport
-from tactile_resonance.frf.faults import find_faults
+from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
+from tactile_resonance.frf.estimate import fast_frf, mean_spectra, robust_frf
+from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
-from tactile_resonance.frf.streaming import FrfStream
+from tactile_resonance.frf.spectra import (
+    FloatArray,
+    IntArray,
+    PeriodicSpectra,
+    Spectrum,
+    stacked_spectra,
+)
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Contact, Origin, Record
 
 LEAST_COVERAGE = 0.8
 """Of the time of a measurement its force must be known."""
 
+MOST_BINS = 20000
+"""More than this of one band and record are refused: they travel with every result."""
+
 
 class MeasurementFrf:
     """Takes in the records of one measurement; after each, the FRF so far.
+
+    The record of the realisation so far is kept, and transformed anew with every block: what comes of
+    it is what the whole record at once gives.
 
     Parameters
     ----------
@@ -36,7 +47,7 @@ class MeasurementFrf:
         Of the local polynomial method.
     bins_band_hz : (low, high), optional
         All bins of this band go with the FRF, as long as all realisations have as many periods and
-        the bins of all are no more than `band_bins_stream.MOST_BINS`.
+        the bins of all are no more than `MOST_BINS`.
     """
 
     def __init__(
@@ -51,10 +62,9 @@ class MeasurementFrf:
         self.measurement_id = measurement_id
         self._band_hz, self._order, self._dof = band_hz, order, dof
         self._bins_band_hz = bins_band_hz
-        self._stream: FrfStream | None = None
-        self._bins: BandBinsStream | None = None
-        self._finished_bins: list[BandBins] = []
-        self._realisation = -1
+        self._lines: IntArray | None = None
+        self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
+        self._spectra: dict[int, tuple[PeriodicSpectra, BandBins | None]] = {}
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
@@ -74,7 +84,8 @@ class MeasurementFrf:
         Raises
         ------
         ValueError
-            If the record does not fit the excitation, or the band holds no line of it.
+            If the record does not fit the excitation, the band holds no line of it, or too many bins
+            would go with the FRF.
         """
         n = excitation.samples_per_period
         u, y = record.actuator.volts(), record.sensor.volts()
@@ -87,26 +98,12 @@ class MeasurementFrf:
             self._remember(record)
             self._note("nothing was played")
             return self.frf()
-        if self._stream is None:
-            self._stream = FrfStream(
-                excitation.harmonics,
-                n,
-                sample_rate_hz=excitation.sample_rate_hz,
-                band_hz=self._band_hz,
-                order=self._order,
-                dof=self._dof,
-                max_periods=excitation.periods,
-            )
-            if self._bins_band_hz is not None:
-                self._bins = BandBinsStream(
-                    excitation.harmonics,
-                    n,
-                    sample_rate_hz=excitation.sample_rate_hz,
-                    band_hz=self._bins_band_hz,
-                    max_periods=excitation.periods,
-                )
+        if self._lines is None:
+            self._lines = self._lines_of(excitation)
+            self._samples = np.empty((2, excitation.periods, n))
         self._remember(record)
-        self._check(u.reshape(-1, n), y.reshape(-1, n), excitation)
+        block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
+        self._check(block, excitation)
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
             self._note(
@@ -114,7 +111,7 @@ class MeasurementFrf:
                 "not used from there on"
             )
         else:
-            self._take(self._stream, record.realisation, u.reshape(-1, n), y.reshape(-1, n))
+            self._take(block, record.realisation, self._lines, excitation)
         return self.frf()
 
     def frf(self) -> FRF:
@@ -158,48 +155,74 @@ class MeasurementFrf:
             contact=replace(last.contact, force_n=force_n, force_std_n=force_std_n, spread=spread),
         )
 
-    def _take(self, stream: FrfStream, realisation: int, u: np.ndarray, y: np.ndarray) -> None:
+    def _lines_of(self, excitation: Excitation) -> IntArray:
+        """Excited harmonics in the band."""
+        frequency_hz = excitation.frequency_hz
+        if self._bins_band_hz is not None:
+            low_hz, high_hz = self._bins_band_hz
+            line_hz = excitation.sample_rate_hz / excitation.samples_per_period
+            top_hz = min(high_hz, excitation.sample_rate_hz / 2)
+            count = (top_hz - low_hz) / line_hz * excitation.periods
+            if count > MOST_BINS:
+                raise ValueError(
+                    f"bins: {low_hz:g} to {high_hz:g} Hz are {count:.0f} bins after "
+                    f"{excitation.periods} periods, at most {MOST_BINS} are accepted: choose a "
+                    "narrower band"
+                )
+        if self._band_hz is None:
+            return excitation.harmonics
+        low_hz, high_hz = self._band_hz
+        lines = excitation.harmonics[(frequency_hz >= low_hz) & (frequency_hz <= high_hz)]
+        if lines.size == 0:
+            raise ValueError(
+                f"band_hz: {low_hz:g}..{high_hz:g} holds no excited line, they reach "
+                f"from {frequency_hz[0]:g} to {frequency_hz[-1]:g} Hz"
+            )
+        return lines
+
+    def _take(
+        self, record: Spectrum, realisation: int, lines: IntArray, excitation: Excitation
+    ) -> None:
         """Periods (P, N) that follow those of the same realisation without a gap."""
-        if realisation != self._realisation and stream.periods:
-            stream.next_realisation()
-            self._put_bins_aside()
-        self._realisation = realisation
-        for period_u, period_y in zip(u, y, strict=True):
-            single = stream.add_period(period_u, period_y)
-            if self._bins is not None:
-                self._bins.add_period(period_u, period_y)
-            self._periods[realisation] += 1
-        if len(self._periods) == 1:
-            self._frf = single
-            if self._bins is not None:
-                self._frf = replace(single, bins=self._bins.bins())
-        elif stream.periods >= max(self._periods.values()):
-            self._frf = replace(stream.robust().frf, bins=self._all_bins())
+        if not np.all(np.isfinite(record.samples)):
+            raise ValueError("record: samples are not finite, expected a complete block")
+        so_far = self._periods[realisation]
+        periods = so_far + record.periods
+        if periods > self._samples.shape[1]:
+            raise ValueError(
+                f"record: {periods} periods of realisation {realisation}, at most "
+                f"{self._samples.shape[1]} are accepted, those of the excitation"
+            )
+        self._samples[:, so_far:periods] = record.samples
+        if so_far:
+            record = Spectrum(self._samples[:, :periods])
+        spectra = mean_spectra(record, lines, order=self._order, dof=self._dof)
+        bins = None
+        if self._bins_band_hz is not None:
+            bins = band_bins(
+                record,
+                excitation.harmonics,
+                sample_rate_hz=excitation.sample_rate_hz,
+                band_hz=self._bins_band_hz,
+            )
+        self._spectra[realisation] = spectra, bins
+        self._periods[realisation] = periods
+        if periods < max(self._periods.values()):
+            return  # it counts once it is as long as the others
+        each = [of for of, _ in self._spectra.values()]
+        if len(each) == 1:
+            frf = fast_frf(spectra, sample_rate_hz=excitation.sample_rate_hz)
+        else:
+            frf = robust_frf(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
+        bins = stacked_bins([of for _, of in self._spectra.values()])
+        if bins is not None and bins.u.size > MOST_BINS:
+            bins = None
+        self._frf = replace(frf, bins=bins)
 
-    def _put_bins_aside(self) -> None:
-        """Those of the present realisation, before the next one begins."""
-        if self._bins is None:
-            return
-        bins = self._bins.bins()
-        if bins is None:
-            self._bins = None
-            return
-        self._finished_bins.append(bins)
-        self._bins.clear()
-
-    def _all_bins(self) -> BandBins | None:
-        """Of all realisations; None where they differ in periods, or are too many to travel along."""
-        now = None if self._bins is None else self._bins.bins()
-        if now is None:
-            return None
-        bins = stacked_bins([*self._finished_bins, now])
-        return None if bins is None or bins.u.size > MOST_BINS else bins
-
-    def _check(self, u: np.ndarray, y: np.ndarray, excitation: Excitation) -> None:
-        """Keep the worst fault of each kind that one block (P, N) shows by itself."""
+    def _check(self, block: Spectrum, excitation: Excitation) -> None:
+        """Keep the worst fault of each kind that one block shows by itself."""
         report = find_faults(
-            u,
-            y,
+            block,
             sample_rate_hz=excitation.sample_rate_hz,
             harmonics=excitation.harmonics,
             transient_removed=True,

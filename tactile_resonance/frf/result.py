@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
-import numpy as np
-import numpy.typing as npt
-
 from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
+PER_LINE = (
+    *("frequency_hz", "g", "variance_noise", "variance_total"),
+    *("actuator_amplitude", "sensor_variance_given_actuator"),
+)
+"""Fields of an `FRF` whose last axis are its lines."""
 
 
 class FrfStatus(Enum):
@@ -42,10 +43,12 @@ class FRF:
         From noise and stochastic nonlinear distortion; needs two realisations.
     noise_dof, total_dof : int
         Degrees of freedom of either; 0 where unknown.
-    spectra : (..., 2, F) complex or None
-        Mean sensor and actuator spectra, row order [Y; U] [V], scaled by 1/N.
-    spectra_covariance : (..., 2, 2, F) complex or None
-        Noise covariance of these means [V^2].
+    actuator_amplitude : (..., F) float or None
+        Magnitude of the mean spectrum U, scaled by 1/N: a cosine of peak a gives a/2 [V]. Of one
+        realisation.
+    sensor_variance_given_actuator : (..., F) float or None
+        Noise variance of the mean spectrum Y that is not noise of U, which the generator makes:
+        ``C_YY - |C_YU|^2 / C_UU`` [V^2]. Of one realisation.
     bins : BandBins or None
         All bins of a band of the records behind G, where asked for: of as many realisations.
     periods, realisations : int
@@ -62,8 +65,8 @@ class FRF:
     variance_total: FloatArray | None = None
     noise_dof: int = 0
     total_dof: int = 0
-    spectra: ComplexArray | None = None
-    spectra_covariance: ComplexArray | None = None
+    actuator_amplitude: FloatArray | None = None
+    sensor_variance_given_actuator: FloatArray | None = None
     bins: BandBins | None = None
     periods: int = 1
     realisations: int = 1
@@ -81,26 +84,22 @@ class FRF:
         """Degrees of freedom of `variance`."""
         return self.noise_dof if self.variance_total is None else self.total_dof
 
+    @property
+    def variance_distortion(self) -> FloatArray | None:
+        """(..., F) variance of the stochastic nonlinear distortion of the FRF of *one* realisation.
+
+        ``M (total - noise)`` for M realisations. Unbiased, hence negative at some lines where
+        distortion is lost in noise: average over lines before taking a root. None where either is
+        unknown.
+        """
+        if self.variance_noise is None or self.variance_total is None:
+            return None
+        return self.realisations * (self.variance_total - self.variance_noise)
+
     def band(self, low_hz: float, high_hz: float) -> FRF:
         """The lines from `low_hz` to `high_hz`, ends included."""
         inside = (self.frequency_hz >= low_hz) & (self.frequency_hz <= high_hz)
-
-        def cut(array):
-            return None if array is None else array[..., inside]
-
-        return FRF(
-            frequency_hz=self.frequency_hz[inside],
-            g=self.g[..., inside],
-            variance_noise=cut(self.variance_noise),
-            variance_total=cut(self.variance_total),
-            noise_dof=self.noise_dof,
-            total_dof=self.total_dof,
-            spectra=cut(self.spectra),
-            spectra_covariance=cut(self.spectra_covariance),
-            bins=self.bins,
-            periods=self.periods,
-            realisations=self.realisations,
-            method=self.method,
-            status=self.status,
-            message=self.message,
+        arrays = {name: getattr(self, name) for name in PER_LINE}
+        return replace(
+            self, **{name: x[..., inside] for name, x in arrays.items() if x is not None}
         )

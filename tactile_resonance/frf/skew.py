@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.fast import fast_frf
-from tactile_resonance.frf.fault_types import Fault, FaultKind
-from tactile_resonance.frf.result import FRF, ComplexArray, FloatArray
-from tactile_resonance.frf.spectra import averaged_spectra
+from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.faults import Fault, FaultKind
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray, Spectrum, averaged_spectra
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def skew_from_loopback(
     ValueError
         For fewer than three lines, or channels that do not see the same signal.
     """
-    frf = fast_frf(averaged_spectra(u, y, harmonics), sample_rate_hz=sample_rate_hz)
+    frf = fast_frf(averaged_spectra(Spectrum.of(u, y), harmonics), sample_rate_hz=sample_rate_hz)
     f = frf.frequency_hz
     if f.size < 3:
         raise ValueError(f"harmonics: {f.size} lines, expected at least 3 to fit a delay")
@@ -87,20 +87,11 @@ def correct_skew(frf: FRF, delay_s: float) -> FRF:
     Returns
     -------
     FRF
-        Response, sensor spectrum and its covariance with the actuator turned; variances unchanged.
+        Variances are the same.
     """
     if not np.isfinite(delay_s):
         raise ValueError(f"delay_s: {delay_s}, expected a finite delay in seconds")
-    turn = np.exp(2j * np.pi * frf.frequency_hz * delay_s)  # (F,)
-    spectra, covariance = frf.spectra, frf.spectra_covariance
-    if spectra is not None:
-        spectra = spectra * np.stack([turn, np.ones_like(turn)])
-    if covariance is not None:
-        ones = np.ones_like(turn)
-        covariance = covariance * np.stack(
-            [np.stack([ones, turn]), np.stack([turn.conj(), ones])]
-        )  # rows and columns [Y; U]
-    return replace(frf, g=frf.g * turn, spectra=spectra, spectra_covariance=covariance)
+    return replace(frf, g=frf.g * np.exp(2j * np.pi * frf.frequency_hz * delay_s))
 
 
 def suspected_skew(frf: FRF) -> Fault | None:
@@ -122,7 +113,7 @@ def suspected_skew(frf: FRF) -> Fault | None:
         return None
     text = (
         f"The phase looks like a delay of {delay * 1e6:.3g} us between the channels: measure it "
-        "with a loop-back."
+        "with a loop-back"
     )
     return Fault(FaultKind.CHANNEL_SKEW, "both", abs(float(delay)), False, text)
 

@@ -1,18 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mean input and output spectra of periodic records, with their noise covariance."""
+"""Spectra of periodic records: each is transformed once, and read by everything that follows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from tactile_resonance.frf.result import ComplexArray, FloatArray
-
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
+
+NOT_FINITE = "u, y: samples are not finite, expected a complete record"
+
+
+class Spectrum:
+    """Records of both channels and their Fourier transforms, made when first read and then kept.
+
+    Parameters
+    ----------
+    samples : (..., 2, P, N) float
+        Rows [y; u], sensor and actuator [V]: P consecutive periods of N samples, from the first
+        sample on.
+
+    Raises
+    ------
+    ValueError
+        If there is no period or no sample.
+
+    Examples
+    --------
+    >>> u = np.cos(2 * np.pi * np.arange(40).reshape(4, 10) / 10)
+    >>> record = Spectrum.of(u, 3 * u)
+    >>> record.bins.shape, abs(record.bins[:, 4]).round(12)
+    ((2, 21), array([1.5, 0.5]))
+    """
+
+    def __init__(self, samples: FloatArray) -> None:
+        if samples.ndim < 3 or samples.shape[-3] != 2 or samples.size == 0:
+            raise ValueError(f"samples: shape {samples.shape}, expected (..., 2, P, N)")
+        self.samples = samples
+
+    @classmethod
+    def of(cls, u: npt.ArrayLike, y: npt.ArrayLike) -> Spectrum:
+        """Of actuator and sensor [V], (..., P, N) each; ValueError unless they are alike."""
+        u, y = np.asarray(u), np.asarray(y)
+        if u.ndim < 2 or u.shape != y.shape or u.size == 0:
+            raise ValueError(f"u, y: shapes {u.shape}, {y.shape}, expected the same (..., P, N)")
+        return cls(np.stack([y, u], axis=-3, dtype=float))
+
+    @property
+    def periods(self) -> int:
+        """P."""
+        return self.samples.shape[-2]
+
+    @property
+    def samples_per_period(self) -> int:
+        """N."""
+        return self.samples.shape[-1]
+
+    @cached_property
+    def bins(self) -> ComplexArray:
+        """(..., 2, P N // 2 + 1) bins of whole records, scaled by 1 / (P N).
+
+        A cosine of peak a gives a/2. A sample that is missing makes all bins of its channel NaN.
+        """
+        whole = self.samples.reshape(*self.samples.shape[:-2], -1)
+        return np.asarray(scipy.fft.rfft(whole, axis=-1, norm="forward"))
+
+    @cached_property
+    def by_period(self) -> ComplexArray:
+        """(..., 2, P, N // 2 + 1) harmonics of each period alone, scaled by 1 / N."""
+        if self.periods == 1:
+            return self.bins[..., None, :]
+        return np.asarray(scipy.fft.rfft(self.samples, axis=-1, norm="forward"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +96,6 @@ class PeriodicSpectra:
         Noise covariance of these means, ``C[i, j] = E dZ_i conj(dZ_j)``; None for a single period.
     noise_dof : int
         Degrees of freedom of the covariance of one record; 0 where unknown.
-    correlation_lines : int
-        Means and covariances of two lines further apart than this many lines are independent.
     method : str
         How the transient was dealt with, for people.
     """
@@ -43,7 +106,6 @@ class PeriodicSpectra:
     spectra: ComplexArray
     covariance: ComplexArray | None
     noise_dof: int
-    correlation_lines: int
     method: str
 
     def frequency_hz(self, sample_rate_hz: float) -> FloatArray:
@@ -74,24 +136,6 @@ class PeriodicSpectra:
         )
 
 
-def period_spectra(
-    samples: npt.NDArray[np.floating], harmonics: npt.NDArray[np.int64]
-) -> ComplexArray:
-    """Spectrum of each period at the given harmonics.
-
-    Parameters
-    ----------
-    samples : (..., N) float
-    harmonics : (F,) int
-
-    Returns
-    -------
-    (..., F) complex
-        ``X[k] = (1/N) sum_n x[n] exp(-j 2 pi k n / N)``; single precision stays single.
-    """
-    return scipy.fft.rfft(samples, axis=-1, norm="forward")[..., harmonics]
-
-
 def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
     """(F,) int harmonics, read-only; ValueError unless ascending within 1..(N - 1) // 2."""
     array = np.array(harmonics)
@@ -110,18 +154,13 @@ def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntA
 
 
 def averaged_spectra(
-    u: npt.NDArray[np.floating],
-    y: npt.NDArray[np.floating],
-    harmonics: npt.ArrayLike,
-    *,
-    unsettled_periods: int = 0,
+    record: Spectrum, harmonics: npt.ArrayLike, *, unsettled_periods: int = 0
 ) -> PeriodicSpectra:
     """Mean and sample covariance over periods: right where the record is in steady state.
 
     Parameters
     ----------
-    u, y : (..., P, N) float
-        Actuator and sensor [V], P consecutive periods of N samples.
+    record : Spectrum
     harmonics : (F,) int
     unsettled_periods : int
         Periods dropped at the start because the transient has not died out.
@@ -129,29 +168,24 @@ def averaged_spectra(
     Raises
     ------
     ValueError
-        If shapes differ, nothing is left, or samples are not finite.
+        If nothing is left, or samples are not finite.
 
     References
     ----------
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     chapter 2.
     """
-    u, y = np.asarray(u), np.asarray(y)
-    if u.ndim < 2 or u.shape != y.shape:
-        raise ValueError(f"u, y: shapes {u.shape}, {y.shape}, expected the same (..., P, N)")
-    recorded, samples = u.shape[-2:]
+    recorded = record.periods
     if not 0 <= unsettled_periods < recorded:
         raise ValueError(
             f"unsettled_periods: {unsettled_periods}, accepted is 0..{recorded - 1} "
             f"({recorded} periods were recorded)"
         )
-    harmonics = checked_harmonics(harmonics, samples)
+    harmonics = checked_harmonics(harmonics, record.samples_per_period)
     used = recorded - unsettled_periods
-    per_period = np.stack(
-        [period_spectra(x[..., unsettled_periods:, :], harmonics) for x in (y, u)], axis=-3
-    ).astype(complex, copy=False)  # (..., 2, P', F)
+    per_period = record.by_period[..., unsettled_periods:, harmonics]  # (..., 2, P', F)
     if not np.all(np.isfinite(per_period)):
-        raise ValueError("u, y: samples are not finite, expected a complete record")
+        raise ValueError(NOT_FINITE)
     mean = per_period.mean(axis=-2)  # (..., 2, F)
     covariance = None
     if used > 1:
@@ -160,12 +194,11 @@ def averaged_spectra(
         covariance /= used * (used - 1)  # (..., 2, 2, F), covariance of the mean
     return PeriodicSpectra(
         harmonics=harmonics,
-        samples_per_period=samples,
+        samples_per_period=record.samples_per_period,
         periods=used,
         spectra=mean,
         covariance=covariance,
         noise_dof=used - 1,
-        correlation_lines=0,
         method=f"mean of {used} of {recorded} periods",
     )
 
@@ -198,6 +231,27 @@ def stacked_spectra(realisations: Sequence[PeriodicSpectra]) -> PeriodicSpectra:
     )
 
 
+def power(spectrum: npt.NDArray[np.complexfloating]) -> FloatArray:
+    """Squared magnitudes, without the root that ``abs`` takes."""
+    return np.asarray(spectrum.real**2 + spectrum.imag**2)
+
+
+def ratio(mean: ComplexArray) -> ComplexArray:
+    """(..., F) Y/U of mean spectra (..., 2, F), [Y; U]; NaN where there is no input."""
+    u = mean[..., 1, :]
+    return np.asarray(mean[..., 0, :] / np.where(u == 0, np.nan, u))
+
+
+def error_variance(g: ComplexArray, covariance: ComplexArray) -> FloatArray:
+    """(..., F) variance of ``Y - G U`` for noise of covariance (..., 2, 2, F), [Y; U]."""
+    cross = covariance[..., 0, 1, :]
+    return np.asarray(
+        covariance[..., 0, 0, :].real
+        + power(g) * covariance[..., 1, 1, :].real
+        - 2 * (cross.real * g.real + cross.imag * g.imag)
+    )
+
+
 def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
     """Variance of Y/U, to first order in the noise.
 
@@ -210,14 +264,15 @@ def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
     Returns
     -------
     (..., F) float
-        ``|Y/U|^2 (C_YY/|Y|^2 + C_UU/|U|^2 - 2 Re(C_YU / (Y conj U)))``, written without dividing by Y
-        (Pintelon &
-        Schoukens 2012, chapter 2).
+        ``|Y/U|^2 (C_YY/|Y|^2 + C_UU/|U|^2 - 2 Re(C_YU / (Y conj U)))``, written without dividing by
+        Y (Pintelon & Schoukens 2012, chapter 2); NaN where there is no input.
     """
-    u = np.where(mean[..., 1, :] == 0, np.nan, mean[..., 1, :])
-    g = mean[..., 0, :] / u
-    return (
-        covariance[..., 0, 0, :].real
-        + np.abs(g) ** 2 * covariance[..., 1, 1, :].real
-        - 2 * np.real(covariance[..., 0, 1, :] * g.conj())
-    ) / np.abs(u) ** 2
+    input_power = power(mean[..., 1, :])
+    return error_variance(ratio(mean), covariance) / np.where(input_power == 0, np.nan, input_power)
+
+
+def conditional_variance(covariance: ComplexArray) -> FloatArray:
+    """(..., F) variance of Y given U, for noise of covariance (..., 2, 2, F), [Y; U]."""
+    u = covariance[..., 1, 1, :].real
+    explained = power(covariance[..., 0, 1, :]) / np.where(u == 0, np.inf, u)
+    return np.asarray(covariance[..., 0, 0, :].real - explained)

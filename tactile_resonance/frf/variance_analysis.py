@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.detection import decibel
-from tactile_resonance.frf.result import ComplexArray, FloatArray
+from tactile_resonance.frf.distortion import decibel
+from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
 PAPER_AXES = ("preparation", "position", "repetition", "period")
 """Sources of figure 9 of arXiv 1805.00682, outermost first."""
@@ -33,10 +33,7 @@ class VarianceSource:
         Degrees of freedom: ``(size - 1)`` times the number of groups.
     variance : (F,) float or None
         Sample variance over this axis of the means over all inner axes, averaged over all outer
-        ones. It *holds* what is left of the inner scatter: `from_inner`. None if the size is 1.
-    from_inner : (F,) float or None
-        Part of `variance` that the inner axes alone account for: variance of the next inner axis
-        divided by its size (zero for the innermost axis). None where that is unknown.
+        ones. It *holds* what is left of the inner scatter. None if the size is 1.
     mean_power : (F,) float
         ``|G|^2`` of the mean over everything.
     """
@@ -45,37 +42,13 @@ class VarianceSource:
     size: int
     dof: int
     variance: FloatArray | None
-    from_inner: FloatArray | None
     mean_power: FloatArray
-
-    @property
-    def level_db(self) -> FloatArray | None:
-        """(F,) `variance` against ``|mean G|^2`` [dB]."""
-        return None if self.variance is None else decibel(self.variance / self.mean_power)
-
-    @property
-    def component(self) -> FloatArray | None:
-        """(F,) scatter of this source alone, ``variance - from_inner``.
-
-        Unbiased, hence negative at lines where the source is lost in the inner scatter. None where
-        either is unknown.
-        """
-        if self.variance is None or self.from_inner is None:
-            return None
-        return self.variance - self.from_inner
-
-    @property
-    def mean_level_db(self) -> float:
-        """Mean over lines of variance / |mean G|^2 [dB]; NaN where unknown."""
-        if self.variance is None:
-            return float("nan")
-        return float(decibel(np.mean(self.variance / self.mean_power)))
 
     @property
     def rms_level_db(self) -> float:
         """Mean variance over lines against mean ``|mean G|^2`` [dB]; NaN where unknown.
 
-        Unlike `mean_level_db` it is not ruled by the lines where G is small.
+        It is not ruled by the lines where G is small, as a mean of ratios would be.
         """
         if self.variance is None:
             return float("nan")
@@ -137,8 +110,7 @@ def analyse_variance(
     -----
     With independent sources of variances v_1 (outermost) ... v_n and sizes A_i the expected sample
     variance over axis i is ``v_i + v_(i+1)/A_(i+1) + ... + v_n/(A_(i+1) ... A_n)``: averaging an
-    inner source reduces it, but does not remove it. Nothing is subtracted from `variance`; what
-    the inner axes explain is reported beside it.
+    inner source reduces it, but does not remove it. Nothing is subtracted from `variance`.
 
     References
     ----------
@@ -158,7 +130,6 @@ def analyse_variance(
     mean = g.mean(axis=tuple(range(g.ndim - 1)))
     power = np.abs(mean) ** 2
     sources: list[VarianceSource] = []
-    inner: VarianceSource | None = None
     group_means = g  # means over all axes inside the present one
     for axis in reversed(range(len(axes))):
         size = g.shape[axis]
@@ -167,18 +138,14 @@ def analyse_variance(
             # |x - mean|^2 / (size - 1), averaged over the outer axes
             scatter = np.var(group_means, axis=axis, ddof=1)
             variance = scatter.reshape(-1, frequency.size).mean(axis=0)
-        from_inner: FloatArray | None = np.zeros(frequency.size)
-        if inner is not None:
-            from_inner = None if inner.variance is None else inner.variance / inner.size
         groups = int(np.prod(g.shape[:axis]))
-        inner = VarianceSource(
+        source = VarianceSource(
             name=axes[axis],
             size=size,
             dof=(size - 1) * groups,
             variance=variance,
-            from_inner=from_inner,
             mean_power=power,
         )
-        sources.insert(0, inner)
+        sources.insert(0, source)
         group_means = group_means.mean(axis=axis)
     return VarianceAnalysis(frequency, mean, tuple(sources))

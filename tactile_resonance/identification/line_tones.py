@@ -52,9 +52,9 @@ def poles_without_tones(
     for line in sorted(found):
         frequency_hz = frf.frequency_hz[line]
         rms_v = np.nan
-        if frf.spectra is not None:
+        if frf.actuator_amplitude is not None:
             error = frf.g[line] - batch.fit.response(frequency_hz[None])[0]
-            rms_v = np.sqrt(2) * np.abs(error * frf.spectra[1, line])
+            rms_v = np.sqrt(2) * np.abs(error) * frf.actuator_amplitude[line]
         tones.append(Tone(float(frequency_hz), float(rms_v), "sensor", spacing_hz))
     return batch, tuple(tones)
 

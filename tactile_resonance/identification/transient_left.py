@@ -34,8 +34,8 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
     noise of the output, and is largest beside the mode. So the variance of the output given the input
     (``C_YY - |C_YU|^2 / C_UU``, which noise of the generator does not enter) of the lines within half
     the mode's width, three at least and a quarter of the band at most, is compared with that of the
-    farther half of the band by an F-test. It needs `FRF.spectra_covariance`, hence one realisation;
-    without, half widths below `FEWEST_BINS` are mentioned.
+    farther half of the band by an F-test. It needs `FRF.sensor_variance_given_actuator`, hence one
+    realisation; without, half widths below `FEWEST_BINS` are mentioned.
 
     Monte Carlo, 30 records a cell of a mode at 250 Hz in 200-300 Hz, lines 2.5 Hz apart, order 2, 2 to 8
     periods, damping ratio .005 to .1, 20 to 80 dB: from rest, mean square errors of f0 over the
@@ -82,12 +82,9 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
 def _beside(frf: FRF, poles: Poles, mode: int) -> float:
     """How much larger the variance beside a mode is than elsewhere; 0 where chance may make it."""
     band = frf.band(*poles.band_hz)
-    covariance = band.spectra_covariance
-    if covariance is None or band.noise_dof < 2:
+    variance = band.sensor_variance_given_actuator
+    if variance is None or band.noise_dof < 2:
         return 0.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cross = np.abs(covariance[0, 1]) ** 2 / covariance[1, 1].real
-    variance = covariance[0, 0].real - np.where(np.isfinite(cross), cross, 0.0)  # (F,)
     distance = np.abs(band.frequency_hz - poles.f0_hz[mode])
     order = np.argsort(distance)
     half_width = abs(poles.damping_ratio[mode]) * poles.f0_hz[mode]

@@ -49,11 +49,9 @@ if TYPE_CHECKING:  # nodes without contact control do not load it
 
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 
-COVARIANCE_ARRAYS = ("sensor_variance", "actuator_variance", "covariance_real", "covariance_imag")
-FRF_ARRAYS = (
-    *("real", "imag", "variance_noise", "variance_total"),
-    *("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"),
-    *COVARIANCE_ARRAYS,
+FRF_OPTIONAL = (
+    *("variance_noise", "variance_total"),
+    *("actuator_amplitude", "sensor_variance_given_actuator"),
 )
 
 RosTime = Callable[[int], int]
@@ -114,17 +112,10 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
     write_origin(message, origin)
     fill(message.frequency_hz, frf.frequency_hz)
     fill_complex(message, "", frf.g)
-    for name in ("variance_noise", "variance_total"):
-        variance = getattr(frf, name)
-        if variance is not None:
-            fill(getattr(message, name), variance)
-    if frf.spectra is not None:
-        fill_complex(message, "sensor_", frf.spectra[0])
-        fill_complex(message, "actuator_", frf.spectra[1])
-    if frf.spectra_covariance is not None:
-        fill(message.sensor_variance, frf.spectra_covariance[0, 0].real)
-        fill(message.actuator_variance, frf.spectra_covariance[1, 1].real)
-        fill_complex(message, "covariance_", frf.spectra_covariance[0, 1])
+    for name in FRF_OPTIONAL:
+        values = getattr(frf, name)
+        if values is not None:
+            fill(getattr(message, name), values)
     if frf.bins is not None:
         _write_bins(message, frf.bins)
     return message
@@ -133,34 +124,16 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
 def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
     """FRF of a message, and what it belongs to."""
     lines = len(message.frequency_hz)
-    for name in FRF_ARRAYS:
+    for name in ("real", "imag", *FRF_OPTIONAL):
         values = getattr(message, name)
         if len(values) != lines and (len(values) or name in ("real", "imag")):
             raise ValueError(f"{name}: {len(values)} values for {lines} lines, expected as many")
-    groups = (("sensor_real", "sensor_imag", "actuator_real", "actuator_imag"), COVARIANCE_ARRAYS)
-    for names in groups:
-        if len({len(getattr(message, name)) for name in names}) > 1:
-            raise ValueError(f"{', '.join(names)}: some empty, expected all or none")
-    spectra = covariance = None
-    if len(message.sensor_real):
-        spectra = np.stack([complex_of(message, "sensor_"), complex_of(message, "actuator_")])
-    if len(message.sensor_variance):
-        cross = complex_of(message, "covariance_")
-        covariance = np.array(
-            [
-                [array_of(message.sensor_variance), cross],
-                [cross.conj(), array_of(message.actuator_variance)],
-            ]
-        )
     frf = FRF(
         frequency_hz=array_of(message.frequency_hz),
         g=complex_of(message, ""),
-        variance_noise=optional(message.variance_noise),
-        variance_total=optional(message.variance_total),
+        **{name: optional(getattr(message, name)) for name in FRF_OPTIONAL},
         noise_dof=message.noise_dof,
         total_dof=message.total_dof,
-        spectra=spectra,
-        spectra_covariance=covariance,
         bins=_bins(message),
         periods=message.periods,
         realisations=message.realisations,

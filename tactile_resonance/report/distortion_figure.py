@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactile_resonance.frf.detection import DetectionLines
-from tactile_resonance.frf.distortion import Distortion
+from tactile_resonance.frf.distortion import DetectionLines, Distortion
 from tactile_resonance.report.drawing import decibel, new_figure
 
 

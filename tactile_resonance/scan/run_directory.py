@@ -307,7 +307,7 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
     Two channels of floating point samples per block, an FRF of all lines after each of them, and
     a megabyte a point for poses and wrenches.
     """
-    block = 2 * 8 * design.samples + 16 * 8 * design.lines + 10_000
+    block = 2 * 8 * design.samples + 10 * 8 * design.lines + 10_000
     return points * (design.periods * design.realisations * block + 1_000_000)
 
 

@@ -7,7 +7,7 @@ from scipy import io, signal
 
 from tactile_resonance.frf.distortion import nonlinear_distortion
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
-from tactile_resonance.frf.spectra import averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 from tactile_resonance.multisine import Grid, harmonics_on_grid
 
 SILVERBOX_ENDS = (48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196)
@@ -24,29 +24,34 @@ def records(rng, multisine, nonlinearity, noise, *, realisations=3, periods=4):
 
 
 def distortion_of(u, y):
-    return nonlinear_distortion(averaged_spectra(u, y, ALL), EXCITED, sample_rate_hz=1024.0)
+    return nonlinear_distortion(
+        averaged_spectra(Spectrum.of(u, y), ALL), EXCITED, sample_rate_hz=1024.0
+    )
+
+
+def output_deviation(spectra):
+    return np.sqrt(spectra.covariance[..., 0, 0, :].real)
 
 
 def test_equals_the_reference_implementation(shared_data):
     with np.load(shared_data / "oracle" / "nl_odd_random_grid.npz") as data:
         u, y = data["u"].astype(float), data["y"].astype(float)
-        result = nonlinear_distortion(
-            averaged_spectra(u, y, np.arange(1, 1201)), data["ex"], sample_rate_hz=10e3
-        )
+        spectra = averaged_spectra(Spectrum.of(u, y), np.arange(1, 1201))
+        result = nonlinear_distortion(spectra, data["ex"], sample_rate_hz=10e3)
         even, odd = result.even, result.odd
         for mine, theirs in (
             (result.frequency_hz, "fE"),
             (result.output, "YE"),
-            (np.sqrt(result.output_variance), "sYE"),
+            (output_deviation(spectra.at(data["ex"])), "sYE"),
             (result.output / result.input, "Gm"),
             (even.frequency_hz, "fev"),
             (even.output, "Yev"),
-            (np.sqrt(even.output_variance), "sYev"),
+            (output_deviation(spectra.at(even.harmonics)), "sYev"),
             (even.frequency_hz[even.in_band], "fevin"),
             (even.corrected[:, even.in_band], "Ycev"),
             (odd.frequency_hz, "fod"),
             (odd.output, "Yod"),
-            (np.sqrt(odd.output_variance), "sYod"),
+            (output_deviation(spectra.at(odd.harmonics)), "sYod"),
             (odd.frequency_hz[odd.in_band], "fodin"),
             (odd.corrected[:, odd.in_band], "Ycod"),
         ):
@@ -61,7 +66,7 @@ def test_silverbox_even_output_is_near_minus_48_db(shared_data):
         np.stack([data[name][0][end - 8192 : end] for end in SILVERBOX_ENDS])[:, None, :]
         for name in ("V1", "V2")
     )  # (M, 1, N)
-    spectra = averaged_spectra(u, y, np.arange(1, 2684))
+    spectra = averaged_spectra(Spectrum.of(u, y), np.arange(1, 2684))
     result = nonlinear_distortion(spectra, np.arange(1, 2684, 2), sample_rate_hz=1e7 / 2**14)
     assert result.even.rms_output_level_db == pytest.approx(-48, abs=1)
     assert result.even.above_noise is None  # single periods: the noise is not known
@@ -145,7 +150,7 @@ def test_local_polynomial_spectra_serve_as_well(multisine):
     rng = np.random.default_rng(6)
     u, y = records(rng, multisine, lambda u: u + 0.02 * u**2, 1e-3)
     fitted = nonlinear_distortion(
-        LocalPolynomialPlan(ALL, SAMPLES, 4)(u, y), EXCITED, sample_rate_hz=1024.0
+        LocalPolynomialPlan(ALL, SAMPLES, 4)(Spectrum.of(u, y)), EXCITED, sample_rate_hz=1024.0
     )
     plain = distortion_of(u, y)
     assert fitted.even.rms_level_db == pytest.approx(plain.even.rms_level_db, abs=0.05)
@@ -156,7 +161,7 @@ def test_local_polynomial_spectra_serve_as_well(multisine):
 def test_outside_the_band_nothing_is_corrected(multisine):
     u, y = records(np.random.default_rng(7), multisine, lambda u: u + u**2, 1e-3)
     result = nonlinear_distortion(
-        averaged_spectra(u, y, np.arange(1, 400)), EXCITED, sample_rate_hz=1024.0
+        averaged_spectra(Spectrum.of(u, y), np.arange(1, 400)), EXCITED, sample_rate_hz=1024.0
     )
     outside = result.even.harmonics > EXCITED[-1]
     assert np.all(np.isnan(result.even.corrected[:, outside]))
@@ -166,7 +171,7 @@ def test_outside_the_band_nothing_is_corrected(multisine):
 
 def test_refusals(multisine):
     u, y = records(np.random.default_rng(8), multisine, lambda u: u, 0.0)
-    spectra = averaged_spectra(u, y, ALL)
+    spectra = averaged_spectra(Spectrum.of(u, y), ALL)
     with pytest.raises(ValueError, match="even ones are among them"):
         nonlinear_distortion(spectra, [1, 2, 3], sample_rate_hz=1.0)
     with pytest.raises(ValueError, match="only excited harmonics"):
@@ -174,4 +179,6 @@ def test_refusals(multisine):
     with pytest.raises(ValueError, match=r"harmonics: \[301\] are not among"):
         nonlinear_distortion(spectra, [1, 3, 301], sample_rate_hz=1.0)
     with pytest.raises(ValueError, match="expected .* with realisations M"):
-        nonlinear_distortion(averaged_spectra(u[0], y[0], ALL), EXCITED, sample_rate_hz=1.0)
+        nonlinear_distortion(
+            averaged_spectra(Spectrum.of(u[0], y[0]), ALL), EXCITED, sample_rate_hz=1.0
+        )

@@ -6,7 +6,7 @@ import pytest
 
 from tactile_resonance.frf.estimate import estimate_frf
 from tactile_resonance.frf.measurement import MeasurementFrf, mean_force
-from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.frf.result import PER_LINE, FrfStatus
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Channel, Contact, Origin, Record
 
@@ -48,16 +48,86 @@ def channels():
     return np.stack([u, y]) + 1e-3 * RNG.standard_normal((2, 2, 4, N))
 
 
-def test_block_by_block_is_all_at_once(channels):
+@pytest.mark.parametrize("band_hz", [None, (80.0, 120.0)])
+@pytest.mark.parametrize(("order", "dof"), [(2, 6), (0, 1)])
+def test_block_by_block_is_all_at_once(channels, band_hz, order, dof):
     u, y = channels
-    measurement = MeasurementFrf(1)
+    measurement = MeasurementFrf(1, band_hz=band_hz, order=order, dof=dof)
+    lines = excitation().harmonics
+    if band_hz is not None:
+        lines = lines[(lines * RATE_HZ / N >= band_hz[0]) & (lines * RATE_HZ / N <= band_hz[1])]
+    options = {"sample_rate_hz": RATE_HZ, "harmonics": lines, "order": order, "dof": dof}
     for m in range(2):
         for p in range(4):
-            measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
-    frf = measurement.frf()
-    alone = estimate_frf(u, y, sample_rate_hz=RATE_HZ, harmonics=excitation().harmonics)
-    np.testing.assert_allclose(frf.g, alone.g, rtol=1e-9)
+            frf = measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
+            if m == 0 and p > 0:
+                so_far = (slice(1), slice(p + 1))
+                assert_equal(frf, estimate_frf(u[so_far], y[so_far], **options))
+    assert_equal(frf, estimate_frf(u, y, **options))
     assert (frf.realisations, frf.periods) == (2, 4)
+
+
+def assert_equal(frf, expected):
+    for name in PER_LINE:
+        mine, theirs = getattr(frf, name), getattr(expected, name)
+        assert (mine is None) == (theirs is None), name
+        if mine is not None:
+            np.testing.assert_allclose(mine, theirs, rtol=1e-9, err_msg=name)
+    assert (frf.noise_dof, frf.total_dof) == (expected.noise_dof, expected.total_dof)
+    assert (frf.periods, frf.status) == (expected.periods, expected.status)
+
+
+def test_the_first_period_has_no_covariance(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    frf = measurement.add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
+    assert (frf.status, frf.variance_noise, frf.periods) == (FrfStatus.NO_COVARIANCE, None, 1)
+    lines = excitation().harmonics
+    g = np.fft.rfft(y[0, 0])[lines] / np.fft.rfft(u[0, 0])[lines]
+    np.testing.assert_allclose(frf.g, g, rtol=1e-12)
+    # single periods of two realisations tell the total variance only
+    frf = measurement.add(record(u[1, 0], y[1, 0], 1, 0), excitation(1))
+    assert frf.variance_noise is None
+    assert frf.variance_total is not None
+
+
+def test_a_realisation_that_was_lost_is_no_failure(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    measurement.add(record(u[0, 1], y[0, 1], 0, 1), excitation(0))
+    for p in range(2):
+        frf = measurement.add(record(u[1, p], y[1, p], 1, p), excitation(1))
+    assert (frf.realisations, frf.periods, frf.status) == (1, 2, FrfStatus.SUSPECT)
+    assert "blocks lost" in frf.message
+
+
+def test_a_bad_block_is_not_taken(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    measurement.add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
+    bad = y[0, 1].copy()
+    bad[10] = np.nan
+    with pytest.raises(ValueError, match="record: samples are not finite"):
+        measurement.add(record(u[0, 1], bad, 0, 1), excitation(0))
+    frf = measurement.add(record(u[0, 1], y[0, 1], 0, 1), excitation(0))
+    assert frf.periods == 2
+    assert frf.status is FrfStatus.SUSPECT  # the sensor had missing samples
+
+
+def test_what_is_too_much_is_refused(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    for p in range(4):
+        measurement.add(record(u[0, p], y[0, p], 0, p), excitation(0))
+    with pytest.raises(ValueError, match="record: 5 periods of realisation 0, at most 4"):
+        measurement.add(record(u[0, 0], y[0, 0], 0, 4), excitation(0))
+    with pytest.raises(ValueError, match=r"band_hz: 300\.\.400 holds no excited line"):
+        MeasurementFrf(1, band_hz=(300.0, 400.0)).add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
+    many = replace(excitation(0), periods=1000)
+    with pytest.raises(
+        ValueError, match="bins: 99 to 200 Hz are 20200 bins after 1000 periods, at"
+    ):
+        MeasurementFrf(1, bins_band_hz=(99.0, 200.0)).add(record(u[0, 0], y[0, 0], 0, 0), many)
 
 
 def test_a_realisation_under_way_waits(channels):

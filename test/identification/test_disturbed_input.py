@@ -103,7 +103,7 @@ def test_realisations_with_a_disturbance():
 def test_a_joint_fit_that_does_not_converge_is_followed_by_the_frf(monkeypatch):
     u, y = record(1, kind="white", periods=4)
     monkeypatch.setattr(
-        "tactile_resonance.analysis.identify_poles_from_records",
+        "tactile_resonance.analysis.identify_poles_from_bins",
         lambda *arguments, **options: Poles(status=PolesStatus.NOT_CONVERGED),
     )
     poles = analyse(Recording(u[None], y[None], RATE_HZ, ODD), band_hz=BAND_HZ).poles

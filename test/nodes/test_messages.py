@@ -121,8 +121,6 @@ def complex_normal(*shape):
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_frf(complete):
-    covariance = complex_normal(2, 2, 30)
-    covariance = covariance + np.conj(np.swapaxes(covariance, 0, 1))  # Hermitian
     bins = BandBins(17, complex_normal(2, 6), complex_normal(2, 6), np.arange(5, 8), 1e3, 64, 4)
     frf = FRF(
         frequency_hz=np.sort(RNG.uniform(1, 100, 30)),
@@ -131,8 +129,8 @@ def test_frf(complete):
         variance_total=RNG.uniform(size=30) if complete else None,
         noise_dof=7,
         total_dof=3,
-        spectra=complex_normal(2, 30) if complete else None,
-        spectra_covariance=covariance if complete else None,
+        actuator_amplitude=RNG.uniform(size=30) if complete else None,
+        sensor_variance_given_actuator=RNG.uniform(size=30) if complete else None,
         bins=bins if complete else None,
         periods=4,
         realisations=2,

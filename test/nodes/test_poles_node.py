@@ -28,7 +28,7 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 
 LINES_HZ = np.arange(200.0, 300.1, 2.5)
-SPECTRA = ("sensor_real", "sensor_imag", "actuator_real", "actuator_imag")
+BINS = ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
 
 
 @pytest.fixture
@@ -59,20 +59,14 @@ BROKEN = {
     "imag short": lambda m: shorten(m, "imag"),
     "lines short": lambda m: shorten(m, "frequency_hz"),
     "variance short": lambda m: shorten(m, "variance_noise"),
-    "one spectrum": lambda m: m.sensor_real.extend([1.0] * LINES_HZ.size),
-    "one variance": lambda m: m.sensor_variance.extend([1.0] * LINES_HZ.size),
+    "amplitudes long": lambda m: m.actuator_amplitude.extend([1.0] * (LINES_HZ.size + 1)),
+    "one variance": lambda m: m.sensor_variance_given_actuator.extend([1.0]),
     "bins short": lambda m: m.bins_sensor_imag.extend([1.0]),
     "bins of no whole realisations": lambda m: [
         setattr(m, "realisations", 2),
-        *(
-            getattr(m, f"bins_{name}").extend([1.0])
-            for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
-        ),
+        *(getattr(m, f"bins_{name}").extend([1.0]) for name in BINS),
     ],
-    "bins without a rate": lambda m: [
-        getattr(m, f"bins_{name}").extend([1.0])
-        for name in ("actuator_real", "actuator_imag", "sensor_real", "sensor_imag")
-    ],
+    "bins without a rate": lambda m: [getattr(m, f"bins_{name}").extend([1.0]) for name in BINS],
     "nothing": lambda m: [
         setattr(m, n, array.array("d")) for n in ("frequency_hz", "real", "imag", "variance_noise")
     ],

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.frf.estimate import estimate_distortion
-from tactile_resonance.frf.spectra import period_spectra
+from tactile_resonance.frf.distortion import estimate_distortion
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
 from tactile_resonance.simulation.experiments import records_at_levels, repeated_records
 
@@ -12,7 +12,7 @@ from tactile_resonance.simulation.experiments import records_at_levels, repeated
 def distortion():
     records = records_at_levels((2.0, 4.0), realisations=2, periods=3)
     return {
-        level_v: estimate_distortion(u, y, sample_rate_hz=rate_hz, harmonics=harmonics)
+        level_v: estimate_distortion(Spectrum.of(u, y), sample_rate_hz=rate_hz, harmonics=harmonics)
         for level_v, (u, y, harmonics, rate_hz) in records.items()
     }
 
@@ -44,7 +44,8 @@ def test_sources_of_variance_come_in_the_papers_order():
     )
     frequency_hz = harmonics * rate_hz / u.shape[-1]
     inside = (frequency_hz > 200) & (frequency_hz < 300)
-    g = (period_spectra(y, harmonics) / period_spectra(u, harmonics))[..., inside]
+    lines = Spectrum.of(u, y).by_period[..., harmonics[inside]]
+    g = lines[..., 0, :, :] / lines[..., 1, :, :]
     analysis = analyse_variance(g, frequency_hz[inside], axes=PAPER_AXES)
     levels = [source.rms_level_db for source in reversed(analysis.sources)]
     assert np.all(np.diff(levels) > 0)
