@@ -54,21 +54,21 @@ def require(condition: bool, field: str, value: object, accepted: str) -> None:
         raise ValueError(f"{field}: got {cut(_SHOWN.repr(value))}; accepted is {accepted}")
 
 
-def within(owner: object, **ranges: tuple[float, float]) -> None:
+def check_within(owner: object, **ranges: tuple[float, float]) -> None:
     """`require` each named number of a dataclass to be in its range, ends included; None passes."""
     for name, (low, high) in ranges.items():
         value = getattr(owner, name)
         require(value is None or low <= value <= high, name, value, f"{low:g} to {high:g}")
 
 
-def above_zero(owner: object, *names: str) -> None:
+def check_above_zero(owner: object, *names: str) -> None:
     """`require` each named number of a dataclass to be above 0 and finite; None passes."""
     for name in names:
         value = getattr(owner, name)
         require(value is None or 0 < value < math.inf, name, value, "a number above 0")
 
 
-def not_negative(owner: object, *names: str) -> None:
+def check_not_negative(owner: object, *names: str) -> None:
     """`require` each named number of a dataclass to be 0 or above and finite; None passes."""
     for name in names:
         value = getattr(owner, name)
@@ -79,6 +79,16 @@ def cut(text: str) -> str:
     """Return one line of at most `LONGEST` characters."""
     line = " ".join(text.split())
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 3]}..."
+
+
+def read_file_name(value: object, field: str) -> str:
+    """Return `value` as a name that a file may have; ``ValueError`` if it is not."""
+    good = isinstance(value, str) and 0 < len(value) <= LONGEST and value.isprintable()
+    require(good, field, value, "the name of a file")
+    return str(value)
+
+
+FileName = Annotated[str, read_file_name]
 
 
 def read_text(path: Path) -> str:

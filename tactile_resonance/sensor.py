@@ -10,7 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import above_zero, not_negative, read_file, require, within
+from tactile_resonance.fields import (
+    check_above_zero,
+    check_not_negative,
+    check_within,
+    read_file,
+    require,
+)
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,7 @@ class BeamParameters:
     mode_count: int
 
     def __post_init__(self) -> None:
-        above_zero(
+        check_above_zero(
             self, "free_length_m", "width_m", "piezo_thickness_m", "shim_thickness_m",
             "piezo_modulus_pa", "shim_modulus_pa", "piezo_density_kg_per_m3",
             "shim_density_kg_per_m3", "relative_permittivity_t33",
@@ -39,7 +45,7 @@ class BeamParameters:
         require(self.d31_m_per_v != 0.0, "d31_m_per_v", self.d31_m_per_v, "a number other than 0")
         zeta = self.modal_damping_ratio
         require(0.0 < zeta < 1.0, "modal_damping_ratio", zeta, "above 0 and below 1")
-        within(self, mode_count=(1, 40))
+        check_within(self, mode_count=(1, 40))
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,8 @@ class TipParameters:
     mass_kg: float
 
     def __post_init__(self) -> None:
-        above_zero(self, "radius_m")
-        not_negative(self, "mass_kg")
+        check_above_zero(self, "radius_m")
+        check_not_negative(self, "mass_kg")
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class ElectricParameters:
     feedthrough: float
 
     def __post_init__(self) -> None:
-        above_zero(self, "input_resistance_ohm")
+        check_above_zero(self, "input_resistance_ohm")
         require(0.0 < self.feedthrough < 1.0, "feedthrough", self.feedthrough, "above 0, below 1")
 
 
@@ -91,9 +97,9 @@ class AcquisitionParameters:
     actuator_divider: float = 1.0
 
     def __post_init__(self) -> None:
-        not_negative(self, "sensor_noise_v")
-        above_zero(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
-        within(self, adc_bits=(8, 31))
+        check_not_negative(self, "sensor_noise_v")
+        check_above_zero(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
+        check_within(self, adc_bits=(8, 31))
 
     def noise_rms_v(self, sample_rate_hz: float) -> float:
         """Return the rms of the sensor noise [V] in the full band of a sample rate."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 from tactile_resonance.configuration import shared_file
-from tactile_resonance.fields import above_zero, read, read_file, require, within
+from tactile_resonance.fields import check_above_zero, check_within, read, read_file, require
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
@@ -69,7 +69,7 @@ class Reply:
     errors: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        within(self, result_byte=(0, 255), good=(0, 255), error_byte=(0, 255))
+        check_within(self, result_byte=(0, 255), good=(0, 255), error_byte=(0, 255))
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class CanDescription:
         if self.overload is not None:
             name = self.overload.field
             require(name in self.fields, "overload.field", name, "one of fields")
-        above_zero(self, "full_scale_counts")
+        check_above_zero(self, "full_scale_counts")
         command_id, reply = self.commands.id, self.commands.reply
         require(0 <= command_id <= most, "commands.id", command_id, f"0 to {most:#x}")
         for name in ("result_byte", "error_byte") if reply else ():

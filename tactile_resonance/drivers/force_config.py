@@ -20,13 +20,15 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (
-    above_zero,
+    FileName,
     build,
+    check_above_zero,
+    check_within,
     read,
     read_dataclass,
+    read_file_name,
     read_yaml,
     require,
-    within,
 )
 
 LONGEST_S = 1.0
@@ -101,8 +103,8 @@ class ForceConfig:
     resolution_n: float | None = None
 
     def __post_init__(self) -> None:
-        above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
-        within(self, latency_s=(0, LONGEST_S), inertia_window_s=(0, LONGEST_S))
+        check_above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
+        check_within(self, latency_s=(0, LONGEST_S), inertia_window_s=(0, LONGEST_S))
         good = self._step_n is not None
         require(good, "resolution_n", None, "a number above 0: not known of this source")
         silent_s = self.limits.silent_s
@@ -165,7 +167,7 @@ class CanForce(ForceConfig):
     """
 
     bus: Annotated[dict[str, Any], _read_bus]
-    frames: str
+    frames: FileName
     description: CanDescription
     counts_per_n: float | None = None
     counts_per_nm: float | None = None
@@ -185,8 +187,8 @@ class CanForce(ForceConfig):
             value = getattr(self, name)
             good = (value is None) == (self.matrix is not None)
             require(good, name, value, "a number above 0, or a matrix in place of both")
-        above_zero(self, "counts_per_n", "counts_per_nm")
-        within(self, shortest_delay_s=(0, LONGEST_S), delay_std_s=(0, LONGEST_S))
+        check_above_zero(self, "counts_per_n", "counts_per_nm")
+        check_within(self, shortest_delay_s=(0, LONGEST_S), delay_std_s=(0, LONGEST_S))
         super().__post_init__()
         rates = self.description.commands.rates
         good = not rates or self.rate_hz in rates
@@ -231,7 +233,7 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     kind = read(Literal["can", "rtde", "topic"], content.get("kind"), f"{where} kind")
     given: dict[str, Any] = {}
     if kind == "can":
-        frames = read(str, content.get("frames"), f"{where} frames")
+        frames = read_file_name(content.get("frames"), f"{where} frames")
         beside = path.parent / frames
         file = beside if beside.is_file() else Path(frames)
         given["description"] = build(read_can_description, where, file)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from tactile_resonance.fields import (
-    above_zero,
+    check_above_zero,
     known_keys,
     number,
     read,
@@ -39,7 +39,7 @@ class InputChannel:
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ai0")
-        above_zero(self, "range_v")
+        check_above_zero(self, "range_v")
         good = self.terminals in TERMINALS
         require(good, "terminals", self.terminals, f"one of {', '.join(TERMINALS)}")
 
@@ -53,7 +53,7 @@ class OutputChannel:
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ao0")
-        above_zero(self, "max_voltage_v")
+        check_above_zero(self, "max_voltage_v")
 
 
 def _read_actuator(value: Any, field: str) -> InputChannel | None:
@@ -102,7 +102,7 @@ class NiDaqConfig:
     def __post_init__(self) -> None:
         taken = self.actuator is not None and self.actuator.channel == self.sensor.channel
         require(not taken, "sensor.channel", self.sensor.channel, "another than actuator.channel")
-        above_zero(self, "buffer_s")
+        check_above_zero(self, "buffer_s")
 
     @property
     def input_kind(self) -> InputKind:

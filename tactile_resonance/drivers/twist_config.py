@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from tactile_resonance.contact.samples import PoseOfSix
-from tactile_resonance.fields import read_file, require, within
+from tactile_resonance.fields import check_within, read_file, require
 
 TOPIC = r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 """As in ROS 2, without substitutions (https://design.ros2.org/articles/topic_and_service_names.html)."""
@@ -78,7 +78,7 @@ class TwistConfig:
             require(good, name, value, "the name of a topic: letters, digits, _ and single /")
         accepted = "another topic than command_topic"
         require(self.pose_topic != self.command_topic, "pose_topic", self.pose_topic, accepted)
-        within(self, **RANGES)
+        check_within(self, **RANGES)
         least = 1 / self.rate_hz
         for name in ("max_state_age_s", "max_command_gap_s", "follow_s"):
             value = getattr(self, name)

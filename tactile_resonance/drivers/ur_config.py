@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tactile_resonance.contact.samples import Pose, PoseOfSix
-from tactile_resonance.fields import read_dataclass, read_file, require, within
+from tactile_resonance.fields import check_within, read_dataclass, read_file, require
 
 
 def _is_loopback(host: str) -> bool:
@@ -76,7 +76,7 @@ class UrArmConfig:
 
     def __post_init__(self) -> None:
         require(bool(self.host), "host", self.host, "a name or an address")
-        within(
+        check_within(
             self,
             rate_hz=(25.0, 500.0),
             watchdog_hz=(5.0 if self.simulated else 25.0, 125.0),

@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import above_zero, require
+from tactile_resonance.fields import check_above_zero, require
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 
 FloatArray = npt.NDArray[np.float64]
@@ -43,7 +43,7 @@ class Precise:
     damping_ratio_std: float | None = None
 
     def __post_init__(self) -> None:
-        above_zero(self, "f0_std_hz", "damping_ratio_std")
+        check_above_zero(self, "f0_std_hz", "damping_ratio_std")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import above_zero, build, number, numbers, one_of, require
+from tactile_resonance.fields import build, check_above_zero, number, numbers, one_of, require
 
 FloatArray = npt.NDArray[np.float64]
 Pair = tuple[float, float]
@@ -33,8 +33,9 @@ def grid(
         raster: every row in the direction of x; serpentine: every second one back.
     """
     center, size, spacing = (np.asarray(v, float) for v in (center_m, size_m, spacing_m))
-    counts = np.floor(size / spacing + 1e-9).astype(int) + 1
-    _check_count(float(counts[0]) * float(counts[1]))
+    rows_of_each = np.floor(size / spacing + 1e-9) + 1
+    _check_count(float(np.prod(rows_of_each)))
+    counts = rows_of_each.astype(int)
     x, y = (center[k] + spacing[k] * (np.arange(counts[k]) - (counts[k] - 1) / 2) for k in range(2))
     rows = [np.stack([x, np.full(x.size, value)], axis=1) for value in y]
     if order == "serpentine":
@@ -152,7 +153,7 @@ class _Spiral:
     spacing_m: Spacing
 
     def positions(self) -> FloatArray:
-        above_zero(self, "radius_m")
+        check_above_zero(self, "radius_m")
         return _flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
 
 

@@ -19,15 +19,16 @@ import numpy.typing as npt
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
-    above_zero,
     build,
+    check_above_zero,
+    check_within,
     known_keys,
     read,
     read_dataclass,
+    read_file_name,
     read_yaml,
     require,
     section,
-    within,
 )
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
@@ -102,7 +103,7 @@ class SensorUse:
     def __post_init__(self) -> None:
         known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))
         require(self.name in known, "name", self.name, f"one of config/sensors: {', '.join(known)}")
-        above_zero(self, "band_low_hz", "level_v")
+        check_above_zero(self, "band_low_hz", "level_v")
         low, high = self.band_low_hz, self.band_high_hz
         require(high > low, "band_high_hz", high, f"above band_low_hz = {low:g}")
 
@@ -115,7 +116,7 @@ class TimeLimits:
     scan_s: float = 3600.0
 
     def __post_init__(self) -> None:
-        above_zero(self, "point_s", "scan_s")
+        check_above_zero(self, "point_s", "scan_s")
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ class DriftLimits:
     damping_ratio: float = 5e-5
 
     def __post_init__(self) -> None:
-        above_zero(self, "f0_hz", "damping_ratio")
+        check_above_zero(self, "f0_hz", "damping_ratio")
 
 
 @dataclass(frozen=True)
@@ -151,9 +152,9 @@ class Gate:
     measurements: int = 20
 
     def __post_init__(self) -> None:
-        above_zero(self, "force_rms_n")
+        check_above_zero(self, "force_rms_n")
         require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
-        within(self, measurements=(1, 100))
+        check_within(self, measurements=(1, 100))
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +213,7 @@ class ScanScene:
     notes: Notes = field(default_factory=Notes)
 
     def __post_init__(self) -> None:
-        above_zero(self, "force_n")
+        check_above_zero(self, "force_n")
         require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")
         if self.nominal_contact is not None:
             nominal_n = self.nominal_contact.force_n
@@ -275,6 +276,7 @@ def _read_tissues(
     """Classes and the contact to which they refer: given in place, or in a file beside the scene."""
     classes = content.get("tissue_classes")
     if isinstance(classes, str):
+        read_file_name(classes, f"{where} tissue_classes")
         alone = "nominal_contact" not in content
         accepted = f"none: it belongs to the classes, in {classes}"
         require(alone, f"{where} nominal_contact", "one", accepted)

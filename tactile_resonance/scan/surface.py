@@ -16,7 +16,15 @@ import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import above_zero, build, one_of, read, require, within
+from tactile_resonance.fields import (
+    FileName,
+    build,
+    check_above_zero,
+    check_within,
+    one_of,
+    read,
+    require,
+)
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
 FloatArray = npt.NDArray[np.float64]
@@ -172,7 +180,7 @@ class TouchRequest:
     def __post_init__(self) -> None:
         least, given = 3 if self.form == "plane" else 6, len(self.points_m)
         require(given >= least, "points_m", given, f"{least} positions or more for a {self.form}")
-        above_zero(self, "force_n")
+        check_above_zero(self, "force_n")
         require(self.tolerance_m > 0, "tolerance_m", self.tolerance_m, "a number above 0")
         check_search(self.search_m, "search_m")
 
@@ -206,7 +214,7 @@ class NormalRequest:
     tolerance_m: float = 2e-4
 
     def __post_init__(self) -> None:
-        within(
+        check_within(
             self,
             radius_m=(5e-4, 0.01),
             touches=(3, 12),
@@ -242,7 +250,7 @@ class _Plane:
 
 @dataclass(frozen=True)
 class _Mesh:
-    file: str
+    file: FileName
     unit_m: float
 
     def surface(self, folder: Path) -> Surface:
@@ -252,7 +260,7 @@ class _Mesh:
 
 @dataclass(frozen=True)
 class _HeightFile:
-    file: str
+    file: FileName
 
     def surface(self, folder: Path) -> Surface:
         path = folder / self.file

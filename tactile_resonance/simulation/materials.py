@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import above_zero, build, not_negative, require, within
+from tactile_resonance.fields import (
+    build,
+    check_above_zero,
+    check_not_negative,
+    check_within,
+    require,
+)
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.modal import FloatArray
 from tactile_resonance.simulation.shapes import Point
@@ -82,8 +88,8 @@ class RandomField:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        above_zero(self, "correlation_length_m")
-        not_negative(self, "seed")
+        check_above_zero(self, "correlation_length_m")
+        check_not_negative(self, "seed")
 
     @cached_property
     def _waves(self) -> tuple[FloatArray, FloatArray]:
@@ -116,7 +122,7 @@ class Heterogeneous:
     modulus_spread: float
 
     def __post_init__(self) -> None:
-        within(self, modulus_spread=(0, 1))
+        check_within(self, modulus_spread=(0, 1))
 
     def tissue_at(self, position_m: FloatArray) -> Tissue:
         """Return the tissue there, its modulus times the local factor."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import above_zero, build, read_dataclass, read_yaml, require
+from tactile_resonance.fields import build, check_above_zero, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
@@ -186,5 +186,5 @@ class _BenchPart:
     motion: SurfaceMotion | None = None
 
     def __post_init__(self) -> None:
-        above_zero(self, "force_n")
+        check_above_zero(self, "force_n")
         require(bool(self.regions), "regions", [], "a list of one region or more")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import above_zero, require
+from tactile_resonance.fields import check_above_zero, require
 
 Point = tuple[float, ...]
 
@@ -31,7 +31,7 @@ class Disc:
     radius_m: float
 
     def __post_init__(self) -> None:
-        above_zero(self, "radius_m")
+        check_above_zero(self, "radius_m")
 
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the edge."""
@@ -85,7 +85,7 @@ class Sphere:
     radius_m: float
 
     def __post_init__(self) -> None:
-        above_zero(self, "radius_m")
+        check_above_zero(self, "radius_m")
 
     def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which positions lie inside or on the surface."""

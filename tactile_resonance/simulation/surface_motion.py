@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tactile_resonance.fields import not_negative, within
+from tactile_resonance.fields import check_not_negative, check_within
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class SurfaceMotion:
     phase_seed: int = 1
 
     def __post_init__(self) -> None:
-        within(self, breath_m=(0, 0.02), heart_m=(0, 0.005))  # peak to peak
-        within(self, breath_hz=(0.05, 2.0), heart_hz=(0.3, 10.0), breath_power=(1, 3))
-        not_negative(self, "phase_seed")
+        check_within(self, breath_m=(0, 0.02), heart_m=(0, 0.005))  # peak to peak
+        check_within(self, breath_hz=(0.05, 2.0), heart_hz=(0.3, 10.0), breath_power=(1, 3))
+        check_not_negative(self, "phase_seed")
 
     @cached_property
     def phases_rad(self) -> tuple[float, float]:

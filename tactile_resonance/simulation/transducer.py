@@ -10,7 +10,7 @@ from operator import add
 from pathlib import Path
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import above_zero, not_negative, read_file, require
+from tactile_resonance.fields import check_above_zero, check_not_negative, read_file, require
 from tactile_resonance.simulation.noise import NormalRows, Seed
 
 SAMPLE_PERIOD_S = 0.001
@@ -51,8 +51,8 @@ class CellParameters:
     force_drift_n_per_s: float = 0.0
 
     def __post_init__(self) -> None:
-        above_zero(self, "force_divisor", "torque_divisor", "force_range_n", "torque_range_nm")
-        not_negative(self, "force_noise_rms_n", "torque_noise_rms_nm")
+        check_above_zero(self, "force_divisor", "torque_divisor", "force_range_n", "torque_range_nm")
+        check_not_negative(self, "force_noise_rms_n", "torque_noise_rms_nm")
 
     @classmethod
     def from_yaml(cls, path: Path | None = None) -> CellParameters:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import above_zero, not_negative, require
+from tactile_resonance.fields import check_above_zero, check_not_negative, require
 
 FloatArray = npt.NDArray[np.float64]
 NAN = float("nan")
@@ -97,9 +97,9 @@ class NominalContact:
     unknown_age_factor: float = NAN
 
     def __post_init__(self) -> None:
-        above_zero(self, "force_n", "age_s")
+        check_above_zero(self, "force_n", "age_s")
         require(0 <= self.creep < 1, "creep", self.creep, "0 or above, below 1")
-        not_negative(self, "creep_std", "force_scale_std")
+        check_not_negative(self, "creep_std", "force_scale_std")
         value = self.unknown_force_std_n
         require(not value <= 0, "unknown_force_std_n", value, "a number above 0")
         value = self.unknown_age_factor

@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import (
-    above_zero,
     build,
+    check_above_zero,
+    check_not_negative,
+    check_within,
     join,
     known_keys,
-    not_negative,
     read,
     read_dataclass,
     read_yaml,
     require,
-    within,
 )
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples
 from tactile_resonance.tissue.nominal_contact import (
@@ -44,11 +44,11 @@ class _Point:
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
-        above_zero(self, "f0_hz")
+        check_above_zero(self, "f0_hz")
         damping = self.damping_ratio
         require(0 < damping < 1, "damping_ratio", damping, "a number above 0, below 1")
-        not_negative(self, "f0_std_hz", "damping_ratio_std")
-        within(self, correlation=(-1, 1))
+        check_not_negative(self, "f0_std_hz", "damping_ratio_std")
+        check_within(self, correlation=(-1, 1))
 
     @property
     def estimate(self) -> FloatArray:
@@ -91,8 +91,8 @@ class _Preload(_Point):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        above_zero(self, "force_n")
-        not_negative(self, "force_std_n")
+        check_above_zero(self, "force_n")
+        check_not_negative(self, "force_std_n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,10 +106,9 @@ class _Sensitivity:
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
-        not_negative(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
-        within(self, correlation=(-1, 1))
+        check_not_negative(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
+        check_within(self, correlation=(-1, 1))
 
-    @property
     def sensitivity(self) -> ForceSensitivity:
         stds = self.f0_std_hz_per_n, self.damping_ratio_std_per_n
         per_n = np.array([self.f0_hz_per_n, self.damping_ratio_per_n])
@@ -174,7 +173,7 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
             _between, at, read(tuple[_Preload, _Preload], entries["preloads"], at), nominal_n
         )
     else:
-        sensitivity = read_dataclass(_Sensitivity, how, where).sensitivity
+        sensitivity = build(read_dataclass(_Sensitivity, how, where).sensitivity, where)
     return read_dataclass(NominalContact, rest, where, sensitivity=sensitivity)
 
 
