@@ -240,7 +240,7 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
 
 
 @dataclass(frozen=True)
-class _Plane:
+class _PlaneForm:
     point_m: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
 
@@ -289,7 +289,7 @@ def _read_heights(value: object, where: str) -> _HeightFile | _Heights:
 
 
 _FORMS = {
-    "plane": _Plane,
+    "plane": _PlaneForm,
     "height_field": Annotated[Any, _read_heights],
     "mesh": _Mesh,
     "touch": TouchRequest,
