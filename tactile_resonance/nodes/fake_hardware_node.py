@@ -14,8 +14,7 @@ from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
-from tactile_resonance.nodes.bench_player import BenchPlayer, bench_record
+from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, bench_record
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Parameter, file_of, values

@@ -20,8 +20,7 @@ from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.msg import PointResult
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import drop
+from tactile_resonance.nodes.goals import GoalClient, drop
 from tactile_resonance.nodes.running import STEADY
 
 TICK_S = 0.1

@@ -9,6 +9,7 @@ came or not. No goal goes on that is no longer followed.
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -22,6 +23,39 @@ from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.scan.hands import Check, Interrupted, NodeAway, PointFailed, ScanEnded
+
+
+class GoalClient(ActionClient):
+    """`ActionClient` whose executor takes no answer before its request is registered.
+
+    rclpy of Jazzy sends a request before it registers it: an answer that the executor's thread takes in between
+    is dropped, and its future is never done (rclpy #1123). Kilted has this lock itself.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._registering = threading.Lock()
+        super().__init__(*args, **kwargs)
+
+    def take_data(self) -> Any:
+        """As the executor asks for it."""
+        with self._registering:
+            return super().take_data()
+
+    def send_goal_async(self, *args: Any, **kwargs: Any) -> Future:
+        """As every client."""
+        with self._registering:
+            return super().send_goal_async(*args, **kwargs)
+
+    # What the methods of a goal handle call.
+
+    def _get_result_async(self, goal_handle: ClientGoalHandle) -> Future:
+        with self._registering:
+            return super()._get_result_async(goal_handle)
+
+    def _cancel_goal_async(self, goal_handle: ClientGoalHandle) -> Future:
+        with self._registering:
+            return super()._cancel_goal_async(goal_handle)
+
 
 POLL_S = 0.005
 # A node that was started anew accepts goals again within this.
