@@ -73,7 +73,7 @@ class Reply:
 
 
 @dataclass(frozen=True)
-class Commands:
+class CellCommands:
     """What is sent to the cell.
 
     Attributes
@@ -132,7 +132,7 @@ class CanDescription:
         Counts that mean an invalid value.
     full_scale_counts : int or None
         At and beyond which a count is an overload.
-    commands : Commands
+    commands : CellCommands
         None of them where the cell takes none and streams by itself.
     """
 
@@ -145,7 +145,7 @@ class CanDescription:
     overload: Overload | None = None
     invalid_counts: tuple[int, ...] = ()
     full_scale_counts: int | None = None
-    commands: Commands = field(default_factory=lambda: Commands(id=0))
+    commands: CellCommands = field(default_factory=lambda: CellCommands(id=0))
 
     def __post_init__(self) -> None:
         ids, size = self.frame_ids, self.layout.size

@@ -232,7 +232,7 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
 
 
 @dataclass(frozen=True)
-class _Plane:
+class _PlaneFields:
     point_m: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
 
@@ -281,7 +281,7 @@ def _read_heights(value: object, where: str) -> _HeightFile | _Heights:
 
 
 _FORMS = {
-    "plane": _Plane,
+    "plane": _PlaneFields,
     "height_field": Annotated[Any, _read_heights],
     "mesh": _Mesh,
     "touch": TouchRequest,
