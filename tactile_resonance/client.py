@@ -19,8 +19,8 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
-from tactile_resonance.nodes.goal_client import GoalClient
 from tactile_resonance.nodes.goal_conduct import AskedGoal, Ending, GoalConduct
+from tactile_resonance.nodes.goals import GoalClient
 from tactile_resonance.nodes.running import RESULTS
 
 

@@ -75,10 +75,11 @@ class Excitation:
     label: str = ""
 
     def __post_init__(self) -> None:
-        for name, dtype in (("harmonics", np.int64), ("amplitude_v", float), ("phase_rad", float)):
-            array = np.array(getattr(self, name), dtype=dtype)
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        for name, kind in (("harmonics", "i"), ("amplitude_v", "f"), ("phase_rad", "f")):
+            given = getattr(self, name).dtype
+            if given.kind != kind:
+                accepted = {"i": "signed integers", "f": "real numbers"}[kind]
+                raise ValueError(f"{name}: values of type {given}, expected {accepted}")
         _check_period(self.sample_rate_hz, self.samples_per_period)
         _check_harmonics(self.harmonics, self.samples_per_period)
         for name in ("amplitude_v", "phase_rad"):

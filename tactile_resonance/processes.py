@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import signal
 import socket
@@ -53,8 +54,8 @@ class NodeProcesses:
         nice = ["nice", "-n", str(niceness)] if niceness else []
         command = [*nice, *self._prefix, sys.executable, "-m", module, "--ros-args"]
         for name, value in (parameters or {}).items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            command += ["-p", f"{name}:={text}"]
+            text = value if isinstance(value, str) and value else json.dumps(value, default=str)
+            command += ["-p", f"{name}:={text}"]  # what is no text as YAML
         self._log_folder.mkdir(parents=True, exist_ok=True)
         with (self._log_folder / f"{node}.log").open("wb") as log:
             self._processes[node] = subprocess.Popen(

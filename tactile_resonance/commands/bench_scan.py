@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import sys
@@ -14,18 +13,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance import bringup
+from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY, STALLS_S, TABLE_IN_BASE
+from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
     from tactile_resonance.client import ScanOutcome
 
-NODES = (
-    *("fake_hardware_node", "excitation_node", "frf_node", "poles_node"),
-    *("contact_node", "pole_map_node", "scan_node"),
-)
+NODES = bringup.NODES[:-1]
+"""All but the manager."""
 # On the wall clock, without real-time priority, what computes gives way to what lives by milliseconds: the
 # simulated robot and the control loop.
 COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
@@ -202,41 +200,24 @@ class _Ended:
 
 
 def node_parameters(
-    job: Job, classes: bool, work: Path, map_frame: str = "table"
+    job: Job, classes: bool, work: Path, table_frame: str = "table"
 ) -> dict[str, dict[str, object]]:
-    """Parameters of each node that differ from their defaults."""
-    waits_s = STALLS_S if job.real_time and not may_take_priority(PRIORITY) else 0.0
-    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
-    simulated = not job.real_time
-    time_server = {"time_server": f"{job.host}:{TIME_PORT}" if simulated else "''"}
-    own: dict[str, dict[str, object]] = {
-        "fake_hardware_node": {
-            **time_server,
-            "scene": job.scene,
-            "robot_host": job.host,
-            "table_in_base": table,
-            "seed": job.seed,
-        },
-        "excitation_node": {"record_folder": work / "records", **time_server},
-        "contact_node": {
-            "robot_host": job.host,
-            "force_host": job.host,
-            "simulated_stalls_s": waits_s,
-            **time_server,
-        },
-        "pole_map_node": {
-            "classes_file": job.scene if classes else "''",
-            "frame_id": map_frame,
-            "table_in_base": table,
-        },
-        "scan_node": {
-            "table_in_base": table,
-            "table_frame": map_frame,
-            "goal_folders": json.dumps([str(job.scene.parent), str(job.output.parent)]),
-            **time_server,
-        },
+    """Parameters of each node that differ from their defaults, as `mock.launch.py` passes them."""
+    arguments = {
+        "use_mock_hardware": "true",
+        "robot": "true",
+        "robot_ip": job.host,
+        "scene": str(job.scene),
+        "run_directory": str(job.output),
+        "table_frame": table_frame,
+        "real_time": str(job.real_time).lower(),
     }
-    return {node: {"use_sim_time": simulated, **own.get(node, {})} for node in NODES}
+    nodes = plan_bringup(arguments, {}, priority=may_take_priority(PRIORITY)).nodes
+    nodes["fake_hardware_node"]["seed"] = job.seed
+    nodes["excitation_node"]["record_folder"] = work / "records"
+    if classes:
+        nodes["pole_map_node"]["classes_file"] = job.scene
+    return nodes
 
 
 def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:

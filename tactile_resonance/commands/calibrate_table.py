@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import tempfile
@@ -159,11 +158,10 @@ def _simulated(
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     job = Job(share_path("config/scenes/inclusion_scan.yaml"), work / "run", host)
     parameters = node_parameters(job, False, work)
-    parameters["fake_hardware_node"]["table_in_base"] = f"[{','.join(map(str, true_table()))}]"
+    parameters["fake_hardware_node"]["table_in_base"] = true_table()
     if wanted["file"]:
         wanted["file"] = Path(wanted["file"]).absolute()
-        folder = json.dumps([str(wanted["file"].parent)])
-        parameters["scan_node"]["goal_folders"] = folder
+        parameters["scan_node"]["goal_folders"] = [str(wanted["file"].parent)]
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters)
         try:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.command_limits import CommandLimits
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.interfaces import NodeArm
@@ -19,7 +18,7 @@ from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.fields import read_yaml, require
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Parameter, file_of, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.nodes.twist_arm import TwistArm
 from tactile_resonance.processes import may_take_priority, take_priority
@@ -119,7 +118,7 @@ def make_arm(node: ManagedNode, priority: int) -> NodeArm:
     """The arm that the parameters name, not connected yet; ValueError where they are wrong."""
     names = ("robot_config", "robot_host", "simulated_stalls_s", "base_frame")
     name, host, stalls_s, base_frame = values(node, *names)
-    path = _path(name)
+    path = file_of(name)
     kind = read_yaml(path).get("kind", "ur")
     require(kind in ("ur", "twist"), f"{path}: kind", kind, "ur or twist")
     if kind == "ur":
@@ -206,10 +205,5 @@ def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
 def tip_geometry(node: ManagedNode) -> TipGeometry:
     """Ball, beam and housing; ValueError where a figure is wrong."""
     name, tilt, below = values(node, "sensor_config", "beam_tilt_rad", "housing_below_m")
-    sensor = read_sensor(_path(name))
+    sensor = read_sensor(file_of(name))
     return TipGeometry(sensor.tip.radius_m, sensor.beam.free_length_m, tilt, below)
-
-
-def _path(name: str) -> Path:
-    path = Path(name).expanduser()
-    return path if path.is_absolute() else share_path(name)

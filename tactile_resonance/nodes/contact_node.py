@@ -4,11 +4,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -23,12 +19,7 @@ from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices
-from tactile_resonance.nodes.contact_parameters import (
-    contact_parameters,
-    limits_of_launch,
-    read_parameters,
-    require_stricter,
-)
+from tactile_resonance.nodes.contact_parameters import ContactSettings, contact_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
@@ -97,8 +88,8 @@ class ContactNode(ManagedNode):
         self._thread: ContactThread | None = None
         self._arm: NodeArm | None = None
         self._stop = StopInput(self, self._draw_back)
-        self._launched = limits_of_launch(self)
-        self.add_on_set_parameters_callback(self._on_parameters)
+        (stalls_s,) = values(self, "simulated_stalls_s")
+        self._settings = ContactSettings(self, stalls_s, self._require_allowed, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
@@ -107,7 +98,7 @@ class ContactNode(ManagedNode):
         self._topics = ContactTopics(self, self._stop, frame_id, self._base_frame, rate_hz)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
-        self._settings, self._limits = self._read_parameters()
+        self._settings.read()
         self.resources.callback(self._arm.close)
         self._tip = contact_devices.tip_geometry(self)
         sensor_frame, tool_frame = values(self, "sensor_frame", "tool_frame")
@@ -121,7 +112,7 @@ class ContactNode(ManagedNode):
         self._forces = ForceService(
             self,
             self._force.info.rate_hz,
-            self._settings.period_s,
+            self._settings.parameters.period_s,
             lambda: None if self._thread is None else self._thread.clock,
             self._base_frame,
         )
@@ -134,12 +125,11 @@ class ContactNode(ManagedNode):
         self.resources.callback(self.destroy_guard_condition, self._news)
         self._told: tuple[State, bool] | None = None
         from_poles, false_alarm = values(self, "touch_from_poles", "touch_false_alarm")
-        clock = self._arm.clock
-        began_ns = clock.ros_ns(clock.now_ns())
         self._touch = None
         if from_poles:
+            clock = self._arm.clock
+            began_ns = clock.ros_ns(clock.now_ns())
             self._touch = TouchFromPoles(false_alarm, self._tell_touch, began_ns)
-        if from_poles:
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
@@ -159,8 +149,8 @@ class ContactNode(ManagedNode):
         self._thread = ContactThread(
             self._arm,
             self._force,
-            self._settings,
-            self._limits,
+            self._settings.parameters,
+            self._settings.limits,
             self._tip,
             self._on_cycle,
             self._news.trigger,
@@ -202,33 +192,13 @@ class ContactNode(ManagedNode):
 
     # requests, in the executor's thread
 
-    def _on_parameters(self, changes: Sequence) -> SetParametersResult:
-        """Take what is in range, and of limits what is stricter than the launch's; in contact nothing."""
-        changed = {c.name: c.value for c in changes if c.name.startswith(("contact.", "limits."))}
-        if not changed:
-            return SetParametersResult(successful=True)
-        try:
-            require_stricter(changed, self._launched)
-            parameters, limits = self._read_parameters(**changed)
-            if self._thread is not None:
-                self._thread.configure(parameters, limits)
-        except ValueError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        self._settings, self._limits = parameters, limits
-        return SetParametersResult(successful=True)
-
-    def _read_parameters(self, **changed: Any) -> tuple[ContactParameters, Limits]:
-        """Of the controller, as the arm allows them; ``ValueError`` where one is not accepted."""
-        parameters, limits = read_parameters(self, **changed)
-        (stalls_s,) = values(self, "simulated_stalls_s")
-        limits = replace(
-            limits,
-            force_age_s=limits.force_age_s + stalls_s,
-            arm_age_s=limits.arm_age_s + stalls_s,
-        )
+    def _require_allowed(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._arm is not None:
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
-        return parameters, limits
+
+    def _take(self, parameters: ContactParameters, limits: Limits) -> None:
+        if self._thread is not None:
+            self._thread.configure(parameters, limits)
 
     def _refusal(self, _: MakeContact.Goal) -> str:
         """Goals are taken one at a time, while both devices are well and the tip is not stopped."""
@@ -245,10 +215,13 @@ class ContactNode(ManagedNode):
                 raise ValueError("contact_node is not active")
             if self._stop.stopped:
                 raise ValueError("goal: refused while the tip is stopped")
-            limits = self._goal_limits(goal.request)
+            limits = self._settings.limits.lowered(
+                abort_force_n=goal.request.abort_force_n or None,
+                depth_m=goal.request.depth_limit_m or None,
+            )
             asked = contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
             require_fit(self._force.info, asked.aim.force_n)
-            self._thread.start(asked, self._settings, limits)
+            self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
             result.message = str(error)
             self.health.error(f"refused: {error}")
@@ -289,12 +262,6 @@ class ContactNode(ManagedNode):
         response.success = True
         response.message = "asked; contact_state reports when it is idle"
         return response
-
-    def _goal_limits(self, request: MakeContact.Goal) -> Limits:
-        """The node's limits, lowered where the goal asks for it."""
-        return self._limits.lowered(
-            abort_force_n=request.abort_force_n or None, depth_m=request.depth_limit_m or None
-        )
 
     # what the loop has done, in the executor's thread
 

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
 from tactile_resonance.contact.parameters import (
@@ -60,25 +61,80 @@ def contact_parameters() -> tuple[Parameter, ...]:
     return (*made, *(Parameter(full, list(corner), _CORNERS) for full, corner in corners))
 
 
-def limits_of_launch(node: Node) -> dict[str, Any]:
-    """What may be made only stricter, by parameter, with the values of a node just made."""
-    return {name: node.get_parameter(name).value for name in (*_AT_MOST, *_AT_LEAST)}
+class ContactSettings:
+    """Parameters and limits of a node, as they are set while it runs: limits no laxer than at the launch.
 
+    Parameters
+    ----------
+    node : Node
+        Just made, with `contact_parameters` declared.
+    longer_s : float
+        By which robot and force source may be silent for longer than the limits say.
+    require_allowed : callable
+        Raises ``ValueError`` where the arm's driver would refuse what they allow.
+    take : callable
+        Receives what is new; raises ``ValueError`` where it cannot be taken now.
 
-def require_stricter(changed: Mapping[str, Any], launched: Mapping[str, Any]) -> None:
-    """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
-    for name in changed.keys() & launched.keys():
-        value, limit = np.array(changed[name]), np.array(launched[name])
-        at_most = name in _AT_MOST
-        good = value.shape == limit.shape and bool(
-            np.all(value <= limit if at_most else value >= limit)
+    Attributes
+    ----------
+    parameters, limits : ContactParameters, Limits
+        As `read` last.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        longer_s: float,
+        require_allowed: Callable[[ContactParameters, Limits], None],
+        take: Callable[[ContactParameters, Limits], None],
+    ) -> None:
+        self._node, self._longer_s = node, longer_s
+        self._require_allowed, self._take = require_allowed, take
+        names = (*_AT_MOST, *_AT_LEAST)
+        self._launched = {name: node.get_parameter(name).value for name in names}
+        node.add_on_set_parameters_callback(self._on_change)
+
+    def read(self) -> None:
+        """Read all; ``ValueError`` where one is not accepted."""
+        self.parameters, self.limits = self._read()
+
+    def _read(self, **changed: Any) -> tuple[ContactParameters, Limits]:
+        parameters, limits = read_parameters(self._node, **changed)
+        limits = replace(
+            limits,
+            force_age_s=limits.force_age_s + self._longer_s,
+            arm_age_s=limits.arm_age_s + self._longer_s,
         )
-        accepted = (
-            f"at {'most' if at_most else 'least'} {limit.tolist()}, as launched: it may be made "
-        )
-        require(
-            good, name, value.tolist(), accepted + "stricter here, and laxer by a new launch only"
-        )
+        self._require_allowed(parameters, limits)
+        return parameters, limits
+
+    def _on_change(self, changes: Sequence) -> SetParametersResult:
+        """Take what is in range, and of limits what is stricter than the launch's."""
+        changed = {c.name: c.value for c in changes if c.name.startswith(("contact.", "limits."))}
+        if not changed:
+            return SetParametersResult(successful=True)
+        try:
+            self._require_stricter(changed)
+            new = self._read(**changed)
+            self._take(*new)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.parameters, self.limits = new
+        return SetParametersResult(successful=True)
+
+    def _require_stricter(self, changed: Mapping[str, Any]) -> None:
+        """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
+        for name in changed.keys() & self._launched.keys():
+            value, limit = np.array(changed[name]), np.array(self._launched[name])
+            at_most = name in _AT_MOST
+            stricter = value.shape == limit.shape and (
+                value <= limit if at_most else value >= limit
+            )
+            accepted = (
+                f"at {'most' if at_most else 'least'} {limit.tolist()}, as launched: it may be "
+            )
+            accepted += "made stricter here, and laxer by a new launch only"
+            require(bool(np.all(stricter)), name, value.tolist(), accepted)
 
 
 def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limits]:

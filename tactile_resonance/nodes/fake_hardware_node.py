@@ -6,41 +6,34 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, WrenchStamped
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
-from tactile_resonance.configuration import share_path
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_clock import BenchNow, BenchServer
-from tactile_resonance.nodes.bench_player import BenchPlayer, bench_record
-from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
+from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, bench_record
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
-from tactile_resonance.nodes.messages import pose_to_message, record_to_message, time_message
-from tactile_resonance.nodes.parameters import Parameter, pose_of, values
+from tactile_resonance.nodes.messages import record_to_message, time_message
+from tactile_resonance.nodes.parameters import Parameter, file_of, values
 from tactile_resonance.nodes.plant_child import PlantChild
-from tactile_resonance.nodes.running import PLACES, RESULTS, STREAM, run_node
+from tactile_resonance.nodes.running import RESULTS, run_node
+from tactile_resonance.nodes.simulated_tip import SimulatedTip
 from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.truth_topic import TruthTopic, truth_to_response
-from tactile_resonance.record import Contact
+from tactile_resonance.nodes.truth_topic import truth_to_response
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_run import BenchRun
 from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.contact_so_far import ContactSoFar, ContactState, parts_of
+from tactile_resonance.simulation.contact_so_far import ContactSoFar
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant_process import LaidScene
 from tactile_resonance.simulation.scene import read_scene
 from tactile_resonance.simulation.truth import truth_of
-from tactile_resonance.simulation.varying import INTERVAL_S
-from tactile_resonance.srv import ForceOver, Play, Truth
+from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
     Parameter(
@@ -81,8 +74,6 @@ PARAMETERS = (
 
 EFFECTS = ("noise", "quantisation", "nonlinearity")
 HERTZ = {"contact_radius_m": math.nan, "depth_m": math.nan}  # of a tip: not that of the plant
-PLANT_CHECK_S = 0.5
-CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its first goal
 
 
 class FakeHardwareNode(ManagedNode):
@@ -102,49 +93,39 @@ class FakeHardwareNode(ManagedNode):
         super().__init__("fake_hardware_node", PARAMETERS)
         self._player = BenchPlayer(self.time_server)
         self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
-        self._contact: IdealContact | None = None
+        self._touch: SimulatedTip | None = None
         (serves_contact,) = values(self, "serve_contact")
         self._stop = StopInput(self, self._draw_back) if serves_contact else None
 
     def configure(self) -> None:
         """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
         scene, self._frame_id = values(self, "scene", "frame_id")
-        path = Path(scene)
-        scene_path = path if path.is_absolute() else share_path(scene)
-        self._scene = read_scene(read_tissues(), scene_path)
+        scene_path = file_of(scene)
         self._bench = SimulatedBench.from_configuration()
-        self._stays = Stays()
-        self._tip = BenchTip(None, 0.0, 1.0)
-        self._plant: PlantChild | None = None
-        self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
-        self._truth = TruthTopic(self, self._bench, self._frame_id)
-        host, table, seed, serve = values(
-            self, "robot_host", "table_in_base", "seed", "serve_contact"
-        )
-        self._laid = LaidScene(self._scene, pose_of(table, "table_in_base"))
-        server = self.time_server
+        read = read_scene(read_tissues(), scene_path)
+        host, table, seed = values(self, "robot_host", "table_in_base", "seed")
+        server, plant = self.time_server, None
         if host:
             if server and server != f"{host}:{TIME_PORT}":
                 raise ValueError(
                     f"time_server: {server!r}, the robot at {host} serves {host}:{TIME_PORT}"
                 )
-            self._plant = PlantChild(host, scene_path, table, seed, bool(server))
-            self.resources.callback(self._plant.close)
-            self.every(PLANT_CHECK_S, self._check_plant)
+            plant = PlantChild(host, scene_path, table, seed, bool(server))
+            self.resources.callback(plant.close)
         elif server:
             self.resources.callback(BenchServer(server).close)
         self._now_ns = BenchNow(self, server)
-        if not host:
-            self._serve_ideal_contact(serve)
+        self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns, self._stop)
+        self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self.serve(Play, "bench/play", self._on_play)
         self.serve(Trigger, "bench/stop", self._on_stop)
         self.serve(Truth, "bench/get_truth", self._on_truth)
         self._said_lines = 0
-        self._stalls = 0
 
     def details(self) -> dict[str, str]:
         """How often the simulated robot stood still, as of the last measurement."""
-        return {"simulator stalls": str(self._stalls)} if getattr(self, "_stalls", 0) else {}
+        stalls = 0 if self._touch is None else self._touch.stalls
+        return {"simulator stalls": str(stalls)} if stalls else {}
 
     def deactivate(self) -> None:
         """Silence the output."""
@@ -154,95 +135,9 @@ class FakeHardwareNode(ManagedNode):
         self._player.silence()
         self._played = None
 
-    def _serve_ideal_contact(self, by_action: bool) -> None:
-        if by_action:
-            base_frame, frame_id = values(self, "base_frame", "frame_id")
-            assert self._stop is not None
-            table = self._laid.table
-            x, y, z = (table.position_m + table.rotation.apply([0.0, 0.0, CLEAR_M])).tolist()
-            place = Contact(position_m=(x, y, z), frame_id=base_frame)
-            self._stays.add(Stay(0, 0.0, pose_to_message(place)))
-            self._contact = IdealContact(
-                self,
-                self._stays,
-                self._found_at,
-                self._placed,
-                self._now_ns,
-                self._stop,
-                base_frame,
-                frame_id,
-            )
-        else:
-            self._wrench = self.publish_on(WrenchStamped, "wrench", STREAM)
-            # a scan waits until the pose is received, which needs a reliable subscription; others publish
-            self.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
-            self.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        self.serve(ForceOver, "force_over", self._stays.serve)
-
     def _draw_back(self) -> None:
-        if self._contact is not None:
-            self._contact.draw_back()
-
-    def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
-        """Depth that brings a force at a place in the base, and height of the surface above that place."""
-        tissue = self._laid.tissue_at(place_m)
-        if tissue is None:
-            return None
-        contact = BenchTip(tissue, force_n, 1.0).coupled(self._bench).contact
-        assert contact is not None
-        height_m, _ = self._laid.surface().height_of(place_m)
-        return float(contact.indentation_m), -float(height_m)
-
-    def _placed(self) -> None:
-        """The tip has been put somewhere by a goal."""
-        stay = self._stays.newest
-        point = stay.pose.pose.position
-        tissue = self._laid.tissue_at(np.array([point.x, point.y, point.z]))
-        self._put(BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0), stay.pose)
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        if message == self._stays.newest.pose:
-            return
-        position = message.pose.position
-        tissue = self._scene.tissue_at((position.x, position.y, position.z))
-        tip = BenchTip(tissue, self._scene.force_n if tissue else 0.0, 1.0)
-        self._stays.add(Stay(self._now_ns(), tip.force_n, message))
-        wrench = WrenchStamped()
-        wrench.header.stamp = message.header.stamp
-        wrench.header.frame_id = self._frame_id
-        wrench.wrench.force.z = tip.force_n
-        self._wrench.publish(wrench)
-        self._put(tip, message)
-
-    def _put(self, tip: BenchTip, pose: PoseStamped) -> None:
-        self._tip = tip
-        self._truth.publish(pose, tip)
-
-    def _check_plant(self) -> None:
-        if self._plant is not None and not self._plant.alive:
-            self.fail("the simulated robot has ended; starting it anew")
-
-    def _take_up_contact(self) -> None:
-        """With a robot: the contact as it is now, and its truth; raises ValueError."""
-        if self._plant is None:
-            return
-        try:
-            true = self._plant.truth()
-        except OSError as error:
-            raise ValueError(f"the simulated robot does not answer: {error}") from error
-        self._stalls = true.stalls
-        touching = true.force_n > 0
-        tissue = self._laid.tissue_at(true.site_m) if touching else None
-        self._tip = BenchTip(tissue, true.force_n, true.since_s or 1.0)
-        if touching:
-            self._tip = replace(
-                self._tip, contact_radius_m=true.contact_radius_m, depth_m=true.depth_m
-            )
-        x, y, z = true.tip_m.tolist()
-        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
-        self._plant_ahead_s = true.time_s - place.time_ns * 1e-9
-        self._stays.add(Stay(place.time_ns, true.force_n, pose_to_message(place)))
-        self._truth.publish(self._stays.newest.pose, self._tip)
+        if self._touch is not None:
+            self._touch.draw_back()
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         if not self.active:
@@ -257,9 +152,9 @@ class FakeHardwareNode(ManagedNode):
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
-            self._take_up_contact()
-            tip, so_far = self._tip, None
-            if self._plant is not None and tip.tissue is not None:
+            self._touch.take_up()
+            tip, so_far = self._touch.tip, None
+            if self._touch.plant is not None and tip.tissue is not None:
                 so_far = ContactSoFar(self._bench, tip)
             run = self._start(tip, so_far, int(entropy.generate_state(1, np.uint64)[0]), effects)
             self._silence()
@@ -288,11 +183,8 @@ class FakeHardwareNode(ManagedNode):
         place = request.position
         try:
             if request.here:
-                self._take_up_contact()
-                tip = self._tip
-            else:
-                tissue = self._scene.tissue_at((place.x, place.y, place.z))
-                tip = BenchTip(tissue, self._scene.force_n, 1.0)
+                self._touch.take_up()
+            tip = self._touch.tip if request.here else self._touch.at((place.x, place.y, place.z))
             coupled = replace(
                 tip,
                 force_n=request.force_n or tip.force_n,
@@ -335,32 +227,19 @@ class FakeHardwareNode(ManagedNode):
         A contact of the plant has its truth with every block: the mean over all blocks so far, with the stamp
         that their poles will have.
         """
-        blocks, pose, tip = (
-            run.play(excitation, excitation.periods),
-            self._stays.newest.pose,
-            self._tip,
-        )
+        touch, blocks = self._touch, run.play(excitation, excitation.periods)
+        pose, tip = touch.stays.newest.pose, touch.tip
         block_ns = round(excitation.period_s * 1e9)
 
         def hand_out(end_ns: int) -> None:
             if so_far is not None:
-                so_far.extend(excitation.period_s, self._contact_over(end_ns - block_ns, end_ns))
+                so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)
-                self._truth.publish(pose, tip, excitation.measurement_id, so_far.parts)
+                touch.truth.publish(pose, tip, excitation.measurement_id, so_far.parts)
             record = bench_record(next(blocks), excitation, start_ns, self._frame_id)
             self._blocks.publish(record_to_message(record))
 
         return hand_out
-
-    def _contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
-        """The contact over an interval, as fine as the sensor follows it; unchanged where the plant ended."""
-        assert self._plant is not None
-        from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
-        parts = parts_of(to_s - from_s, INTERVAL_S)
-        try:
-            return self._plant.contact_over(from_s, to_s, parts)
-        except OSError:
-            return [None] * parts
 
 
 def main() -> None:

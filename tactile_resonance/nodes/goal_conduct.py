@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
-from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -17,16 +16,12 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.msg import PointResult
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import drop
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, GoalClient, offer
 from tactile_resonance.nodes.running import STEADY
 
 TICK_S = 0.1
-ASK_AGAIN_S = 2.0
-"""An answer that has not come by then may be lost: it is asked for again."""
 SILENT_S = 5.0
 """A scan that has told nothing for so long may have lost its node: its result is asked for again."""
 GONE_S = 10.0
@@ -174,39 +169,34 @@ class GoalConduct:
         asked.future.set_result(outcome)
 
     async def _send(self, asked: AskedGoal) -> Any:
-        """Send the goal until it is accepted, or return the outcome where it is not; None where it is.
-
-        A goal whose answer is late, or lost, is sent again under its id, and accepted once.
-        """
-        goal_id, answers = _new_id(), list[Future]()
+        """Send the goal until it is accepted, or return the outcome where it is not; None where it is."""
         waited_for = "no scan_node is there"
         deadline_s = time.monotonic() + asked.wait_s
         while not asked.cancelled and time.monotonic() < deadline_s:
             if not asked.client.server_is_ready():
                 await self._tick
                 continue
-            answers.append(asked.client.send_goal_async(asked.goal, asked.hear, goal_uuid=goal_id))
-            await self._until(partial(_any_done, answers), ASK_AGAIN_S)
-            handles = [answer.result() for answer in answers if answer.done()]
-            asked.handle = next((handle for handle in handles if handle.accepted), None)
-            # what was sent twice may be refused because it is known
-            if asked.handle is None and handles and len(answers) > 1:
-                result = handles[-1].get_result_async()
-                answered = await self._until(result.done, ASK_AGAIN_S)
-                if not answered or result.result().status != GoalStatus.STATUS_UNKNOWN:
-                    asked.handle = handles[-1]
+            # what was asked for may have begun: its answer is waited for even where it is wanted no more
+            wanted_s = time.monotonic()
+            with contextlib.closing(offer(asked.client, asked.goal, asked.hear)) as waiting:
+                while time.monotonic() - wanted_s < ASK_AGAIN_S:
+                    try:
+                        next(waiting)
+                    except StopIteration as answered:
+                        asked.handle = answered.value
+                        break
+                    await self._tick
+                    if not asked.cancelled and time.monotonic() < deadline_s:
+                        wanted_s = time.monotonic()
+                else:
+                    break
             if asked.handle is not None:
                 return None
-            if handles:
-                drop(answers)
-                why = self._rejection()
-                if await self._until(why.done, ASK_AGAIN_S) and why.result().success:
-                    return asked.kind(Ending.REJECTED, why.result().message)
-                waited_for = "scan_node is not active"
-                goal_id, answers = _new_id(), []
-                await self._tick
-        drop(answers)
-        ClientGoalHandle(asked.client, goal_id, None).cancel_goal_async()
+            why = self._rejection()
+            if await self._until(why.done, ASK_AGAIN_S) and why.result().success:
+                return asked.kind(Ending.REJECTED, why.result().message)
+            waited_for = "scan_node is not active"
+            await self._tick
         if asked.cancelled:
             return asked.kind(Ending.CANCELLED, "cancelled before it was accepted")
         return asked.kind(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
@@ -230,11 +220,3 @@ class GoalConduct:
                 if answer is not None or time.monotonic() - seen_s > GONE_S:
                     return asked.lost()
                 await self._tick
-
-
-def _any_done(futures: Sequence[Future]) -> bool:
-    return any(future.done() for future in futures)
-
-
-def _new_id() -> UUID:
-    return UUID(uuid=list(uuid.uuid4().bytes))

@@ -9,9 +9,11 @@ came or not. No goal goes on that is no longer followed.
 from __future__ import annotations
 
 import contextlib
+import math
+import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,39 @@ from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.scan.hands import Check, Interrupted, NodeAway, PointFailed, ScanEnded
+
+
+class GoalClient(ActionClient):
+    """`ActionClient` whose executor takes no answer before its request is registered.
+
+    rclpy of Jazzy sends a request before it registers it: an answer that the executor's thread takes in between
+    is dropped, and its future is never done (rclpy #1123). Kilted has this lock itself.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._registering = threading.Lock()
+        super().__init__(*args, **kwargs)
+
+    def take_data(self) -> Any:
+        """As the executor asks for it."""
+        with self._registering:
+            return super().take_data()
+
+    def send_goal_async(self, *args: Any, **kwargs: Any) -> Future:
+        """As every client."""
+        with self._registering:
+            return super().send_goal_async(*args, **kwargs)
+
+    # What the methods of a goal handle call.
+
+    def _get_result_async(self, goal_handle: ClientGoalHandle) -> Future:
+        with self._registering:
+            return super()._get_result_async(goal_handle)
+
+    def _cancel_goal_async(self, goal_handle: ClientGoalHandle) -> Future:
+        with self._registering:
+            return super()._cancel_goal_async(goal_handle)
+
 
 POLL_S = 0.005
 # A node that was started anew accepts goals again within this.
@@ -101,47 +136,17 @@ class Goals:
         self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None
     ) -> ClientGoalHandle | None:
         """Handle of a goal that was accepted; None where it was refused."""
-        goal_id = UUID(uuid=list(uuid.uuid4().bytes))
-
-        def ask() -> Future:
-            return self.client.send_goal_async(goal, feedback, goal_uuid=goal_id)
-
-        futures = [ask()]
-        asked_s = time.monotonic()
-        try:
+        with contextlib.closing(offer(self.client, goal, feedback)) as waiting:
             while True:
-                answers = [future.result() for future in futures if future.done()]
-                taken = next((answer for answer in answers if answer.accepted), None)
-                if taken is not None:
-                    return taken
-                if futures[-1].done():
-                    # where it was sent twice a refusal may mean that it is known already
-                    refused = futures[-1].result()
-                    if len(futures) > 1 and self._known(refused):
-                        return refused
-                    drop(futures)
-                    return None
+                try:
+                    next(waiting)
+                except StopIteration as answered:
+                    return answered.value
                 if not self.client.server_is_ready():
                     raise NodeAway(f"{self.name}: its node went away", "node went away")
-                if time.monotonic() - asked_s > ASK_AGAIN_S:
-                    futures.append(ask())
-                    asked_s = time.monotonic()
                 poll()
                 check()
                 self.pause(POLL_S)
-        except BaseException:
-            drop(futures)
-            # its answer may be lost, and a cancellation does not need it; RuntimeError: ROS has been shut down
-            with contextlib.suppress(RuntimeError):
-                ClientGoalHandle(self.client, goal_id, None).cancel_goal_async()
-            raise
-
-    def _known(self, refused: ClientGoalHandle) -> bool:
-        """Whether the node has a goal of this id after all."""
-        result = refused.get_result_async()
-        if not self._done(result, ASK_AGAIN_S):
-            return True  # it is under way
-        return result.result().status != GoalStatus.STATUS_UNKNOWN
 
     def _done(self, future: Future, timeout_s: float) -> bool:
         """Wait for it; whether it came."""
@@ -151,7 +156,53 @@ class Goals:
         return future.done()
 
 
-def drop(futures: list[Future]) -> None:
+def offer(
+    client: ActionClient, goal: Any, feedback: Callable[[Any], None] | None
+) -> Generator[None, None, ClientGoalHandle | None]:
+    """Offer a goal until it is answered; the handle of one that was accepted, None of one that was refused.
+
+    To be asked for again and again, while answers are received: it yields while it waits. One that is closed
+    before is given up: whatever accepts the goal later cancels it.
+    """
+    goal_id = UUID(uuid=list(uuid.uuid4().bytes))
+    futures: list[Future] = []
+    asked_s = -math.inf
+    try:
+        while True:
+            if time.monotonic() - asked_s > ASK_AGAIN_S and client.server_is_ready():
+                futures.append(client.send_goal_async(goal, feedback, goal_uuid=goal_id))
+                asked_s = time.monotonic()
+            answers = [future.result() for future in futures if future.done()]
+            taken = next((answer for answer in answers if answer.accepted), None)
+            if taken is not None:
+                return taken
+            if futures and futures[-1].done():
+                # where it was sent twice a refusal may mean that it is known already
+                refused = futures[-1].result()
+                if len(futures) > 1 and (yield from _known(refused)):
+                    return refused
+                _drop(futures)
+                return None
+            yield
+    except BaseException:
+        _drop(futures)
+        # its answer may be lost, and a cancellation does not need it; RuntimeError: ROS has been shut down
+        with contextlib.suppress(RuntimeError):
+            ClientGoalHandle(client, goal_id, None).cancel_goal_async()
+        raise
+
+
+def _known(refused: ClientGoalHandle) -> Generator[None, None, bool]:
+    """Whether the node has a goal of this id after all."""
+    result, asked_s = refused.get_result_async(), time.monotonic()
+    while not result.done():
+        if time.monotonic() - asked_s > ASK_AGAIN_S:
+            return True  # it is under way
+        yield
+    return result.result().status != GoalStatus.STATUS_UNKNOWN
+
+
+def _drop(futures: list[Future]) -> None:
     """Ignore answers from now on, but cancel goals that they accept."""
     for future in futures:
         future.add_done_callback(_cancel_if_taken)

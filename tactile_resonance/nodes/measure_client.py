@@ -10,8 +10,7 @@ from collections.abc import Callable
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.nodes.excitation_design import GRIDS
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.nodes.scan_time import ScanTime

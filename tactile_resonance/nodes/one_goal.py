@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.scan.controls import Controls, Request
+from tactile_resonance.scan.progress import Controls, Request
 
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from rcl_interfaces.msg import (
@@ -15,6 +16,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 
+from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 
 
@@ -81,6 +83,12 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> None:
 def values(node: Node, *names: str) -> tuple:
     """Present values of several parameters."""
     return tuple(node.get_parameter(name).value for name in names)
+
+
+def file_of(name: str) -> Path:
+    """Path of a file that a parameter names, absolute or in the package's share folder."""
+    path = Path(name).expanduser()
+    return path if path.is_absolute() else share_path(name)
 
 
 def pose_of(values: list[float], name: str) -> Pose:

@@ -30,13 +30,11 @@ from tactile_resonance.nodes.scan_messages import (
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.table_calibration import calibrate
 from tactile_resonance.nodes.tip_use import TipUseClient
-from tactile_resonance.scan.controls import Request
-from tactile_resonance.scan.goal import Frames, named_frames, resumed_run
-from tactile_resonance.scan.goal_files import GoalFiles
+from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.preparation import UNCHECKED
-from tactile_resonance.scan.progress import Phase, Progress
+from tactile_resonance.scan.progress import Phase, Progress, Request
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_start import new_run, start_run
 from tactile_resonance.scan.runner import ScanRunner

@@ -13,17 +13,16 @@ from std_srvs.srv import SetBool, Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import POLL_S, Goals, Poll
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.stop_input import STOP
 from tactile_resonance.recording.messages import time_from_message
-from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
+    Disturbances,
     PointDisturbed,
     PointFailed,
     ScanEnded,

@@ -9,6 +9,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 
 from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.command_limits import check_acceleration, checked_twist
@@ -26,13 +28,61 @@ from tactile_resonance.contact.vectors import (
 )
 from tactile_resonance.drivers.twist_config import TwistConfig
 from tactile_resonance.drivers.twist_motion import REST, Following, ToolPose, towards, velocity_of
-from tactile_resonance.nodes.listener import Listener
 from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
 from tactile_resonance.recording.messages import time_from_message
+
+CLOSE_WITHIN_S = 2.0
+
+
+class Listener:
+    """A second node beside one, spinning on its own; in its namespace.
+
+    Parameters
+    ----------
+    beside : Node
+
+    Attributes
+    ----------
+    node : Node
+        On which subscriptions, publishers and timers are made, before or after `start`.
+    """
+
+    def __init__(self, beside: Node) -> None:
+        self.node = Node(
+            f"{beside.get_name()}_arm",
+            context=beside.context,
+            namespace=beside.get_namespace(),
+            # a name that the command line gives is the other's
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._executor = SingleThreadedExecutor(context=beside.context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, name="listener", daemon=True)
+
+    def start(self) -> None:
+        """Spin from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Spin no more; all that was made on the node ends."""
+        self._executor.shutdown()
+        if self._thread.is_alive():
+            # where the context is being shut down, that holds what the thread waits for
+            self._thread.join(CLOSE_WITHIN_S)
+        self.node.destroy_node()
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except (ExternalShutdownException, RCLError):
+            return
+
 
 COMMANDS_END_NS = 200_000_000
 """Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""

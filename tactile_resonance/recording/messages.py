@@ -71,6 +71,7 @@ def excitation_from_message(message: Any) -> Excitation:
         If its fields contradict each other.
     """
     arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
+    arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
     return Excitation(**_values(message, EXCITATION), **arrays, grid=grid)
 

@@ -26,7 +26,7 @@ def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]
             continue
         line = (
             f"{start}{1e3 * result.force_n:10.2f}  {result.f0_hz:7.3f}  {result.f0_std_hz:7.2g}  "
-            f"{result.damping_ratio:.5f}  {result.damping_ratio_std:7.1g}  {_tissue(result):<22}"
+            f"{result.damping_ratio:.5f}  {result.damping_ratio_std:7.1g}  {tissue_of(result):<22}"
         )
         truth = truths.get(result.index)
         if truth is not None:
@@ -67,7 +67,8 @@ def repeats_sentence(results: Sequence[PointResult]) -> str:
     )
 
 
-def _tissue(result: PointResult) -> str:
+def tissue_of(result: PointResult) -> str:
+    """The class that was called, with its probability; a dash where none was."""
     if not result.tissue_class or np.isnan(result.tissue_probability):
         return result.tissue_class or "-"
     return f"{result.tissue_class} ({100 * result.tissue_probability:.1f} %)"

@@ -10,8 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
-from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
-from tactile_resonance.scan.pole_map import MapSurface, PoleMap
+from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface, PoleMap
 
 COLOURS = LinearSegmentedColormap.from_list(
     "pole_map", [np.array(LOW_RGB) / 255, np.array(HIGH_RGB) / 255]

@@ -14,14 +14,15 @@ import numpy as np
 import yaml
 
 from tactile_resonance.report.drawing import SIMULATED
-from tactile_resonance.report.point_table import table_notes
+from tactile_resonance.report.point_table import table_notes, tissue_of
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
-from tactile_resonance.scan.references import SensorHealth, sensor_health
-from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.recorded import measurements_of_file
+from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
+from tactile_resonance.scan.run_content import RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits, ScanScene, read_scan_scene
-from tactile_resonance.scan.silent_reference import read_silent
+from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
 
 _STYLE = """
@@ -50,7 +51,7 @@ _COLUMNS = (
         lambda r: _with_std(r.nominal_damping_ratio, r.nominal_damping_ratio_std, 5),
     ),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
-    ("tissue", lambda r: _tissue(r)),
+    ("tissue", lambda r: tissue_of(r)),
     ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
     ("outcome", lambda r: _outcome(r)),
 )
@@ -152,6 +153,29 @@ def summary(run: RunContent) -> list[str]:
         lines.append(f"Tissue called: {named}.")
         lines.append(_compared(run, [r for r in run.latest if r.tissue_class]))
     return lines
+
+
+def read_silent(run: RunContent) -> SilentRecord | None:
+    """Tones and noise of a run's silent record; None where it has none.
+
+    Raises
+    ------
+    ValueError
+        If its file is damaged or holds no samples.
+    """
+    for file in run.files:
+        if file.name.endswith(f"-{SILENT}.mcap"):
+            for stored in measurements_of_file(run.path / RECORDING / file.name):
+                records = stored.records
+                if not records or stored.gaps:
+                    raise ValueError(f"{file.name}: {len(records)} records, expected some without a gap")
+                u, y = (
+                    np.stack([getattr(record, channel).volts() for record in records])
+                    for channel in ("actuator", "sensor")
+                )  # (P, N)
+                return silent_record(u, y, sample_rate_hz=records[0].sample_rate_hz)
+            raise ValueError(f"{file.name}: no measurement, expected a silent one")
+    return None
 
 
 def silent_lines(run: RunContent) -> list[str]:
@@ -277,12 +301,6 @@ def _spread(result: PointResult) -> str:
         return "-"
     low, high = (_number(1e3 * force, 2) for force in (result.force_min_n, result.force_max_n))
     return f"{_number(1e3 * result.force_rms_n, 2)}, {low} to {high}"
-
-
-def _tissue(result: PointResult) -> str:
-    if not result.tissue_class or np.isnan(result.tissue_probability):
-        return result.tissue_class or "-"
-    return f"{result.tissue_class} ({100 * result.tissue_probability:.1f} %)"
 
 
 def _outcome(result: PointResult) -> str:

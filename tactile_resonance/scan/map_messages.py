@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.recording.messages import POLES_STATUS
-from tactile_resonance.scan.colour_scale import colours, shares
 from tactile_resonance.scan.mesh import grid_faces
 from tactile_resonance.scan.messages import make_message, message_types
-from tactile_resonance.scan.pole_map import EllipseScale, PoleMap
+from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
 FloatArray = npt.NDArray[np.float64]
 NO_CLASS = 255  # of the field tissue_class: none called, or unknown

@@ -29,10 +29,14 @@ from rosbags.interfaces import Qos
 
 from tactile_resonance.analysis import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
-from tactile_resonance.scan.bag_metadata import write_bag_metadata
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.messages import definition_and_hash, message_types
-from tactile_resonance.scan.point_file import FileContent, PointFileWriter, offered_qos
+from tactile_resonance.scan.point_file import (
+    FileContent,
+    PointFileWriter,
+    offered_qos,
+    write_bag_metadata,
+)
 from tactile_resonance.scan.point_result import (
     POLES_TYPE,
     RESULTS_DEPTH,

@@ -16,8 +16,14 @@ from tactile_resonance.configuration import PACKAGE_NAME, share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.scan.goal import Frames, ScanGoal, WantedScan, read_goal, resumed_run
-from tactile_resonance.scan.goal_files import GoalFiles
+from tactile_resonance.scan.goal import (
+    Frames,
+    GoalFiles,
+    ScanGoal,
+    WantedScan,
+    read_goal,
+    resumed_run,
+)
 from tactile_resonance.scan.hands import Check, Hands, Touch
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.plan import Plan, plan_points

@@ -14,12 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.identification.result import Poles
-from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide
-from tactile_resonance.scan.disturbances import Disturbances
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
+    Disturbances,
     Hands,
     Interrupted,
     Measured,
@@ -31,7 +30,7 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
-from tactile_resonance.scan.progress import Phase, Progress, Summary
+from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,

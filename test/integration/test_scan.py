@@ -22,9 +22,9 @@ from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.report.run_report import read_silent
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.scan.silent_reference import read_silent
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE

@@ -18,8 +18,7 @@ from rclpy.task import Future
 from tactile_resonance.action import Measure
 from unique_identifier_msgs.msg import UUID
 
-from tactile_resonance.nodes.goal_client import GoalClient
-from tactile_resonance.nodes.goals import Goals
+from tactile_resonance.nodes.goals import GoalClient, Goals
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.hands import Interrupted

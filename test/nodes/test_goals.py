@@ -268,7 +268,8 @@ def scan(monkeypatch):
     def make(answers=None):
         node = Node(answers or {})
         node.result_of = lambda _: Scan.Result(outcome=Scan.Result.COMPLETE)
-        monkeypatch.setattr(goal_conduct, "time", node)
+        for module in (goal_conduct, goals_module):
+            monkeypatch.setattr(module, "time", node)
         monkeypatch.setattr(client_module, "GoalClient", lambda *_, **__: node)
         client = TactileClient(MagicMock())
         future, conducted = client.scan(scene="x.yaml"), client._conduct._conduct()

@@ -35,6 +35,7 @@ from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.bench_tip import BenchTip
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant_process import LaidScene
 
 SECOND_NS = 10**9
 WITHIN_S = 60.0
@@ -190,7 +191,7 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
     assert (result.force_n, result.force_std_n) == (FORCE_N, 0.0)
     assert result.surface_m == pytest.approx(0.0, abs=1e-12)
     # as deep as the sensor's tip presses this tissue with this force
-    gel = ideal.node._tip.tissue
+    gel = ideal.node._touch.tip.tissue
     assert gel.name == "gel10"
     coupled = BenchTip(gel, FORCE_N, 1.0).coupled(SimulatedBench.from_configuration())
     assert result.depth_m == pytest.approx(coupled.contact.indentation_m, rel=1e-12)
@@ -212,7 +213,7 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
     assert ideal.force_over(free_ns, free_ns + SECOND_NS).force_n == 0.0
     # the next one is taken
     assert ideal.answer(ideal.make(goal_at(x_m=0.06))[1]).result.reached
-    assert ideal.node._tip.tissue.name == "gel12"
+    assert ideal.node._touch.tip.tissue.name == "gel12"
 
 
 @pytest.mark.parametrize(
@@ -256,7 +257,7 @@ def test_a_stop_draws_the_tip_back_and_keeps_it_out_until_it_is_released(
     assert ideal.answer(future).result.reached == (not under_way)
     assert ideal.state() == "idle"
     assert ideal.states[-1].stopped
-    assert ideal.node._stays.newest.force_n == 0.0
+    assert ideal.node._touch.stays.newest.force_n == 0.0
     assert not ideal.answer(ideal.contact.send_goal_async(goal_at())).accepted
     # it is remembered while the node is made anew
     ideal.node.trigger_deactivate()
@@ -317,19 +318,19 @@ def test_a_contact_that_is_cancelled_before_its_work_begins_leaves_no_tip_pressi
     begin.set()
     assert ideal.answer(future).status == GoalStatus.STATUS_CANCELED
     assert ideal.state() == "idle"
-    assert ideal.node._stays.newest.force_n == 0.0
+    assert ideal.node._touch.stays.newest.force_n == 0.0
 
 
 def test_a_retraction_that_is_asked_for_as_the_tip_arrives_is_not_lost(monkeypatch):
     monkeypatch.setattr(ideal_contact, "CONTACT_S", 0.05)
-    arrives, goes_on, found_at = threading.Event(), threading.Event(), FakeHardwareNode._found_at
+    arrives, goes_on, surface = threading.Event(), threading.Event(), LaidScene.surface
 
-    def slowly(node, place_m, force_n):
+    def slowly(laid):
         arrives.set()
         goes_on.wait(WITHIN_S)
-        return found_at(node, place_m, force_n)
+        return surface(laid)
 
-    monkeypatch.setattr(FakeHardwareNode, "_found_at", slowly)
+    monkeypatch.setattr(LaidScene, "surface", slowly)
     with bench() as ideal:
         _, future = ideal.make(goal_at())
         ideal.wait(arrives.is_set)
@@ -337,7 +338,7 @@ def test_a_retraction_that_is_asked_for_as_the_tip_arrives_is_not_lost(monkeypat
         goes_on.set()
         ideal.answer(future)
         assert ideal.state() == "idle"
-        assert ideal.node._stays.newest.force_n == 0.0
+        assert ideal.node._touch.stays.newest.force_n == 0.0
 
 
 def test_in_simulated_time_a_contact_takes_its_time_and_no_other():

@@ -26,8 +26,8 @@ from tactile_resonance.nodes.pole_map_node import PoleMapNode
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB, shares
 from tactile_resonance.scan.point_result import PointKind, PointOutcome
+from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, shares
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE

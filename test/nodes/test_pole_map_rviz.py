@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.scan.colour_scale import HIGH_RGB, LOW_RGB
+from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB
 from tactile_resonance.scan.scene import read_scan_scene
 
 

@@ -73,8 +73,8 @@ def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place(alone)
         bench = alone.start(FakeHardwareNode)
         assert spin_until(alone.executor, lambda: not touch.is_alive())
     touch.join()
-    spin_until(alone.executor, lambda: bench._stays.newest.pose.pose.position.x != 0.0, 1.0)
-    taken = bench._stays.newest.pose.pose.position
+    spin_until(alone.executor, lambda: bench._touch.stays.newest.pose.pose.position.x != 0.0, 1.0)
+    taken = bench._touch.stays.newest.pose.pose.position
     assert (taken.x, taken.y, taken.z) == PLACE_M
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.identification.result import Poles
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.controls import Controls
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.hands import Measured, PointFailed
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often an attempt that was disturbed is repeated."""
 
-from tactile_resonance.scan.disturbances import Disturbances
-from tactile_resonance.scan.hands import ATTEMPTS, ATTEMPTS_WITHOUT_NODE, NodeAway, PointDisturbed
+from tactile_resonance.scan.hands import (
+    ATTEMPTS,
+    ATTEMPTS_WITHOUT_NODE,
+    Disturbances,
+    NodeAway,
+    PointDisturbed,
+)
 
 
 def test_nodes_that_leave_do_not_use_up_the_attempts_at_a_late_sensor():

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_resonance.scan.goal import ScanGoal
-from tactile_resonance.scan.goal_files import GoalFiles, require_within
+from tactile_resonance.scan.goal import GoalFiles, ScanGoal, require_within
 
 
 def test_a_path_that_leads_out_of_the_folders_is_refused(tmp_path):

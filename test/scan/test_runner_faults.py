@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.scan import runner
-from tactile_resonance.scan.controls import Controls, Request
 from tactile_resonance.scan.hands import (
     ATTEMPTS,
     ATTEMPTS_WITHOUT_NODE,
@@ -20,6 +19,7 @@ from tactile_resonance.scan.hands import (
 )
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_result import TYPE, PointKind, PointOutcome, from_message
+from tactile_resonance.scan.progress import Controls, Request
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.scene import OnFailure, TimeLimits
 
