@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force, stiffness and place of the surface from force and height: an extended Kalman filter.
 
-The state is (height of the first touch, its speed, ln C, d ln C / dt) of a ball by Hertz (`hertz`): C
-falls as the tissue relaxes, and the surface moves as `moving_surface` says. What the model lacks (layers,
-friction, the beam's swing) goes into the random walks of C and of its rate, so that the estimated force
-follows the measured one.
+The state is (height of the first touch, its speed, ln C, d ln C / dt) of a ball on soft tissue at the end of
+a spring. Hertz, ``F = C u^(3/2)``, u the depth of the ball; with a beam of stiffness k in series the robot
+goes the depth ``d = u + F / k``. C falls as the tissue relaxes, and the surface moves as `moving_surface`
+says. What the model lacks (layers, friction, the beam's swing) goes into the random walks of C and of its
+rate, so that the estimated force follows the measured one.
 """
 
 from __future__ import annotations
@@ -17,8 +18,48 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact import hertz
 from tactile_resonance.contact.moving_surface import SPEED_STD_M_S, MovingSurface
+
+RIGID = math.inf
+"""Stiffness of the beam where there is none."""
+
+
+def hertz_force(
+    depth_m: float, c: float, beam_n_per_m: float = RIGID
+) -> tuple[float, float, float]:
+    """Return force [N], its slope over depth [N/m] and over ln C [N]; zeros out of contact.
+
+    Parameters
+    ----------
+    depth_m : float
+        How far the robot has come past the first touch [m].
+    c : float
+        C [N/m^1.5], above 0.
+    beam_n_per_m : float
+        Stiffness of the beam in series [N/m].
+    """
+    if depth_m <= 0:
+        return 0.0, 0.0, 0.0
+    root = math.sqrt(depth_m)  # of u
+    share = 1.0
+    if beam_n_per_m != RIGID:
+        # C y^3 + k y^2 = k d for the root y of u: a cubic in 1 / y without square, whose one positive
+        # solution is that of the cosine of a third of an angle (Viete), or of the hyperbolic one
+        bent = 1.5 * math.sqrt(3.0) * c * root / beam_n_per_m
+        third = math.cos(math.acos(bent) / 3) if bent < 1 else math.cosh(math.acosh(bent) / 3)
+        root *= 0.5 * math.sqrt(3.0) / third
+        share = beam_n_per_m / (1.5 * c * root + beam_n_per_m)
+    tissue = 1.5 * c * root
+    pressed = c * root**3
+    return pressed, tissue * share, pressed * share
+
+
+def hertz_depth(force_n: float, c: float, beam_n_per_m: float = RIGID) -> float:
+    """Return the depth that the robot must go for a force [m]; 0 for no force."""
+    if force_n <= 0:
+        return 0.0
+    return (force_n / c) ** (2 / 3) + force_n / beam_n_per_m
+
 
 FloatArray = NDArray[np.float64]
 
@@ -100,7 +141,7 @@ class ContactFilter:
     noise_n : float
         Standard deviation of one force [N].
     beam_n_per_m : float
-        Stiffness of the beam in series [N/m]; `hertz.RIGID` without.
+        Stiffness of the beam in series [N/m]; `RIGID` without.
     vibration_m : float
         Unseen vibration of the tip [m] rms: at stiff tissue it adds to the noise.
     walk_per_sqrt_s : float
@@ -122,7 +163,7 @@ class ContactFilter:
         forces_n: Sequence[float],
         *,
         noise_n: float,
-        beam_n_per_m: float = hertz.RIGID,
+        beam_n_per_m: float = RIGID,
         vibration_m: float = 3e-6,
         walk_per_sqrt_s: float = 0.05,
         inflation: float = 1.0,
@@ -188,7 +229,7 @@ class ContactFilter:
     def update(self, height_m: float, force_n: float) -> float:
         """Take one force measured at a height of the tip; return its innovation in deviations."""
         depth = self.surface_m - height_m
-        expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
+        expected, slope, per_ln_c = hertz_force(depth, self.c, self._beam)
         p00, p01, p02, p03, p11, p12, p13, p22, p23, p33 = self._p
         # P h with h = (slope, 0, per_ln_c, 0)
         ph0 = p00 * slope + p02 * per_ln_c
@@ -229,12 +270,12 @@ class ContactFilter:
 
     def force_at(self, height_m: float) -> float:
         """Return the force at a height of the tip [N]."""
-        return hertz.force(self.surface_m - height_m, self.c, self._beam)[0]
+        return hertz_force(self.surface_m - height_m, self.c, self._beam)[0]
 
     def estimate(self, height_m: float) -> ContactEstimate:
         """Return what holds at a height of the tip."""
         depth = self.surface_m - height_m
-        expected, slope, per_ln_c = hertz.force(depth, self.c, self._beam)
+        expected, slope, per_ln_c = hertz_force(depth, self.c, self._beam)
         return ContactEstimate(
             force_n=expected,
             force_std_n=self._force_std(slope, per_ln_c),
@@ -246,11 +287,11 @@ class ContactFilter:
 
     def depth_for(self, force_n: float) -> float:
         """Return the depth of the tip for a force [m]."""
-        return hertz.depth(force_n, self.c, self._beam)
+        return hertz_depth(force_n, self.c, self._beam)
 
     def slope_at(self, depth_m: float) -> tuple[float, float]:
         """Return the stiffness at a depth [N/m], and the standard deviation of the force there [N]."""
-        _, slope, per_ln_c = hertz.force(depth_m, self.c, self._beam)
+        _, slope, per_ln_c = hertz_force(depth_m, self.c, self._beam)
         return slope, self._force_std(slope, per_ln_c)
 
     def _force_std(self, slope: float, per_ln_c: float) -> float:
@@ -264,7 +305,7 @@ def touch_posterior(
     heights_m: FloatArray,
     forces_n: FloatArray,
     noise_n: float,
-    beam_n_per_m: float = hertz.RIGID,
+    beam_n_per_m: float = RIGID,
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (2,) and covariance (2, 2) of (height of touch, ln C) from few samples.
 
@@ -288,7 +329,7 @@ def touch_posterior(
     depth = np.maximum(surface[:, None, None] - heights, 0)  # (s, 1, p)
     c = np.exp(ln_c)[:, None]  # (c, 1)
     root = np.broadcast_to(np.sqrt(depth), (SURFACES, STIFFNESSES, heights.size)).copy()
-    if beam_n_per_m != hertz.RIGID:  # as in `hertz.force`
+    if beam_n_per_m != RIGID:  # as in `hertz_force`
         for _ in range(4):
             excess = (c * root + beam_n_per_m) * root**2 - beam_n_per_m * depth
             root -= excess / ((3 * c * root + 2 * beam_n_per_m) * root + 1e-12)

@@ -6,14 +6,12 @@ from __future__ import annotations
 import math
 
 from tactile_resonance.contact.envelope import Place
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.move import REST, Move, failed
+from tactile_resonance.contact.goal import REST, Move, State, failed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.contact.turning import TurningWay
+from tactile_resonance.contact.tip_path import TipPath, TurningWay
 from tactile_resonance.contact.vectors import Vector, added, scaled, vector
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a contact is asked to do, where in its life it is, and what the arm is commanded."""
+"""What a contact is asked to do, where in its life it is, what one cycle comes to, and what is commanded."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
+from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six
 
@@ -64,3 +66,33 @@ class Command(NamedTuple):
 
     twist: Six | None
     acceleration_m_s2: float
+
+
+class Move(NamedTuple):
+    """The wish of one state for one cycle.
+
+    Attributes
+    ----------
+    twist : tuple of 6 floats or None
+        In the base [m/s, rad/s]; None: stop.
+    to : State or None
+        That follows; None: the same.
+    breach : Breach or None
+        Why `to` is `State.FAULT`.
+    estimate : ContactEstimate or None
+        With which the force was reached, where `to` is `State.HOLD`.
+    """
+
+    twist: Six | None
+    to: State | None = None
+    breach: Breach | None = None
+    estimate: ContactEstimate | None = None
+
+
+REST = Move(None)
+"""Stand still and stay in the state."""
+
+
+def failed(cause: Cause, text: str) -> Move:
+    """Stop, for a reason."""
+    return Move(None, State.FAULT, Breach(cause, text))

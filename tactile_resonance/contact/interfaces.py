@@ -2,20 +2,63 @@
 """The two devices that contact control needs: an arm and a force source.
 
 `drivers/` keeps these contracts on real protocols and in real time, `simulation/` in lockstep virtual
-time. The times of their samples are of the monotonic clock, or of the simulation's.
+time. The times of their samples are of the monotonic clock, or of the simulation's. What an arm's
+configuration allows of a command is checked here for every driver.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
 from tactile_resonance.clock import Clock
-from tactile_resonance.contact.command_limits import CommandLimits
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
-from tactile_resonance.contact.vectors import Six
+from tactile_resonance.contact.vectors import Six, six
+
+
+class CommandLimits(Protocol):
+    """Fields that the configuration of every arm has."""
+
+    @property
+    def max_speed_m_s(self) -> float:
+        """Of the tip [m/s]."""
+        ...
+
+    @property
+    def max_turn_rad_s(self) -> float:
+        """Of the tip [rad/s]."""
+        ...
+
+    @property
+    def max_acceleration_m_s2(self) -> float:
+        """Of a command or a stop [m/s2]."""
+        ...
+
+
+def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:
+    """Return a twist [m/s, rad/s] as floats; ``ValueError`` where it is not finite or beyond a limit."""
+    values = tuple(map(float, twist))
+    if len(values) != 6 or not all(map(math.isfinite, values)):
+        raise ValueError(f"twist: {values}, expected 6 finite numbers")
+    for name, part, most in (
+        ("speed", values[:3], limits.max_speed_m_s),
+        ("turn", values[3:], limits.max_turn_rad_s),
+    ):
+        if math.hypot(*part) > most:
+            raise ValueError(f"{name}: {math.hypot(*part):g}, the configuration allows {most:g}")
+    return six(values)
+
+
+def check_acceleration(value: float, limits: CommandLimits) -> None:
+    """Raise ``ValueError`` where an acceleration [m/s2] is not above 0 or beyond the limit."""
+    if not 0 < value <= limits.max_acceleration_m_s2:
+        raise ValueError(
+            f"acceleration: {value:g}, the configuration allows above 0 to "
+            f"{limits.max_acceleration_m_s2:g}"
+        )
 
 
 class Mount(str, Enum):

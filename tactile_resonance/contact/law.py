@@ -14,8 +14,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from tactile_resonance.contact import hertz
-from tactile_resonance.contact.estimator import ContactFilter
+from tactile_resonance.contact.estimator import ContactFilter, hertz_depth
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.fields import require
 
@@ -73,7 +72,7 @@ def force_speed(
         slope, std = model.slope_at(depth)
         target += parameters.caution * max(0.0, std - SURE_SHARE * aim_n) / slope
     # relaxation takes the force away: at constant force u goes as C^(-2/3)
-    creep = 2 / 3 * model.c_rate_per_s * hertz.depth(aim_n, model.c)
+    creep = 2 / 3 * model.c_rate_per_s * hertz_depth(aim_n, model.c)
     follow = creep + model.surface_speed_m_s
     # what is under way will be gone by then, and the target will have moved on
     target += follow * (parameters.arm_dead_time_s + parameters.arm_lag_s)

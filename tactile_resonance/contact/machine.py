@@ -17,11 +17,10 @@ from tactile_resonance.contact.envelope import Envelope, Place, is_finite
 from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
+from tactile_resonance.contact.goal import REST, TOUCHING, Command, ContactGoal, Move, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.judgement import Judgement
 from tactile_resonance.contact.law import HoldMode
-from tactile_resonance.contact.move import REST, Move
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.outcome import Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -223,7 +222,9 @@ class ContactController:
         if self.state is State.IDLE or goal is None:
             return None
         place = None
-        if arm is not None and is_finite(arm):  # of one whose place is not finite nothing else is known
+        if arm is not None and is_finite(
+            arm
+        ):  # of one whose place is not finite nothing else is known
             if self.state is State.TRAVEL and not self._free.begun:
                 self._begin_way(now_ns, arm)
             place = self._place(goal, arm)
@@ -326,7 +327,11 @@ class ContactController:
     def _remember(self, goal: ContactGoal) -> None:
         """Keep where a contact was that ended as it should."""
         result = self.result
-        if result is not None and result.reached and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
+        if (
+            result is not None
+            and result.reached
+            and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED)
+        ):
             self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
 
     def _forget(self, goal: ContactGoal) -> None:

@@ -15,8 +15,7 @@ from statistics import mean, stdev
 
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.free_motion import FreeMotion
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.move import Move, failed
+from tactile_resonance.contact.goal import Move, State, failed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
@@ -191,7 +190,9 @@ class Withdrawal:
             now_n, std_n = mean(forces_n), stdev(forces_n)
             change_n = abs(now_n - self._before_n)
             if height_m - begun_m < BEYOND_M_S * STEP_S / 4:
-                return failed(Cause.HELD, f"{1e3 * now_n:.1f} mN at the standoff, and no room above it")
+                return failed(
+                    Cause.HELD, f"{1e3 * now_n:.1f} mN at the standoff, and no room above it"
+                )
             if change_n < max(LEFT_N / 2, NOISES * std_n * math.sqrt(2 / len(forces_n))):
                 self.zero_n = now_n if observer.tared else None
                 return Move(None, State.IDLE)

@@ -11,12 +11,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from tactile_resonance.configuration import shared_file
+from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.cell_checks import CellLimits
 from tactile_resonance.contact.interfaces import ForceInfo, Mount
-from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.tip_force import Mounting
 from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (

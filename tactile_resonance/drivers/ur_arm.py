@@ -9,8 +9,14 @@ import time
 from collections.abc import Callable, Sequence
 
 from tactile_resonance.clock import Clock, Demand
-from tactile_resonance.contact.command_limits import check_acceleration, checked_twist
-from tactile_resonance.contact.interfaces import ArmError, ArmFault, Cell, LoopClock
+from tactile_resonance.contact.interfaces import (
+    ArmError,
+    ArmFault,
+    Cell,
+    LoopClock,
+    check_acceleration,
+    checked_twist,
+)
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.rtde_stream import RtdeStream

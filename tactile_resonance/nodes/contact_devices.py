@@ -6,9 +6,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_resonance.contact.command_limits import CommandLimits
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.interfaces import NodeArm
+from tactile_resonance.contact.interfaces import CommandLimits, NodeArm
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import CanForce, read_force_config

@@ -11,11 +11,11 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
+from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.requirements import require_fit
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes import contact_devices

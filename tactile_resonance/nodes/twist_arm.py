@@ -13,8 +13,14 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from tactile_resonance.clock import Clock, WallClock
-from tactile_resonance.contact.command_limits import check_acceleration, checked_twist
-from tactile_resonance.contact.interfaces import ArmError, ArmFault, Cell, LoopClock
+from tactile_resonance.contact.interfaces import (
+    ArmError,
+    ArmFault,
+    Cell,
+    LoopClock,
+    check_acceleration,
+    checked_twist,
+)
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import (
     ZERO,

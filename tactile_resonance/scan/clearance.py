@@ -22,8 +22,7 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import ContactParameters, Limits, Workspace
 from tactile_resonance.contact.samples import ArmSample, Pose
-from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.contact.turning import TurningWay
+from tactile_resonance.contact.tip_path import TipPath, TurningWay
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.surface import Surface

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.beam import BeamModes
 from tactile_resonance.simulation.indenter import Ball, Indenter
@@ -121,7 +120,9 @@ class ContactBench:
             tip_radius_m=tip.radius_m,
             mounting=mounting,
         )
-        self.clock = VirtualBench(self.plant, start, tracking=tracking, period_s=period_s, seed=seed)
+        self.clock = VirtualBench(
+            self.plant, start, tracking=tracking, period_s=period_s, seed=seed
+        )
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, vector(centre)) if on_tool else None

@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tactile_resonance.contact import hertz, moving_surface
-from tactile_resonance.contact.arm_model import ArmModel
+from tactile_resonance.contact import moving_surface
 from tactile_resonance.contact.estimator import (
+    RIGID,
     SPEED_LASTS_S,
     ContactFilter,
     TouchDetector,
+    hertz_depth,
+    hertz_force,
     touch_posterior,
 )
 from tactile_resonance.contact.law import force_speed
 from tactile_resonance.contact.moving_surface import SPEED_STD_M_S
+from tactile_resonance.contact.observer import ArmModel
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
@@ -24,36 +27,36 @@ from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
 NOISE_N, DT = 1e-3, 0.002
 
 
-@pytest.mark.parametrize("beam", [hertz.RIGID, 14.8, 100.0])
+@pytest.mark.parametrize("beam", [RIGID, 14.8, 100.0])
 @pytest.mark.parametrize("c", [140.0, 800.0, 4000.0])
 def test_force_and_depth_are_each_other_and_obey_hertz_in_series(c, beam):
     for pressed in (1e-5, 1e-3, 1e-2, 5e-2):
-        depth = hertz.depth(pressed, c, beam)
-        force, slope, per_ln_c = hertz.force(depth, c, beam)
+        depth = hertz_depth(pressed, c, beam)
+        force, slope, per_ln_c = hertz_force(depth, c, beam)
         assert force == pytest.approx(pressed, rel=1e-12)
         assert c * (depth - force / beam) ** 1.5 == pytest.approx(force, rel=1e-12)
         step = 1e-4 * depth
-        up, down = (hertz.force(depth + sign * step, c, beam)[0] for sign in (1, -1))
+        up, down = (hertz_force(depth + sign * step, c, beam)[0] for sign in (1, -1))
         assert slope == pytest.approx((up - down) / (2 * step), rel=1e-4)
-        up, down = (hertz.force(depth, c * math.exp(sign * 1e-4), beam)[0] for sign in (1, -1))
+        up, down = (hertz_force(depth, c * math.exp(sign * 1e-4), beam)[0] for sign in (1, -1))
         assert per_ln_c == pytest.approx((up - down) / 2e-4, rel=1e-4)
-    assert hertz.force(-1e-3, c, beam) == (0.0, 0.0, 0.0)
-    assert hertz.depth(0.0, c, beam) == 0.0
+    assert hertz_force(-1e-3, c, beam) == (0.0, 0.0, 0.0)
+    assert hertz_depth(0.0, c, beam) == 0.0
 
 
-def press(rng, c, beam=hertz.RIGID, speed=4e-3, surface=0.0):
+def press(rng, c, beam=RIGID, speed=4e-3, surface=0.0):
     """Heights and forces of a tip that comes down until the touch is told, surface at 0."""
     detector = TouchDetector(NOISE_N, 7e-5)
     heights, forces = [], []
     while True:
         heights.append(surface + speed * DT * (150 + rng.uniform(0, 1) - len(heights)))
-        true = hertz.force(surface - heights[-1], c, beam)[0]
+        true = hertz_force(surface - heights[-1], c, beam)[0]
         forces.append(true + NOISE_N * rng.standard_normal())
         if detector.add(forces[-1]):
             return np.array(heights[-220:]), np.array(forces[-220:])
 
 
-@pytest.mark.parametrize("beam", [hertz.RIGID, 14.8])
+@pytest.mark.parametrize("beam", [RIGID, 14.8])
 @pytest.mark.parametrize("c", [140.0, 800.0, 3800.0])
 def test_stated_uncertainty_after_the_touch_is_that_of_the_errors(c, beam):
     # chi-square of (surface, ln C) over 60 touches: mean 2 if honest; the prior and the grid make it
@@ -69,7 +72,7 @@ def test_stated_uncertainty_after_the_touch_is_that_of_the_errors(c, beam):
     assert np.median(values) > chi2(2).median() / 4
 
 
-@pytest.mark.parametrize("beam", [hertz.RIGID, 14.8])
+@pytest.mark.parametrize("beam", [RIGID, 14.8])
 @pytest.mark.parametrize("c", [140.0, 800.0, 3800.0])
 def test_force_is_followed_through_press_and_relaxation(c, beam):
     rng = np.random.default_rng(2)
@@ -78,12 +81,12 @@ def test_force_is_followed_through_press_and_relaxation(c, beam):
         heights, forces = press(rng, c, beam)
         model = ContactFilter(heights, forces, noise_n=NOISE_N, beam_n_per_m=beam)
         height, t = heights[-1], 0.0
-        goal = -hertz.depth(0.01, c, beam)
+        goal = -hertz_depth(0.01, c, beam)
         for _ in range(500):
             height += min(4e-3 * DT, max(-4e-3 * DT, goal - height))
             t += DT
             now = c * (0.5 + 0.5 * math.exp(-t))  # half of it relaxes
-            true = hertz.force(-height, now, beam)[0]
+            true = hertz_force(-height, now, beam)[0]
             model.predict(DT)
             model.update(height, true + NOISE_N * rng.standard_normal())
         estimate = model.estimate(height)
@@ -111,7 +114,7 @@ def test_time_passes_alike_in_one_step_and_in_many_and_an_hour_is_not_too_long()
     assert math.isfinite(ways[0].update(heights[-1], forces[-1]))
 
 
-@pytest.mark.parametrize("beam", [hertz.RIGID, 14.8])
+@pytest.mark.parametrize("beam", [RIGID, 14.8])
 def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
     rng = np.random.default_rng(6)
     heights, forces = press(rng, 800.0, beam)
@@ -124,7 +127,7 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
     for n in range(900):
         height -= 4e-6 if n < 150 else 0.0
         surface = 2e-4 * math.sin(8.0 * DT * (n - 300)) if n > 300 else 0.0
-        measured = hertz.force(surface - height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
+        measured = hertz_force(surface - height, 800.0, beam)[0] + NOISE_N * rng.standard_normal()
         measured += 2.0 if n == 5 else 0.0  # by which ln C would change by more than 1
         motion = model._motion
         gone, left = 1 - math.exp(-DT), math.exp(-DT / SPEED_LASTS_S)
@@ -136,7 +139,7 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
         pull = motion.acceleration_m_s2
         x, p = f @ x, f @ p @ f.T + q
         x[1] += pull * way
-        expected, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[2]), beam)
+        expected, slope, per_ln_c = hertz_force(x[0] - height, math.exp(x[2]), beam)
         h = np.array([slope, 0, per_ln_c, 0])
         spread = h @ p @ h + NOISE_N**2 + (slope * 5e-6) ** 2
         step = p @ h / spread * (measured - expected)
@@ -155,7 +158,7 @@ def test_filter_is_the_extended_kalman_filter_written_with_matrices(beam):
     got = model.surface_m, model.surface_speed_m_s, math.log(model.c), model.c_rate_per_s
     np.testing.assert_allclose(got, x, rtol=1e-6)
     assert estimate.depth_std_m == pytest.approx(math.sqrt(p[0, 0]), rel=1e-6)
-    force, slope, per_ln_c = hertz.force(x[0] - height, math.exp(x[2]), beam)
+    force, slope, per_ln_c = hertz_force(x[0] - height, math.exp(x[2]), beam)
     h = np.array([slope, 0, per_ln_c, 0])
     assert estimate.force_n == model.force_at(height) == pytest.approx(force, rel=1e-6)
     assert estimate.force_std_n == pytest.approx(math.sqrt(h @ p @ h), rel=1e-6)
@@ -170,7 +173,7 @@ def follow(motion_m, seconds=4.0, seed=0, c=800.0):
     for n in range(round(seconds / DT)):
         target = model.surface_m - model.depth_for(0.01)
         height += (target - height) * DT / 0.03 + model.surface_speed_m_s * DT
-        truth = hertz.force(motion_m(n * DT) - height, c)[0]
+        truth = hertz_force(motion_m(n * DT) - height, c)[0]
         model.predict(DT)
         model.update(height, truth + NOISE_N * rng.standard_normal())
         force_n.append(model.force_at(height) - truth)
@@ -278,7 +281,7 @@ def test_law_stands_still_at_the_force_and_goes_towards_it_elsewhere():
     target, (slope, std) = model.surface_m - depth, model.slope_at(depth)
     assert model.estimate(target).force_n == pytest.approx(0.01, rel=1e-6)
     p = ContactParameters()
-    creep = 2 / 3 * model.c_rate_per_s * hertz.depth(0.01, model.c)
+    creep = 2 / 3 * model.c_rate_per_s * hertz_depth(0.01, model.c)
     assert creep < 0  # relaxing tissue is followed
     at = force_speed(model, target, 0.0, 0.01, p, holding=True)
     # the target moves on while the arm's commands are under way

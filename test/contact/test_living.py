@@ -12,9 +12,9 @@ import pytest
 
 from benchmarks.contact_living import BONE_ROWS, run_case
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.held_motion import HeldMotion
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes

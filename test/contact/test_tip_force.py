@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.contact.admission import require_fit, unfit
 from tactile_resonance.contact.interfaces import ForceInfo, Mount
-from tactile_resonance.contact.mounting import Mounting
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.contact.requirements import require_fit, unfit
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
-from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import six, vector
 
 FINE = ForceInfo("fine", 1000.0, 1e-3, 2e-4, 5.0, Mount.TOOL)

@@ -17,8 +17,7 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, Pose
-from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.contact.turning import MARGIN_M, PASSED_RAD, TurningWay
+from tactile_resonance.contact.tip_path import MARGIN_M, PASSED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.contact_bench import ContactBench, Tip
 from tactile_resonance.simulation.surfaces import FlatSurface, RoundSurface
