@@ -16,9 +16,7 @@ from tactile_resonance.fields import number
 from tactile_resonance.simulation.bench_time import BenchTime
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.robot.reactor import Reactor
-from tactile_resonance.simulation.slcan import SlcanServer
-from tactile_resonance.simulation.socketcand import SocketcandServer
-from tactile_resonance.simulation.tcp_bus import Receiver, TcpBus
+from tactile_resonance.simulation.tcp_bus import Receiver, SlcanServer, SocketcandServer, TcpBus
 from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S, CellParameters
 
 BUSES: dict[str, Callable[[Reactor, int, Receiver], TcpBus]] = {

@@ -160,7 +160,7 @@ class _Bench:
         """Serve the cell's bus and take orders for both at the robot's control port."""
         from tactile_resonance.simulation.load_cell import LoadCell
         from tactile_resonance.simulation.plant_process import CellOnBus, attach
-        from tactile_resonance.simulation.socketcand import SocketcandServer
+        from tactile_resonance.simulation.tcp_bus import SocketcandServer
         from tactile_resonance.simulation.transducer import CellParameters
 
         options = self._options

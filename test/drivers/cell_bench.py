@@ -10,7 +10,7 @@ from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.simulation.bench_time import BenchTime
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.robot.reactor import Reactor
-from tactile_resonance.simulation.socketcand import SocketcandServer
+from tactile_resonance.simulation.tcp_bus import SocketcandServer
 from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S, CellParameters
 
 HOST = "127.0.6.4"

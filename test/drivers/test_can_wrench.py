@@ -25,7 +25,7 @@ from cell_bench import HOST, STEP_NS, CellBench, cell_config  # noqa: E402
 
 from tactile_resonance.drivers import can_wrench  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
-from tactile_resonance.simulation.socketcand import QUIET_S  # noqa: E402
+from tactile_resonance.simulation.tcp_bus import QUIET_S  # noqa: E402
 
 PATIENCE_S = 60.0
 SHORTEST_DELAY_S = 1e-4  # of config/force/can_simulated.yaml: taken off every stamp
@@ -132,7 +132,9 @@ def test_every_fault_is_named_in_time_and_its_end_brings_the_source_back(
     assert len(bench.go(source, 200)) == 200
 
 
-def test_a_reader_that_was_held_up_waits_once_more_for_a_cell_that_sends_nothing(bench, make_source):
+def test_a_reader_that_was_held_up_waits_once_more_for_a_cell_that_sends_nothing(
+    bench, make_source
+):
     source = make_source()
     source.start()
     bench.go(source, 50)

@@ -11,15 +11,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from tactile_resonance.simulation import slcan as slcan_module
-from tactile_resonance.simulation import socketcand, tcp_bus
+from tactile_resonance.simulation import tcp_bus
 from tactile_resonance.simulation.bench_time import STALL_S
 from tactile_resonance.simulation.load_cell import CanFrame
 from tactile_resonance.simulation.robot import reactor as reactor_module
-from tactile_resonance.simulation.robot.reactor import Reactor
-from tactile_resonance.simulation.slcan import SlcanServer
-from tactile_resonance.simulation.socketcand import QUIET_S, SocketcandServer
-from tactile_resonance.simulation.tcp_bus import LONGEST_MESSAGE
+from tactile_resonance.simulation.robot.reactor import MessageService, Reactor
+from tactile_resonance.simulation.tcp_bus import (
+    QUIET_S,
+    SlcanServer,
+    SocketcandServer,
+)
 
 HOST = "127.0.6.3"
 FRAME = CanFrame(1.25, 0x001, bytes.fromhex("0B01F4FC18138803"))
@@ -33,8 +34,7 @@ class Served:
     def __init__(self, kind, monkeypatch):
         self.now_s = 100.0
         clock = SimpleNamespace(monotonic=lambda: self.now_s)
-        for module in (socketcand, slcan_module, tcp_bus):
-            monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(tcp_bus, "time", clock)
         self.frames, self.answer = [], []
         self.reactor = Reactor(HOST)
         self.bus = kind(self.reactor, 0, self._receive)
@@ -235,7 +235,11 @@ def test_a_message_without_end_costs_its_sender_the_link_and_nobody_time(served,
             ended.set()
             sender.join()
         assert max(pieces) <= reactor_module.MOST_AT_ONCE
-        assert LONGEST_MESSAGE < sum(pieces) <= LONGEST_MESSAGE + reactor_module.MOST_AT_ONCE
+        assert (
+            MessageService.LONGEST
+            < sum(pieces)
+            <= MessageService.LONGEST + reactor_module.MOST_AT_ONCE
+        )
         assert good.say(b"< nonsense >") == b"< error unknown command >"
 
 

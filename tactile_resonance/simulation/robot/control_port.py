@@ -12,10 +12,9 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-from tactile_resonance.simulation.robot.reactor import Connection
+from tactile_resonance.simulation.robot.reactor import Connection, MessageService
 
 PORT = 30020
-_LONGEST_LINE = 1 << 16
 
 
 class ControlPort:
@@ -49,25 +48,16 @@ class ControlPort:
             return {"ok": False, "error": str(error)}
 
 
-class ControlService:
+class ControlService(MessageService):
     """One connection to the control port."""
 
     def __init__(self, port: ControlPort, connection: Connection) -> None:
+        super().__init__(connection)
         self._port = port
-        self._connection = connection
-        self._buffer = b""
 
-    def received(self, data: bytes) -> None:
-        """Answer each complete line."""
-        self._buffer += data
-        if len(self._buffer) > _LONGEST_LINE:
-            raise ValueError("control port: line too long")
-        *lines, self._buffer = self._buffer.split(b"\n")
-        for line in lines:
-            self._connection.send(json.dumps(self._port.answer(line)).encode() + b"\n")
-
-    def closed(self) -> None:
-        """Nothing to free."""
+    def understand(self, message: bytes) -> None:
+        """Answer one line."""
+        self.connection.send(json.dumps(self._port.answer(message)).encode() + b"\n")
 
 
 def order(host: str, command: str, port: int = PORT, timeout_s: float = 5.0, **fields: Any) -> dict:

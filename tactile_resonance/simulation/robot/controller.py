@@ -16,13 +16,14 @@ from tactile_resonance.simulation.robot.machine import Environment, Machine, Mac
 from tactile_resonance.simulation.robot.outputs import OUTPUT_TYPES, Outputs, OutputValue
 from tactile_resonance.simulation.robot.ports import (
     INPUT_TYPES,
+    LARGEST_FIGURE,
     InputValue,
     Ports,
+    Registers,
     write_registers,
 )
 from tactile_resonance.simulation.robot.poses import largest
 from tactile_resonance.simulation.robot.program import Program, register_offset
-from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.safety import RefusedError, RobotMode, Safety, SafetyMode
 from tactile_resonance.simulation.robot.target import CYCLE_S, ProtectiveStop, ScriptError
 

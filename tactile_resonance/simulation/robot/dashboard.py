@@ -10,35 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tactile_resonance.simulation.robot.controller import RuntimeState, UrController
-from tactile_resonance.simulation.robot.reactor import Connection
+from tactile_resonance.simulation.robot.reactor import Connection, MessageService
 from tactile_resonance.simulation.robot.safety import RefusedError
 
 PORT = 29999
-_LONGEST_LINE = 4096
 # What a robot in local control answers to everything that changes its state.
 _LOCAL = "Command is not allowed: the robot is not in remote control"
 
 
-class DashboardServer:
-    """Makes the service of each dashboard connection."""
-
-    def __init__(self, controller: UrController) -> None:
-        self._controller = controller
-
-    def serve(self, connection: Connection) -> DashboardService:
-        """Greet a new client."""
-        connection.send(b"Connected: Universal Robots Dashboard Server\n")
-        return DashboardService(self._controller, connection)
-
-
-class DashboardService:
+class DashboardService(MessageService):
     """One dashboard connection."""
 
+    LONGEST = 4096
+
     def __init__(self, controller: UrController, connection: Connection) -> None:
-        self._controller = controller
-        self._connection = connection
-        self._buffer = b""
-        c = controller
+        super().__init__(connection)
+        connection.send(b"Connected: Universal Robots Dashboard Server\n")
+        self._controller = c = controller
         # asked at any time
         self._questions: dict[str, Callable[[], str]] = {
             "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
@@ -66,21 +54,12 @@ class DashboardService:
             "shutdown": (c.power_off, "Shutting down"),
         }
 
-    def received(self, data: bytes) -> None:
-        """Answer each complete line."""
-        self._buffer += data
-        if len(self._buffer) > _LONGEST_LINE:
-            raise ValueError("dashboard: line too long")
-        *lines, self._buffer = self._buffer.split(b"\n")
-        for line in lines:
-            request = line.decode("utf-8", "replace").strip()
-            self._connection.send((self._answer(request) + "\n").encode())
-            if request == "quit":
-                self._connection.close()
-                return
-
-    def closed(self) -> None:
-        """Nothing to free."""
+    def understand(self, message: bytes) -> None:
+        """Answer one line."""
+        request = message.decode("utf-8", "replace").strip()
+        self.connection.send((self._answer(request) + "\n").encode())
+        if request == "quit":
+            self.connection.close()
 
     def _answer(self, request: str) -> str:
         if request in self._questions:

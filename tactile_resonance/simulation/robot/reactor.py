@@ -6,6 +6,7 @@ from __future__ import annotations
 import select
 import socket
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Protocol
 
@@ -140,6 +141,35 @@ class Connection:
         self._socket.close()
         if self.service is not None:
             self.service.closed()
+
+
+class MessageService(ABC):
+    """Serves one connection message by message, each of them ended by `END`."""
+
+    END = b"\n"
+    LONGEST = 1 << 16
+    """Bytes without the end of a message, beyond which the connection is closed."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self._buffer = b""
+
+    def received(self, data: bytes) -> None:
+        """Execute each whole message; ValueError where one has no end."""
+        *messages, self._buffer = (self._buffer + data).split(self.END)
+        for message in messages:
+            if self.connection.is_open:
+                self.understand(message)
+        if len(self._buffer) > self.LONGEST:
+            raise ValueError(f"port {self.connection.port}: a message without end")
+
+    @abstractmethod
+    def understand(self, message: bytes) -> None:
+        """Execute one message."""
+
+    def closed(self) -> None:
+        """Forget the connection: by default there is nothing to free."""
+        return None
 
 
 class _Listener:

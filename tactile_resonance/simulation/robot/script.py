@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.simulation.robot.registers import LARGEST_FIGURE, Registers
+from tactile_resonance.simulation.robot.ports import LARGEST_FIGURE, Registers
 from tactile_resonance.simulation.robot.target import ScriptError
 
 # Steps once in a cycle, until it is done.

@@ -4,18 +4,56 @@
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.bench_time import BenchTime
-from tactile_resonance.simulation.robot import dashboard, rtde_server, script_server
+from tactile_resonance.simulation.robot import dashboard, rtde_server
 from tactile_resonance.simulation.robot.control_port import PORT as CONTROL_PORT
 from tactile_resonance.simulation.robot.control_port import ControlPort
 from tactile_resonance.simulation.robot.controller import UrController
 from tactile_resonance.simulation.robot.reactor import Reactor
+from tactile_resonance.simulation.robot.safety import RefusedError
 from tactile_resonance.simulation.robot.target import CYCLE_S
+
+# Programs come in here, nothing goes out: a real controller also sends its state, which no client of this
+# package reads.
+SCRIPT_PORT = 30003
+# The client's own has 42 kB; what has no end is searched anew with each piece that comes.
+_LONGEST_PROGRAM = 1 << 18
+# A program ends with a line `end` that is not indented.
+_END = re.compile(rb"^end[ \t]*\r?\n", re.MULTILINE)
+
+
+class ScriptService:
+    """Collects a program and hands it to the controller."""
+
+    def __init__(self, controller: UrController) -> None:
+        self._controller = controller
+        self._buffer = b""
+
+    def received(self, data: bytes) -> None:
+        """Start each program that is complete; what is refused goes to the controller's log."""
+        self._buffer += data
+        if len(self._buffer) > _LONGEST_PROGRAM:
+            raise ValueError(f"script: longer than {_LONGEST_PROGRAM} bytes")
+        while (end := _END.search(self._buffer)) is not None:
+            text, self._buffer = self._buffer[: end.end()], self._buffer[end.end() :]
+            try:
+                self._controller.start_program(text.decode("utf-8", "replace"))
+            except (ValueError, RefusedError) as error:
+                self._controller.log.append(str(error))
+
+    def closed(self) -> None:
+        """An unfinished program is forgotten, and that is logged."""
+        if self._buffer.strip():
+            begin = self._buffer[:40].decode("utf-8", "replace")
+            self._controller.log.append(f"program: got {begin!r}... and no line 'end': ignored")
+
 
 _LONGEST_FREEZE_S = 600.0
 
@@ -72,8 +110,8 @@ class SimulatedRobot:
         self.time.packets_arrived = self._packets_arrived
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
-            self.reactor.listen(dashboard.PORT, dashboard.DashboardServer(controller).serve)
-            self.reactor.listen(script_server.PORT, script_server.ScriptServer(controller).serve)
+            self.reactor.listen(dashboard.PORT, partial(dashboard.DashboardService, controller))
+            self.reactor.listen(SCRIPT_PORT, lambda _: ScriptService(controller))
             self.reactor.listen(control_port, self.control.serve, freezable=False)
             if simulated_time:
                 self.reactor.listen(TIME_PORT, self.time.serve, freezable=False)

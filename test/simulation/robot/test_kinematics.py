@@ -10,14 +10,14 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.robot import kinematics
-from tactile_resonance.simulation.robot.dynamics import (
+from tactile_resonance.simulation.robot.ft_sensor import ToolPayload
+from tactile_resonance.simulation.robot.kinematics import Posture
+from tactile_resonance.simulation.robot.outputs import (
     LINK_CENTRE_M,
     LINK_MASS_KG,
     gravity_torque,
     momentum,
 )
-from tactile_resonance.simulation.robot.ft_sensor import ToolPayload
-from tactile_resonance.simulation.robot.kinematics import Posture
 from tactile_resonance.simulation.robot.poses import pose_from_transform, transform_from_pose
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from tactile_resonance.simulation.robot import motion
+from tactile_resonance.simulation.robot.motion import Trapezoid
 from tactile_resonance.simulation.robot.poses import ZERO, transform_from_pose
-from tactile_resonance.simulation.robot.profile import Trapezoid
 from tactile_resonance.simulation.robot.target import (
     CYCLE_S,
     MotionLimits,

@@ -6,8 +6,7 @@ import struct
 import pytest
 
 from tactile_resonance.simulation.robot.controller import UrController
-from tactile_resonance.simulation.robot.rtde_packets import Kind, PacketReader, packet
-from tactile_resonance.simulation.robot.rtde_server import RtdeServer
+from tactile_resonance.simulation.robot.rtde_server import Kind, PacketReader, RtdeServer, packet
 
 
 class Connection:
