@@ -99,7 +99,7 @@ class SignalParts:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Simulated samples of both channels over whole periods, or over a burst.
+    """Simulated samples of both channels over whole periods.
 
     Attributes
     ----------

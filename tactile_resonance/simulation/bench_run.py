@@ -146,7 +146,7 @@ class BenchRun:
         """Return the next periods of an excitation as one block."""
         require(periods >= 1, "periods", periods, "1 or above")
         lines = self._take_up(excitation)
-        return join([self._make_block(lines, lines.samples_per_period) for _ in range(periods)])
+        return join([self._make_period(lines) for _ in range(periods)])
 
     def play(
         self,
@@ -174,24 +174,6 @@ class BenchRun:
         self._index += periods
         self._samples += periods * lines.samples_per_period
 
-    def burst(
-        self,
-        excitation: PeriodicExcitation | Lines,
-        samples: int,
-        *,
-        ring_down_samples: int = 0,
-    ) -> Block:
-        """Return one block: the first `samples` of a period, then silence.
-
-        Always a realisation of its own; at most one period of excitation.
-        """
-        require(ring_down_samples >= 0, "ring_down_samples", ring_down_samples, "0 or above")
-        self._end_excitation()
-        lines = self._take_up(excitation)
-        block = self._make_block(lines, samples, ring_down_samples)
-        self._end_excitation()
-        return block
-
     def _streams(self) -> list[Stream]:
         linear = [] if self._linear is None else [self._linear]
         return [self._drive, self._sensor, *linear]
@@ -204,31 +186,17 @@ class BenchRun:
             self._index = 0
         return self._lines
 
-    def _end_excitation(self) -> None:
-        if self._lines is not None:
-            for stream in self._streams():
-                stream.silence(0, self._lines.sample_rate_hz)
-        self._lines = None
-
-    def _make_block(self, lines: Lines, samples: int, ring_down: int = 0) -> Block:
-        total = samples + ring_down
-
-        def run(stream: Stream) -> FloatArray:
-            played = stream.play(lines, samples)
-            if ring_down == 0:
-                return played
-            return np.concatenate([played, stream.silence(ring_down, lines.sample_rate_hz)])
-
-        drive = run(self._drive)
-        clean = run(self._sensor)
-        linear = clean if self._linear is None else run(self._linear)
-        drive_noise = self._noise(_ACTUATOR, self.effects.actuator_noise_v, total)
+    def _make_period(self, lines: Lines) -> Block:
+        samples = lines.samples_per_period
+        drive, clean = self._drive.play(lines), self._sensor.play(lines)
+        linear = clean if self._linear is None else self._linear.play(lines)
+        drive_noise = self._noise(_ACTUATOR, self.effects.actuator_noise_v, samples)
         sensor_rms = self._acquisition.noise_rms_v(lines.sample_rate_hz)
-        noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, total)
-        disturbance = self._disturbance(lines.sample_rate_hz, total)
+        noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, samples)
+        disturbance = self._disturbance(lines.sample_rate_hz, samples)
         parts = None
         if self._keep_parts:
-            zero = np.zeros(total)
+            zero = np.zeros(samples)
             parts = SignalParts(
                 actuator_v=drive,
                 actuator_noise_v=zero if drive_noise is None else drive_noise,
@@ -251,7 +219,7 @@ class BenchRun:
             parts=parts,
         )
         self._index += 1
-        self._samples += total
+        self._samples += samples
         return block
 
     def _channel(self, volts: FloatArray, scale_v: float) -> ChannelSamples:

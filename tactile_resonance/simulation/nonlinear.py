@@ -164,28 +164,20 @@ class NonlinearStream:
         self._past = np.zeros(WindowKernel.PAST)  # last values of the strain term
         self._kernels: dict[tuple[int, float], WindowKernel] = {}
 
-    def play(self, lines: Lines, samples: int | None = None) -> FloatArray:
-        """Return the response to the next samples of an excitation, as `ResponseStream.play`.
+    def play(self, lines: Lines) -> FloatArray:
+        """Return the response to the next period of an excitation, as `ResponseStream.play`.
 
         Raises
         ------
         DriveTooStrongError
             If the response grows beyond bounds.
         """
-        samples = lines.samples_per_period if samples is None else samples
-        through = self._through.play(lines, samples)
+        through = self._through.play(lines)
         if self._drive is None or not lines.same_signal(self._drive[0]):
             self._drive = (lines, effective_drive(lines, self._nonlinear, self._oversampling))
-        driven = self._driven.play(self._drive[1], samples * self._oversampling)
+        driven = self._driven.play(self._drive[1])
         strain = self._march(driven, lines.sample_rate_hz * self._oversampling, lines)
         return strain[:: self._oversampling] + through
-
-    def silence(self, samples: int, sample_rate_hz: float) -> FloatArray:
-        """Return the response over `samples` samples of zero excitation."""
-        through = self._through.silence(samples, sample_rate_hz)
-        fine_rate_hz = sample_rate_hz * self._oversampling
-        driven = self._driven.silence(samples * self._oversampling, fine_rate_hz)
-        return self._march(driven, fine_rate_hz, None)[:: self._oversampling] + through
 
     def skip(self, lines: Lines, periods: int) -> None:
         """Advance whole periods; a nonlinear response has to be computed all the same."""
@@ -193,7 +185,7 @@ class NonlinearStream:
         for _ in range(periods):
             self.play(lines)
 
-    def _march(self, driven: FloatArray, rate_hz: float, lines: Lines | None) -> FloatArray:
+    def _march(self, driven: FloatArray, rate_hz: float, lines: Lines) -> FloatArray:
         """Add the feedback of the strain term to the driven strain, window by window."""
         strain = np.empty_like(driven)
         for begin in range(0, driven.size, WINDOW):
@@ -201,7 +193,7 @@ class NonlinearStream:
             strain[begin : begin + WINDOW] = self._solve_window(window, rate_hz, lines)
         return strain
 
-    def _solve_window(self, driven: FloatArray, rate_hz: float, lines: Lines | None) -> FloatArray:
+    def _solve_window(self, driven: FloatArray, rate_hz: float, lines: Lines) -> FloatArray:
         kernel = self._kernel(driven.size, rate_hz)
         known = driven + kernel.history(self._state, self._past)
         strain = known
@@ -226,13 +218,10 @@ class NonlinearStream:
         return self._kernels[key]
 
 
-def _refusal(lines: Lines | None, reason: str) -> str:
-    level = "silence after a drive"
-    if lines is not None:
-        rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
-        count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
-        level = f"{rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz"
+def _refusal(lines: Lines, reason: str) -> str:
+    rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
+    count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
     return (
-        f"amplitude_v: got {level}; accepted is a drive weak enough for the sensor's nonlinearity "
-        f"({reason}); lower the level or spread it over more lines"
+        f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a drive "
+        f"weak enough for the sensor's nonlinearity ({reason}); lower the level or spread it over more lines"
     )

@@ -77,8 +77,8 @@ class _Plan:
 class ResponseStream:
     """The response of a linear system, from rest, to one excitation after another.
 
-    Each call of `play` or `silence` continues where the last one ended, so a record may be made in
-    pieces of any length.
+    Each call of `play` continues where the last one ended, so a record may be made in pieces of any
+    length. Silence is an excitation whose lines are 0.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class ResponseStream:
         self._delay_s = delay_s
         self._negligible_v = negligible_v
         self._sample_rate_hz: float | None = None
-        self._plan: _Plan | None = None  # None: silence
+        self._plan: _Plan | None = None
         self._phase = 0  # samples of the current period already played
         # state minus steady state: it only decays, so it loses no digits over many periods
         self._deviation = np.zeros(model.poles_rad_s.size, dtype=complex)
@@ -154,13 +154,6 @@ class ResponseStream:
         self._phase = (self._phase + samples) % lines.samples_per_period
         scale = NEGLIGIBLE * float(np.abs(plan.state).max(initial=0.0))
         return self._advance(steady, scale)
-
-    def silence(self, samples: int, sample_rate_hz: float) -> FloatArray:
-        """Return the response over `samples` excitation samples of zero excitation."""
-        require(samples >= 0, "samples", samples, "0 or above")
-        self._set_rate(sample_rate_hz)
-        self._deviation, self._plan, self._phase = self.state, None, 0
-        return self._advance(np.zeros(samples), 0.0)
 
     def skip(self, lines: Lines, periods: int) -> None:
         """Advance whole periods of an excitation; only the last one is synthesised."""

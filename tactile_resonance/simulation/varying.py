@@ -48,24 +48,9 @@ class VaryingStream:
         )
         self._time = 0.0
 
-    def play(self, lines: Lines, samples: int | None = None) -> FloatArray:
-        """Return the response to the next samples of an excitation, as `ResponseStream.play`."""
-        samples = lines.samples_per_period if samples is None else samples
-        return self._in_steps(samples, lines.sample_rate_hz, lambda s, n: s.play(lines, n))
-
-    def silence(self, samples: int, sample_rate_hz: float) -> FloatArray:
-        """Return the response over `samples` samples of zero excitation."""
-        return self._in_steps(samples, sample_rate_hz, lambda s, n: s.silence(n, sample_rate_hz))
-
-    def skip(self, lines: Lines, periods: int) -> None:
-        """Advance whole periods."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        for _ in range(periods):
-            self.play(lines)
-
-    def _in_steps(
-        self, samples: int, rate_hz: float, act: Callable[[ResponseStream, int], FloatArray]
-    ) -> FloatArray:
+    def play(self, lines: Lines) -> FloatArray:
+        """Return the response to the next period of an excitation, as `ResponseStream.play`."""
+        samples, rate_hz = lines.samples_per_period, lines.sample_rate_hz
         count = max(1, int(np.ceil(samples / rate_hz / INTERVAL_S - 1e-9)))
         ends = np.linspace(0, samples, count + 1).astype(int)
         start, parts = self._time, []
@@ -74,6 +59,12 @@ class VaryingStream:
             contact = self._coupled_at(middle_s)
             state = self._coupled.carry_state(self._stream.state, contact)
             self._coupled, self._stream = contact, self._stream.continued(contact.modal, state)
-            parts.append(act(self._stream, int(end - begin)))
+            parts.append(self._stream.play(lines, int(end - begin)))
         self._time = start + samples / rate_hz
         return np.concatenate(parts)
+
+    def skip(self, lines: Lines, periods: int) -> None:
+        """Advance whole periods."""
+        require(periods >= 0, "periods", periods, "0 or above")
+        for _ in range(periods):
+            self.play(lines)

@@ -10,6 +10,7 @@ import pytest
 from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import TissueLibrary, read_tissues
+from tactile_resonance.simulation.lines import Lines
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +26,12 @@ def library() -> TissueLibrary:
 @pytest.fixture(scope="session")
 def bench(sensor, library) -> SimulatedBench:
     return SimulatedBench(sensor, library.contact)
+
+
+@pytest.fixture(scope="session")
+def silence() -> Callable[[float, int], Lines]:
+    """Return a maker of excitations of zero amplitude: sample rate, samples of a period."""
+    return lambda rate_hz, samples: Lines(np.ones(1, int), np.zeros(1, complex), rate_hz, samples)
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import pytest
 from tactile_resonance.simulation.acquisition import BenchEffects, convert
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.lines import Lines, sample_period
+from tactile_resonance.simulation.response import ResponseStream
 
 IDEAL = BenchEffects.none()
 
@@ -204,20 +205,18 @@ def test_hum_offset_and_drift_are_as_stated(bench, gel, multisine):
     np.testing.assert_allclose(block.parts.disturbance_v, expected, atol=1e-12)
 
 
-def test_burst_from_rest_and_its_ring_down(bench, gel, multisine):
-    lines = Lines.of(multisine(1))
+def test_ring_down_is_an_excitation_of_silent_lines(bench, gel, multisine, silence):
+    lines, quiet = Lines.of(multisine(1)), silence(50e3, 1000)
     run = bench.start(gel, effects=IDEAL)
-    block = run.burst(lines, 1500, ring_down_samples=1000)
-    assert block.samples == 2500
-    period = bench.start(gel, effects=IDEAL).block(lines)
-    np.testing.assert_allclose(block.sensor.volts[:1500], period.sensor.volts[:1500], atol=1e-14)
-    np.testing.assert_array_equal(block.actuator.volts[1500:], 0)
-    quiet = np.abs(block.sensor.volts[2300:]).max()
-    assert 0 < quiet < 0.2 * np.abs(block.sensor.volts[:1500]).max()
-    again = run.burst(lines, 1500)
-    assert (again.realisation, again.start_time_s) == (1, 2500 / 50e3)
-    # the second burst begins its excitation anew, on what is left of the first
-    np.testing.assert_allclose(again.actuator.volts, sample_period(lines)[:1500], atol=1e-12)
+    played, rung, again = run.block(lines), run.block(quiet), run.block(lines)
+    np.testing.assert_array_equal(rung.actuator.volts, 0)
+    left = np.abs(rung.sensor.volts[800:]).max()
+    assert 0 < left < 0.2 * np.abs(played.sensor.volts).max()
+    assert (again.realisation, again.index) == (2, 0)
+    assert again.start_time_s == (lines.samples_per_period + 1000) / 50e3
+    # the excitation begins anew, on what is left of it
+    np.testing.assert_allclose(again.actuator.volts, sample_period(lines), atol=1e-12)
+    assert np.abs(again.sensor.volts - played.sensor.volts).max() > 1e-3
 
 
 def test_state_carries_over_to_the_next_realisation(bench, gel, multisine):
@@ -238,7 +237,7 @@ def test_state_carries_over_to_the_next_realisation(bench, gel, multisine):
         (lambda b, t, e: b.start(t, force_n=0.0), "force_n"),
         (lambda b, t, e: b.start(t).block(e, 0), "periods"),
         (lambda b, t, e: next(b.start(t).play(e, 3, periods_per_block=2)), "periods"),
-        (lambda b, t, e: b.start(t).burst(e, 5001), "samples"),
+        (lambda b, t, e: ResponseStream(b.coupled(t).modal).play(Lines.of(e), 5001), "samples"),
         (lambda b, t, e: BenchEffects(hum_v=-1.0), "hum_v"),
         (lambda b, t, e: BenchEffects(offset_v=np.nan), "offset_v"),
     ],

@@ -64,7 +64,7 @@ def test_from_rest_the_response_satisfies_the_differential_equation(coupled, mul
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_change_of_excitation_and_ring_down_carry_the_state(coupled, multisine):
+def test_change_of_excitation_and_ring_down_carry_the_state(coupled, multisine, silence):
     first = Lines.of(multisine(1, band_hz=(100, 3000), samples_per_period=500))
     second = Lines.of(multisine(2, band_hz=(100, 3000), samples_per_period=500))
     stream = ResponseStream(coupled.modal)
@@ -73,7 +73,7 @@ def test_change_of_excitation_and_ring_down_carry_the_state(coupled, multisine):
             stream.play(first),
             stream.play(first, 137),
             stream.play(second),
-            stream.silence(200, 50e3),
+            stream.play(silence(50e3, 500), 200),
         ]
     )
     spans = [(first, 637), (second, 500), (None, 200)]
@@ -141,7 +141,7 @@ def test_from_rest_less_its_transient_the_response_is_the_analytic_one(
 
 @pytest.mark.parametrize("samples", [1001, 2501])
 def test_burst_from_rest_to_rest_has_the_analytic_response_at_any_frequency(
-    coupled, multisine, samples
+    coupled, multisine, silence, samples
 ):
     """The Laplace transforms of response and burst, from their samples by Simpson's rule."""
     rate_hz = 400e3
@@ -151,7 +151,7 @@ def test_burst_from_rest_to_rest_has_the_analytic_response_at_any_frequency(
     until = ResponseStream(coupled.modal).play(lines, samples)  # its last sample still driven
     stream = ResponseStream(coupled.modal)
     stream.play(lines, samples - 1)
-    after = stream.silence(400_001, rate_hz)  # 1 s
+    after = stream.play(silence(rate_hz, 400_001))  # 1 s
     time = np.arange(samples + after.size - 1) / rate_hz
     drive_v = sample_period(lines)[:samples]
     for frequency in (130.0, 251.7, 402.3):
