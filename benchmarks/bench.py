@@ -24,7 +24,7 @@ from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.contact_history import ContactHistory
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.lines import Lines, sample_period
+from tactile_resonance.simulation.linear import Lines, sample_period
 from tactile_resonance.simulation.nonlinear import NonlinearStream, nonlinear_steady_state
 from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter

@@ -21,7 +21,7 @@ from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.lines import Lines
+from tactile_resonance.simulation.linear import Lines
 from tactile_resonance.simulation.response import ResponseStream
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 

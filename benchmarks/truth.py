@@ -33,11 +33,10 @@ from tactile_resonance.identification.result import (
 )
 from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.simulation.bench import DEFAULT_EFFECTS, SimulatedBench
-from tactile_resonance.simulation.bench_run import BenchRun
+from tactile_resonance.simulation.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
 from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
 from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.lines import Lines
+from tactile_resonance.simulation.linear import Lines
 
 FloatArray = npt.NDArray[np.float64]
 

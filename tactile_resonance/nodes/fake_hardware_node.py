@@ -25,14 +25,12 @@ from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import truth_to_response
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.acquisition import BenchEffects
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bench_run import BenchRun
-from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.contact_so_far import ContactSoFar
+from tactile_resonance.simulation.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.bimorph import truth_of
+from tactile_resonance.simulation.contact_so_far import BenchTip, ContactSoFar
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.scene import read_scene
-from tactile_resonance.simulation.truth import truth_of
 from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (

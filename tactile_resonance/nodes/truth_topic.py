@@ -24,9 +24,8 @@ from tactile_resonance.recording.messages import (
     time_from_message,
 )
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.bimorph import CoupledBimorph
-from tactile_resonance.simulation.truth import Truth
+from tactile_resonance.simulation.bimorph import CoupledBimorph, Truth
+from tactile_resonance.simulation.contact_so_far import BenchTip
 from tactile_resonance.srv import Truth as TruthService
 
 

@@ -12,15 +12,19 @@ from matplotlib.figure import Figure
 from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.beam import mode_shape, sensor_modes
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
-from tactile_resonance.simulation.indentation import Indentation, indent
+from tactile_resonance.simulation.contact_history import (
+    ContactHistory,
+    Indentation,
+    indent,
+    pole_trajectory,
+)
+from tactile_resonance.simulation.experiments import truth_map
 from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.shapes import Sphere
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
-from tactile_resonance.simulation.truth_map import truth_map
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 
 From the outside in: `bench` (blocks of samples), `scene` (what lies where), `library` (tissues),
 `bimorph` (poles, zeros and response of the coupled sensor), `response` and `nonlinear` (its time
-domain), `contact`, `tissue` and `beam` (the physics), `indenter` (force against depth through time,
-step by step) and `indentation` (a whole test at once).
-Nothing simulated here is a measurement; sources of the parameters stand in ``config/``.
+domain), `tissue` and `beam` (the physics), `indenter` (force against depth through time).
+`plant` and `robot` are what a tip moves on; `plant_process` puts them on ports, `contact_bench` in
+virtual time. Nothing simulated here is a measurement; sources of the parameters stand in ``config/``.
 """

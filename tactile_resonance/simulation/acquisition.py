@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.modal import FloatArray
+from tactile_resonance.simulation.linear import FloatArray
 
 
 @dataclass(frozen=True)

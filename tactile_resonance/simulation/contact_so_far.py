@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contact of a plant as a simulated sensor feels it: known up to now, told part by part."""
+"""The contact that the simulated sensor feels: as it begins to play, then part by part as a plant tells."""
 
 from __future__ import annotations
 
@@ -10,8 +10,46 @@ from dataclasses import dataclass, replace
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.bimorph import CoupledBimorph
+from tactile_resonance.simulation.bimorph import CoupledBimorph, couple
+from tactile_resonance.simulation.tissue import Tissue, contact_of_radius
+
+
+@dataclass(frozen=True)
+class BenchTip:
+    """What the tip is in contact with.
+
+    Attributes
+    ----------
+    tissue : Tissue or None
+        None: air.
+    force_n : float
+    since_s : float
+        How long the force has been held [s].
+    contact_radius_m, depth_m : float
+        As a plant has them [m]; NaN: those of Hertz under the force after `since_s`.
+    """
+
+    tissue: Tissue | None
+    force_n: float
+    since_s: float
+    contact_radius_m: float = math.nan
+    depth_m: float = math.nan
+
+    def coupled(self, bench: SimulatedBench) -> CoupledBimorph:
+        """The linear sensor on it."""
+        if self.tissue is None or math.isnan(self.contact_radius_m):
+            return bench.coupled(
+                self.tissue, force_n=self.force_n or None, hold_time_s=self.since_s
+            )
+        contact = contact_of_radius(
+            self.tissue,
+            self.contact_radius_m,
+            bench.contact,
+            force_n=self.force_n,
+            indentation_m=self.depth_m,
+        )
+        return couple(bench.sensor, contact)
+
 
 LEAST_RADIUS_M = 1e-6
 """A contact that is lost stays one of this radius: its stiffness is below a hundredth of that at 1 cN."""

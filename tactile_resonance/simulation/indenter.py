@@ -23,8 +23,52 @@ from typing import Protocol
 import numpy as np
 
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.free_springs import FreeSprings, Node, Values
-from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.tissue import FloatArray, Tissue
+
+Values = list[float]  # one per Prony term: its share E_j v_j of the line load
+Node = tuple[float, float, FloatArray]  # x, time when it was let go, modal state then
+
+
+class FreeSprings:
+    """Springs of a Prony series without load: ``E0 u = sum E_j z_j``, ``tau_j z_j' = u - z_j``.
+
+    While it touches, a spring bears ``Einf u + sum E_j v_j`` with ``v_j = u - z_j``.
+
+    Parameters
+    ----------
+    moduli_pa, times_s : (terms,) arrays
+        E_j above 0 [Pa] and tau_j [s].
+    glassy_pa : float
+        ``E0 = Einf + sum E_j`` [Pa].
+
+    Notes
+    -----
+    The same rank-one change of ``diag(1 / tau)`` as in the creep compliance; its eigenvectors
+    make every free spring a sum of decays, so none needs to be stepped.
+    """
+
+    def __init__(self, moduli_pa: FloatArray, times_s: FloatArray, glassy_pa: float) -> None:
+        root = np.sqrt(moduli_pa / times_s)
+        rates, vectors = np.linalg.eigh(np.diag(1 / times_s) - np.outer(root, root) / glassy_pa)
+        weights = np.sqrt(moduli_pa * times_s)
+        self._moduli, self._decay_rates = moduli_pa, (-rates).tolist()
+        self._into = vectors.T * weights  # (modes, terms): modal state of z
+        displacement = vectors.T @ root / glassy_pa  # (modes,)
+        loads = moduli_pa[:, None] * (displacement - vectors / weights[:, None])  # (terms, modes)
+        self._out = np.vstack([displacement, loads]).tolist()
+
+    def let_go(self, u: float, values: Values) -> FloatArray:
+        """Return the modal state of a spring at displacement u [m] that has just been let go."""
+        return (self._into @ (u - np.array(values) / self._moduli)).tolist()
+
+    def at(self, node: Node, time: float) -> tuple[float, Values]:
+        """Return u of a free spring [m], and what its terms would bear if it were held there."""
+        _, since, state = node
+        elapsed = time - since
+        now = [y * exp(elapsed * rate) for y, rate in zip(state, self._decay_rates, strict=True)]
+        values = [sum(map(mul, row, now)) for row in self._out]
+        return values.pop(0), values
+
 
 NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes as its square
 MAX_NODES_PER_STEP = 64
@@ -64,7 +108,7 @@ class Ball(Protocol):
 class Indenter:
     """A spherical rigid tip on a viscoelastic half-space, stepped through time.
 
-    Inertia of the tissue is left out (see `contact` for the waves of fast vibration), friction too.
+    Inertia of the tissue is left out (see `tissue` for the waves of fast vibration), friction too.
 
     Parameters
     ----------

@@ -12,8 +12,7 @@ import numpy as np
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import build, read_file, require
-from tactile_resonance.simulation.contact import HertzParameters
-from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.tissue import HertzParameters, Tissue
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values
 

@@ -20,7 +20,7 @@ from tactile_resonance.fields import (
     require,
 )
 from tactile_resonance.simulation.library import TissueLibrary
-from tactile_resonance.simulation.modal import FloatArray
+from tactile_resonance.simulation.linear import FloatArray
 from tactile_resonance.simulation.shapes import Point
 from tactile_resonance.simulation.tissue import Tissue
 

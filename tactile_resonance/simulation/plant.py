@@ -34,8 +34,7 @@ from tactile_resonance.contact.vectors import (
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.indenter import Ball
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
-from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import PlantSurface
+from tactile_resonance.simulation.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]

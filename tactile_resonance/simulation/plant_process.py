@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot, tissue and load cell of the bench on one clock, each on the ports of a real one."""
+"""Robot, tissue and load cell of the bench on one clock, each on the ports of a real one.
+
+What was true of the tip at every step is kept: no instrument shows it, but the simulated sensor follows the
+contact by it, and tests and benchmarks judge by it how deep, how hard and how long.
+"""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import sensor_modes
@@ -19,14 +26,95 @@ from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
 from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
-from tactile_resonance.simulation.plant_history import PlantHistory
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.sprung_indenter import SprungIndenter
-from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import FlatSurface
+from tactile_resonance.simulation.surfaces import FlatSurface, SurfaceMotion
 from tactile_resonance.simulation.tcp_bus import TcpBus
 from tactile_resonance.simulation.tissue import Tissue
+
+KEEP_STEPS = 30_000
+"""A minute at 500 Hz."""
+
+MOST_STEPS = 250
+"""In one answer: to write more would hold the plant up."""
+
+
+@dataclass(frozen=True, slots=True)
+class _PlantStep:
+    time_s: float
+    tip_m: Vector
+    normal_force_n: float
+    contact_radius_m: float
+    depth_m: float
+
+
+class PlantHistory:
+    """Time, place of the tip and its contact, step by step.
+
+    Parameters
+    ----------
+    plant : Plant
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self._steps: deque[_PlantStep] = deque(maxlen=KEEP_STEPS)
+
+    def step(self) -> None:
+        """Note what is true now; to be called after each step of the plant."""
+        plant = self._plant
+        self._steps.append(
+            _PlantStep(
+                plant.time_s,
+                plant.tip_m,
+                plant.normal_force_n,
+                plant.contact_radius_m,
+                plant.depth_m,
+            )
+        )
+
+    def contact_over(self, fields: dict) -> dict:
+        """Control port: the contact from field ``after_s`` to ``until_s``, means over so many equal ``parts``.
+
+        Answers ``normal_force_n``, ``contact_radius_m`` and ``depth_m``, each (parts,); null for a part in
+        which the plant stood still, or of which nothing is kept.
+        """
+        after_s = number(fields.get("after_s"), "after_s")
+        until_s = number(fields.get("until_s"), "until_s")
+        parts = fields.get("parts")
+        require(after_s < until_s, "until_s", until_s, f"above after_s = {after_s:g}")
+        good = type(parts) is int and 1 <= parts <= MOST_STEPS
+        require(good, "parts", parts, f"an integer, 1 to {MOST_STEPS}")
+        assert isinstance(parts, int)
+        steps = [step for step in self._since(after_s) if step.time_s <= until_s]
+        times = np.array([step.time_s for step in steps])
+        # a step ends at its time
+        at = np.ceil((times - after_s) / (until_s - after_s) * parts - 1e-6).astype(int) - 1
+        at = at.clip(0, parts - 1)
+        counts = np.bincount(at, minlength=parts)
+        answer = {}
+        for name in ("normal_force_n", "contact_radius_m", "depth_m"):
+            sums = np.bincount(at, [getattr(step, name) for step in steps], parts)
+            pairs = zip(sums.tolist(), counts.tolist(), strict=True)
+            answer[name] = [total / count if count else None for total, count in pairs]
+        return answer
+
+    def since(self, fields: dict) -> dict:
+        """Control port: the first steps after field ``after_s``, 250 at most, oldest first.
+
+        Answers ``time_s`` (n,), ``tip_m`` (n, 3) in the base and ``normal_force_n`` (n,).
+        """
+        first = self._since(number(fields.get("after_s", 0.0), "after_s"))[:MOST_STEPS]
+        return {
+            name: [getattr(step, name) for step in first]
+            for name in ("time_s", "tip_m", "normal_force_n")
+        }
+
+    def _since(self, after_s: float) -> list[_PlantStep]:
+        """Steps after a time, oldest first."""
+        return list(takewhile(lambda step: step.time_s > after_s, reversed(self._steps)))[::-1]
+
 
 FloatArray = NDArray[np.float64]
 
@@ -145,7 +233,9 @@ class Tabletop:
             tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
             azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
         )
-        self.plant.surface = FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        self.plant.surface = FlatSurface.tilted(
+            setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad
+        )
         return {}
 
     def move_surface(self, fields: dict) -> dict:

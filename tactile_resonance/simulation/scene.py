@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import build, check_above_zero, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.hertz_field import energy_share
 from tactile_resonance.simulation.library import TissueLibrary
+from tactile_resonance.simulation.linear import FloatArray
 from tactile_resonance.simulation.materials import FillingEntry, Material, TissueEntry, mixture
-from tactile_resonance.simulation.modal import FloatArray
-from tactile_resonance.simulation.shapes import Shape, ShapeEntry
-from tactile_resonance.simulation.surface_motion import SurfaceMotion
+from tactile_resonance.simulation.shapes import Shape, ShapeEntry, energy_share
+from tactile_resonance.simulation.surfaces import SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
 
@@ -35,7 +34,7 @@ class Buried:
     """Something under the surface: an inclusion, the layer below a layer.
 
     The tip feels it as far as the stresses of its contact reach: with the share f of the strain
-    energy inside the shape (`hertz_field`), ``1/E = (1 - f)/E_region + f/E_buried``, and Prony
+    energy inside the shape (`energy_share`), ``1/E = (1 - f)/E_region + f/E_buried``, and Prony
     ratios at f between the two. Exact to first order in the contrast, otherwise less than the truth
     for what is stiffer. The contact radius is that of the tip on the region alone.
 
@@ -135,7 +134,9 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
     """
     path = share_path("config/scenes/gelatine_phantoms.yaml") if path is None else Path(path)
     content, where = read_yaml(path), f"{path.name}:"
-    ours = {field.name: content[field.name] for field in fields(_BenchPart) if field.name in content}
+    ours = {
+        field.name: content[field.name] for field in fields(_BenchPart) if field.name in content
+    }
     file = read_dataclass(_BenchPart, ours, where)
     return PhantomScene(
         name=path.stem if file.name is None else file.name,

@@ -26,9 +26,9 @@ from tactile_resonance.report.run_report import read_silent
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.bench import SimulatedBench
+from tactile_resonance.simulation.bimorph import truth_of
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.truth import truth_of
 
 SCENE = """
 name: three points

@@ -33,7 +33,7 @@ from tactile_resonance.nodes.running import STREAM, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bench_tip import BenchTip
+from tactile_resonance.simulation.contact_so_far import BenchTip
 from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant_process import LaidScene
 

@@ -10,7 +10,7 @@ import pytest
 from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import TissueLibrary, read_tissues
-from tactile_resonance.simulation.lines import Lines
+from tactile_resonance.simulation.linear import Lines
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 
 from tactile_resonance.simulation.acquisition import BenchEffects, convert
 from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.lines import Lines, sample_period
+from tactile_resonance.simulation.linear import Lines, sample_period
 from tactile_resonance.simulation.response import ResponseStream
 
 IDEAL = BenchEffects.none()

@@ -4,9 +4,13 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.bench_tip import BenchTip
-from tactile_resonance.simulation.contact_so_far import ContactSoFar, ContactState, parts_of
-from tactile_resonance.simulation.varying import INTERVAL_S
+from tactile_resonance.simulation.contact_so_far import (
+    BenchTip,
+    ContactSoFar,
+    ContactState,
+    parts_of,
+)
+from tactile_resonance.simulation.response import INTERVAL_S
 
 
 def near_250(coupled):

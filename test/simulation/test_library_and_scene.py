@@ -12,7 +12,7 @@ from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.materials import Uniform
 from tactile_resonance.simulation.scene import PhantomScene, Region, read_scene
 from tactile_resonance.simulation.shapes import Box, HalfSpace, Sphere
-from tactile_resonance.simulation.surface_motion import SurfaceMotion
+from tactile_resonance.simulation.surfaces import SurfaceMotion
 
 
 def write(tmp_path, content):

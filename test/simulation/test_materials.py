@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.simulation.hertz_field import energy_density, energy_share, hertz_stress
+from tactile_resonance.simulation.experiments import truth_map
 from tactile_resonance.simulation.materials import (
     Gradient,
     Heterogeneous,
@@ -21,8 +21,14 @@ from tactile_resonance.simulation.materials import (
     mixture,
 )
 from tactile_resonance.simulation.scene import Buried, PhantomScene, Region, read_scene
-from tactile_resonance.simulation.shapes import Box, HalfSpace, Sphere
-from tactile_resonance.simulation.truth_map import truth_map
+from tactile_resonance.simulation.shapes import (
+    Box,
+    HalfSpace,
+    Sphere,
+    energy_density,
+    energy_share,
+    hertz_stress,
+)
 
 EVERYWHERE = HalfSpace((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 

@@ -8,15 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tactile_resonance.sensor import NonlinearParameters
-from tactile_resonance.simulation.lines import Lines, sample_period
-from tactile_resonance.simulation.modal import PoleResidueModel
+from tactile_resonance.simulation.linear import Lines, PoleResidueModel, sample_period
 from tactile_resonance.simulation.nonlinear import (
     DriveTooStrongError,
     NonlinearStream,
+    WindowKernel,
     nonlinear_steady_state,
 )
 from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.volterra import WindowKernel
 
 LINEAR = NonlinearParameters(0.0, 0.0)
 

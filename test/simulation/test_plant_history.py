@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.plant_history import KEEP_STEPS, MOST_STEPS, PlantHistory
+from tactile_resonance.simulation.plant_process import KEEP_STEPS, MOST_STEPS, PlantHistory
 
 
 def a_plant():

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import simpson, solve_ivp
 from scipy.linalg import expm
 
-from tactile_resonance.simulation.lines import Lines, sample_period
+from tactile_resonance.simulation.linear import Lines, sample_period
 from tactile_resonance.simulation.response import ResponseStream, free_decay, steady_state
 
 

@@ -11,8 +11,7 @@ from tactile_resonance.simulation.plant import Plant, RigidTip
 from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
 from tactile_resonance.simulation.robot.poses import transform_from_pose
 from tactile_resonance.simulation.scene import read_scene
-from tactile_resonance.simulation.surface_motion import SurfaceMotion
-from tactile_resonance.simulation.surfaces import FlatSurface
+from tactile_resonance.simulation.surfaces import FlatSurface, SurfaceMotion
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU, MODULUS_PA = 2.5e-3, 0.49, 10e3

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tactile_resonance.simulation.contact import hertz_contact
-from tactile_resonance.simulation.indentation import indent
-from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.contact_history import indent
+from tactile_resonance.simulation.tissue import Tissue, hertz_contact
 
 NAMES = ["gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver"]
 RADIUS = 2.5e-3

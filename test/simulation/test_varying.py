@@ -10,9 +10,8 @@ from scipy.integrate import solve_ivp
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bimorph import couple
 from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
-from tactile_resonance.simulation.lines import Lines
-from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.varying import INTERVAL_S, VaryingStream
+from tactile_resonance.simulation.linear import Lines
+from tactile_resonance.simulation.response import INTERVAL_S, ResponseStream, VaryingStream
 
 RADIUS = 2.5e-3
 IDEAL = BenchEffects.none()
