@@ -27,7 +27,7 @@ from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.linear import Lines, sample_period
 from tactile_resonance.simulation.nonlinear import NonlinearStream, nonlinear_steady_state
 from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.tip import SprungIndenter
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -18,9 +18,10 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.contact_bench import ContactBench, Tip
+from tactile_resonance.simulation.contact_bench import ContactBench
 from tactile_resonance.simulation.indenter import Ball, Indenter
 from tactile_resonance.simulation.surfaces import FlatSurface, PlantSurface
+from tactile_resonance.simulation.tip import Tip
 from tactile_resonance.simulation.tissue import Tissue
 from tactile_resonance.simulation.tracking import TrackingParameters
 from tactile_resonance.simulation.transducer import CellParameters

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.lock_in_touch import ScatterTouch, lock_in
 from tactile_resonance.contact.estimator import TouchDetector
-from tactile_resonance.contact.resonance_touch import ScatterTouch, lock_in
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.bench import SimulatedBench
@@ -23,7 +23,7 @@ from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import read_tissues
 from tactile_resonance.simulation.linear import Lines
 from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.tip import SprungIndenter
 
 FloatArray = NDArray[np.float64]
 

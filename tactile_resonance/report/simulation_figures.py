@@ -23,7 +23,7 @@ from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.scene import PhantomScene
 from tactile_resonance.simulation.shapes import Sphere
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.tip import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = npt.NDArray[np.float64]

@@ -173,42 +173,19 @@ class CoupledBimorph:
         s = np.asarray(s_rad_s, dtype=complex)
         at_rest = s == 0
         s = np.where(at_rest, 1.0, s)
-        strain, loaded, _ = self._loop(s)
-        return np.where(at_rest, 0.0, (strain + self.feedthrough) / loaded)
-
-    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
-        """Return G(j 2 pi f), of the shape of `frequency_hz`, in closed form."""
-        return self.response(2j * np.pi * np.asarray(frequency_hz, dtype=float))
-
-    def characteristic(self, s_rad_s: ArrayLike) -> ComplexArray:
-        """Return the characteristic polynomial at complex s [rad/s], up to a constant factor.
-
-        ``(1 + k*(s) H_tip(s)) (1 + alpha(s) / Ct + 1 / (s R Ct))`` - a rank-one change of the free
-        beam by the tissue, another by the electric load - times the denominators of the uncoupled
-        parts, so that it is zero exactly at the poles and finite everywhere.
-        """
-        s = np.asarray(s_rad_s, dtype=complex)
-        _, loaded, touched = self._loop(s)
-        relative = s[..., None] / self.beam.natural_rad_s
-        uncoupled = relative**2 + 2 * self.beam.damping_ratio * relative + 1  # (..., n)
-        value = loaded * touched * s * np.prod(uncoupled, axis=-1)
-        if self.contact is not None:
-            times = np.asarray(self.contact.tissue.prony_times_s)
-            value = value * np.prod(1 + s[..., None] * times, axis=-1)
-        return np.asarray(value)
-
-    def _loop(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return ``alpha/Ct``, ``1 + alpha/Ct + 1/(s R Ct)`` and ``1 + k* H_tip`` at s != 0."""
         beam = self.beam
         natural, phi, chi = beam.natural_rad_s, beam.tip_deflection, beam.coupling
         ss = s[..., None]
         modal = 1 / (ss**2 + 2 * beam.damping_ratio * natural * ss + natural**2)  # (..., n)
         charge, cross, receptance = modal @ chi**2, modal @ (chi * phi), modal @ phi**2
         k = np.zeros_like(s) if self.contact is None else self.contact.dynamic_stiffness(s)
-        touched = 1 + k * receptance
-        strain = (charge - cross**2 * k / touched) / beam.capacitance_f
+        strain = (charge - cross**2 * k / (1 + k * receptance)) / beam.capacitance_f
         leak = 1 / (s * self.input_resistance_ohm * beam.capacitance_f)
-        return strain, 1 + strain + leak, touched
+        return np.where(at_rest, 0.0, (strain + self.feedthrough) / (1 + strain + leak))
+
+    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Return G(j 2 pi f), of the shape of `frequency_hz`, in closed form."""
+        return self.response(2j * np.pi * np.asarray(frequency_hz, dtype=float))
 
     @property
     def modes(self) -> tuple[Mode, ...]:

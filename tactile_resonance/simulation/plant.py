@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +31,9 @@ from tactile_resonance.contact.vectors import (
     vector,
 )
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.indenter import Ball
 from tactile_resonance.simulation.robot.poses import IDENTITY, ORIGIN, Transform
 from tactile_resonance.simulation.surfaces import PlantSurface, SurfaceMotion
+from tactile_resonance.simulation.tip import TipOnTissue
 from tactile_resonance.simulation.tissue import Tissue
 
 FloatArray = NDArray[np.float64]
@@ -47,30 +46,6 @@ SAME_PLACE = 0.1
 
 STANDING_M = 1e-5
 """A tip that moves less than this along the surface in a step is above the place that it will touch."""
-
-
-class TipOnTissue(Protocol):
-    """A tip on one tissue through time: `RigidTip`, `SprungIndenter`."""
-
-    @property
-    def indenter(self) -> Ball:
-        """The ball."""
-        ...
-
-    def step(self, depth_m: float, dt_s: float, /) -> float:
-        """Advance with the depth of what holds the tip [m]; return the force on that [N]."""
-        ...
-
-
-@dataclass(frozen=True)
-class RigidTip:
-    """A ball that moves as the robot does."""
-
-    indenter: Ball
-
-    def step(self, depth_m: float, dt_s: float, /) -> float:
-        """Advance with the depth of the ball [m]; return the force on it [N]."""
-        return self.indenter.step(depth_m, dt_s)
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,14 @@ from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.indenter import Indenter
 from tactile_resonance.simulation.library import TissueLibrary
 from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.plant import CellMounting, Plant, RigidTip, TipOnTissue
+from tactile_resonance.simulation.plant import CellMounting, Plant
 from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.scene import PhantomScene
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.surfaces import FlatSurface, SurfaceMotion
 from tactile_resonance.simulation.tcp_bus import TcpBus
+from tactile_resonance.simulation.tip import Tip
 from tactile_resonance.simulation.tissue import Tissue
 
 KEEP_STEPS = 30_000
@@ -201,27 +200,19 @@ class Tabletop:
         self._library = library
         self._tissue: Tissue | None = library[setup.tissue]
         self._scene = laid
-        if laid is not None:
-            laid.tissue_at(
-                laid.table.position_m
-            )  # what is computed once must not hold up the first touch
-        modes, radius_m = sensor_modes(sensor), sensor.tip.radius_m
-
-        def tip(tissue: Tissue) -> TipOnTissue:
-            indenter = Indenter(
-                tissue, tip_radius_m=radius_m, poisson_ratio=library.contact.poisson_ratio
-            )
-            return (
-                RigidTip(indenter) if setup.rigid_tip else SprungIndenter.on_beam(indenter, modes)
-            )
-
+        if laid is None:
+            surface = FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        else:
+            surface = laid.surface()
+            # what is computed once must not hold up the first touch
+            laid.tissue_at(laid.table.position_m)
+        beam = None if setup.rigid_tip else sensor_modes(sensor)
+        tip = Tip(sensor.tip.radius_m, beam, library.contact.poisson_ratio)
         self.plant = Plant(
-            laid.surface()
-            if laid
-            else FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad),
+            surface,
             self._tissue_at,
-            tip,
-            tip_radius_m=radius_m,
+            lambda tissue: tip.on(tissue, surface),
+            tip_radius_m=tip.radius_m,
             mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
         )
         self.plant.motion = laid.scene.motion if laid else None

@@ -168,21 +168,8 @@ class SurfaceMotion:
 
     def displacement_m(self, time_s: float) -> float:
         """Of the surface at a time [m]; 0 is end-expiration between two heartbeats."""
-        breath, heart = self._turns(time_s)
+        breath, heart = self.phases_rad
+        breath += math.pi * self.breath_hz * time_s
+        heart += 2 * math.pi * self.heart_hz * time_s
         rise = self.breath_m * math.cos(breath) ** (2 * self.breath_power)
         return rise + self.heart_m / 2 * math.sin(heart)
-
-    def velocity_m_s(self, time_s: float) -> float:
-        """Time derivative of the displacement [m/s]."""
-        breath, heart = self._turns(time_s)
-        n = self.breath_power
-        steepness = -2 * n * math.cos(breath) ** (2 * n - 1) * math.sin(breath)
-        rise = self.breath_m * steepness * math.pi * self.breath_hz
-        return rise + self.heart_m * math.pi * self.heart_hz * math.cos(heart)
-
-    def _turns(self, time_s: float) -> tuple[float, float]:
-        breath, heart = self.phases_rad
-        return (
-            breath + math.pi * self.breath_hz * time_s,
-            heart + 2 * math.pi * self.heart_hz * time_s,
-        )

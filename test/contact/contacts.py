@@ -12,8 +12,9 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.contact_bench import ContactBench, Tip
+from tactile_resonance.simulation.contact_bench import ContactBench
 from tactile_resonance.simulation.surfaces import FlatSurface
+from tactile_resonance.simulation.tip import Tip
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, FORCE_N = 2.5e-3, 0.01
@@ -73,7 +74,12 @@ def contact(
     touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(touch.position_m + [0, 0, start_m], touch.rotation_rad)
     rig = ContactBench(
-        tissue, FlatSurface.tilted(height_m, tilt_rad), start, tip=tip or Tip(RADIUS_M), seed=seed, **bench
+        tissue,
+        FlatSurface.tilted(height_m, tilt_rad),
+        start,
+        tip=tip or Tip(RADIUS_M),
+        seed=seed,
+        **bench,
     )
     limits = Limits() if limits is None else limits
     controller = ContactController(parameters, limits, under_sample=under_sample)

@@ -18,10 +18,9 @@ from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.obstacles import Clinging, OnBone
-from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surfaces import SurfaceMotion
+from tactile_resonance.simulation.tip import RigidTip, Tip
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, stiffer

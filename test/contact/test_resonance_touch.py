@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
 
-from tactile_resonance.contact.resonance_touch import PolesTouch, ScatterTouch, lock_in
+from benchmarks.lock_in_touch import ScatterTouch, lock_in
+from tactile_resonance.contact.resonance_touch import PolesTouch
 
 COVARIANCE = np.array([[0.0086**2, 1e-7], [1e-7, 3e-5**2]])
 AIR = np.array([246.6, 0.0119])

@@ -11,8 +11,8 @@ from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.obstacles import Clinging
-from tactile_resonance.simulation.plant import RigidTip
 from tactile_resonance.simulation.surfaces import FlatSurface
+from tactile_resonance.simulation.tip import RigidTip
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import RADIUS_M, SOFT, contact, started, stiffer
@@ -141,7 +141,9 @@ def test_force_on_the_way_counts_where_the_cell_is_under_the_sample(under_sample
     made.loop.start(made.goal)
     made.run(0.2)
     assert made.controller.state is State.TRAVEL
-    made.bench.cell.faults.bias_step_n = -0.05  # something is touched, or somebody leans on the dish
+    made.bench.cell.faults.bias_step_n = (
+        -0.05
+    )  # something is touched, or somebody leans on the dish
     made.run(0.1)
     result = made.controller.result
     assert (result is not None) == under_sample

@@ -81,10 +81,35 @@ def test_poles_are_stable_and_come_in_pairs(coupled):
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(poles.conj()), rtol=1e-12)
 
 
+def characteristic(coupled, s):
+    """The characteristic polynomial at complex s [rad/s], up to a constant factor.
+
+    ``(1 + k*(s) H_tip(s)) (1 + alpha(s) / Ct + 1 / (s R Ct))`` - a rank-one change of the free
+    beam by the tissue, another by the electric load - times the denominators of the uncoupled
+    parts, so that it is zero exactly at the poles and finite everywhere.
+    """
+    beam, s = coupled.beam, np.asarray(s, dtype=complex)
+    relative = s[..., None] / beam.natural_rad_s
+    uncoupled = relative**2 + 2 * beam.damping_ratio * relative + 1  # (..., n)
+    modal = 1 / (uncoupled * beam.natural_rad_s**2)
+    phi, chi = beam.tip_deflection, beam.coupling
+    k = 0.0 if coupled.contact is None else coupled.contact.dynamic_stiffness(s)
+    touched = 1 + k * (modal @ phi**2)
+    alpha = modal @ chi**2 - (modal @ (chi * phi)) ** 2 * k / touched
+    loaded = 1 + (alpha + 1 / (s * coupled.input_resistance_ohm)) / beam.capacitance_f
+    value = loaded * touched * s * np.prod(uncoupled, axis=-1)
+    if coupled.contact is not None:
+        times = np.asarray(coupled.contact.tissue.prony_times_s)
+        value = value * np.prod(1 + s[..., None] * times, axis=-1)
+    return value
+
+
 def test_poles_equal_a_root_search(coupled):
     poles = coupled.modal.poles_rad_s
     found = [
-        optimize.newton(coupled.characteristic, pole * (1 + 1e-3), tol=1e-13 * abs(pole))
+        optimize.newton(
+            lambda s: characteristic(coupled, s), pole * (1 + 1e-3), tol=1e-13 * abs(pole)
+        )
         for pole in poles
     ]
     np.testing.assert_allclose(found, poles, rtol=1e-9)
@@ -94,7 +119,7 @@ def test_no_pole_is_missing(coupled):
     # the characteristic polynomial over the product of (s - pole) is the same number everywhere
     rng = np.random.default_rng(1)
     s = 10 ** rng.uniform(0, 5, 50) * np.exp(1j * rng.uniform(0.1, 3.0, 50))
-    logs = np.log(coupled.characteristic(s)) - np.log(s[:, None] - coupled.poles_rad_s).sum(axis=1)
+    logs = np.log(characteristic(coupled, s)) - np.log(s[:, None] - coupled.poles_rad_s).sum(axis=1)
     np.testing.assert_allclose(np.exp(logs - logs[0]), 1, rtol=1e-9)
 
 

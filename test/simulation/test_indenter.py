@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from tactile_resonance.simulation.beam import sensor_modes
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
+from tactile_resonance.simulation.tip import SprungIndenter
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS, POISSON = 2.5e-3, 0.49

@@ -7,12 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.contact_bench import Tip
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import CellMounting, Friction, Plant, RigidTip
+from tactile_resonance.simulation.plant import CellMounting, Friction, Plant
 from tactile_resonance.simulation.robot.poses import transform_from_pose
-from tactile_resonance.simulation.sprung_indenter import SprungIndenter
 from tactile_resonance.simulation.surfaces import FlatSurface, RoundSurface, relative_radius_m
+from tactile_resonance.simulation.tip import RigidTip, SprungIndenter, Tip
 from tactile_resonance.simulation.tissue import Tissue
 
 RADIUS_M, NU = 2.5e-3, 0.49

@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.plant import Plant, RigidTip
+from tactile_resonance.simulation.plant import Plant
 from tactile_resonance.simulation.robot.machine import MachineConfig
 from tactile_resonance.simulation.robot.safety import SafetyMode
 from tactile_resonance.simulation.surfaces import FlatSurface
+from tactile_resonance.simulation.tip import RigidTip
 from tactile_resonance.simulation.tissue import Tissue
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -1,17 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ball at the end of the beam: what bends between the robot and the tissue."""
+"""The tip on a tissue through time: the ball held rigidly, or at the end of the beam, which bends."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import ceil, cos, exp, sin, sqrt
+from typing import Protocol
 
 import numpy as np
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.beam import BeamModes
-from tactile_resonance.simulation.indenter import Ball
+from tactile_resonance.simulation.indenter import Ball, Indenter
+from tactile_resonance.simulation.surfaces import PlantSurface, relative_radius_m
+from tactile_resonance.simulation.tissue import Tissue
 
 SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
+
+
+class TipOnTissue(Protocol):
+    """A tip on one tissue through time: `RigidTip`, `SprungIndenter`."""
+
+    @property
+    def indenter(self) -> Ball:
+        """The ball."""
+        ...
+
+    def step(self, depth_m: float, dt_s: float, /) -> float:
+        """Advance with the depth of what holds the tip [m]; return the force on that [N]."""
+        ...
+
+
+@dataclass(frozen=True)
+class RigidTip:
+    """A ball that moves as the robot does."""
+
+    indenter: Ball
+
+    def step(self, depth_m: float, dt_s: float, /) -> float:
+        """Advance with the depth of the ball [m]; return the force on it [N]."""
+        return self.indenter.step(depth_m, dt_s)
 
 
 class SprungIndenter:
@@ -106,3 +135,39 @@ class SprungIndenter:
         self._base, self.tip_depth_m, self._speed = base_depth_m, depth, speed
         self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
         return self.force_n
+
+
+@dataclass(frozen=True)
+class Tip:
+    """The ball, and the beam that holds it where there is one.
+
+    Attributes
+    ----------
+    radius_m : float
+    beam : BeamModes or None
+        None: held rigidly.
+    poisson_ratio : float
+        Of the tissue.
+    adhesion_j_per_m2 : float
+        See `Indenter`.
+    meets : callable, optional
+        From the ball on the tissue to what it meets: `OnBone`, `Clinging`.
+    """
+
+    radius_m: float = 2.5e-3
+    beam: BeamModes | None = None
+    poisson_ratio: float = 0.49
+    adhesion_j_per_m2: float = 0.0
+    meets: Callable[[Indenter], Ball] | None = None
+
+    def on(self, tissue: Tissue, surface: PlantSurface) -> TipOnTissue:
+        """Return the tip at rest over a tissue with that surface."""
+        radius_m = relative_radius_m(self.radius_m, surface)
+        soft = Indenter(
+            tissue,
+            tip_radius_m=radius_m,
+            poisson_ratio=self.poisson_ratio,
+            adhesion_j_per_m2=self.adhesion_j_per_m2,
+        )
+        ball: Ball = soft if self.meets is None else self.meets(soft)
+        return RigidTip(ball) if self.beam is None else SprungIndenter.on_beam(ball, self.beam)
