@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.vectors import Vector, difference, dot, vector
-from tactile_resonance.fields import check_not_negative, require, check_within
+from tactile_resonance.fields import check_not_negative, check_within, require
 
 FloatArray = NDArray[np.float64]
 
