@@ -186,8 +186,10 @@ class BinData:
     def part(self, which: slice) -> BinData:
         """Some of the records."""
         values: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
-        several = {n: v for n, v in values.items() if v is not None and v.shape[1] == self.records}
-        return replace(self, **{n: np.ascontiguousarray(v[:, which]) for n, v in several.items()})
+        for name, array in values.items():
+            if array is not None and array.shape[1] == self.records:
+                values[name] = np.ascontiguousarray(array[:, which])
+        return replace(self, **values)
 
     def residual_variance(self, g: ComplexArray) -> FloatArray:
         """(points, M or 1, K_driven or 1) variance of ``y - g u`` for a response g (points, K_driven)."""

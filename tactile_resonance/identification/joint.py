@@ -25,7 +25,7 @@ from tactile_resonance.identification.result import PolesBatch
 ComplexArray = npt.NDArray[np.complex128]
 
 # Points whose arrays fit the cache.
-CHUNK = 500
+CHUNK = 250
 METHOD = "joint maximum likelihood of poles and transient"
 
 

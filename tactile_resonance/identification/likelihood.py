@@ -290,7 +290,12 @@ def _set(row, value, rows):
 
 @njit(**OPTIONS)
 def _fill(values, block, row, count, rows):
-    """Rows from values (blocks, count, BLOCK), or (1, count, 1) for all bins, or 0 from none."""
+    """Rows from values (blocks, count, BLOCK), or (1, count, 1) for all bins, or 0 from none.
+
+    What is the same for all bins stays from the first block on.
+    """
+    if block > 0 and (values.shape[0] == 0 or values.shape[2] == 1):
+        return
     for i in range(count):
         if values.shape[0] == 0:
             _set(row + i, 0.0, rows)
@@ -458,7 +463,8 @@ def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, err
     variance = of_bins[point, min(m, of_bins.shape[1] - 1)]
     of_input = variance_u[point, min(m, variance_u.shape[1] - 1)]
     covariance = covariance_yu[point, min(m, covariance_yu.shape[1] - 1)]
-    gram[:] = 0.0
+    for i in range(gram.size):
+        gram[i] = 0.0
     cost = 0.0
     before = y.shape[2] - last.shape[0] if driven else 0
     for block in range(last.shape[0]):
@@ -495,7 +501,7 @@ def _gram(tables, data, point, theta, kind, memory, gram, cost):
     Theta (M, n + 1) and these in the order C, A, B: what records do not share comes first; theta ends with
     1. Costs (2,) of the point are written too.
     """
-    cost[:] = 0.0
+    cost[0] = cost[1] = 0.0
     undriven, driven, none, sums = tables.undriven, tables.driven, memory[2], memory[3]
     block = memory[:2]
     for m in range(theta.shape[0]):
@@ -528,7 +534,9 @@ def _solve(gram, c, n, damping, work, total, step):
         Out.
     """
     records, shared, width = gram.shape[0], n - c, n + 1
-    total[:] = 0.0
+    for i in range(shared):
+        for j in range(shared + 1):
+            total[i, j] = 0.0
     more = 1 + 1e-15 + damping
     for m in range(records):
         matrix, first, second = work[m], gram[m, 0], gram[m, 1]
