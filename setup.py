@@ -61,7 +61,7 @@ setup(
     install_requires=[
         "numpy>=1.24,<3",
         "scipy>=1.10,<2",
-        "numba>=0.58,<0.70",  # Ubuntu 24.04 has 0.58.1, Debian 13 has 0.61.2
+        "numba>=0.56.4,<0.70",  # from that of Debian 12 on
         "matplotlib>=3.6,<4",
         "PyYAML>=6,<7",
         "tqdm>=4.60,<5",
