@@ -61,6 +61,7 @@ setup(
     install_requires=[
         "numpy>=1.24,<3",
         "scipy>=1.10,<2",
+        "numba>=0.56.4,<0.70",  # from that of Debian 12 on
         "matplotlib>=3.6,<4",
         "PyYAML>=6,<7",
         "tqdm>=4.60,<5",
@@ -68,7 +69,6 @@ setup(
     # what drives hardware is installed by those who have it
     extras_require={
         "nidaqmx": ["nidaqmx>=1.0,<2"],
-        "compiled": ["numba>=0.68.1,<0.69"],
         "robot": ["ur-rtde>=1.6.5,<1.7"],
         "can": ["python-can>=4.5,<5"],
         "mesh": ["trimesh>=4.5,<6"],

@@ -25,7 +25,6 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
 from tactile_resonance.identification.identify import identify_batch, identify_poles
 from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.result import PolesBatch
 from tactile_resonance.identification.structure import ModelStructure
 
@@ -128,25 +127,20 @@ def compare_methods(quick: bool) -> list[Method]:
     batch = _repeated(frf, times)
     many_u, many_y = (np.tile(values, (times, 1)) for values in (joint_u, joint_y))
     for structure, model in ((BARE, "2nd order"), (ModelStructure(), "mode + 6 residual terms")):
-        for kind, name in ((JointPlan, "joint"), (CompiledJointPlan, "joint compiled")):
-            try:
-                plan = joint_plan(plant, structure, kind)
-            except ImportError as error:
-                missing.append(_missing(f"{name}, {model}", error))
-                continue
-            contestants += [
-                Contestant(
-                    f"{name}, {model}, batched",
-                    lambda p=plan: p.from_bins(many_u, many_y),
-                    len(many_y),
-                    lambda result: estimates_of(result)[:runs],
-                ),
-                Contestant(
-                    f"{name}, {model}, single",
-                    lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)],
-                    50,
-                ),
-            ]
+        plan = joint_plan(plant, structure)
+        contestants += [
+            Contestant(
+                f"joint, {model}, batched",
+                lambda p=plan: p.from_bins(many_u, many_y),
+                len(many_y),
+                lambda result: estimates_of(result)[:runs],
+            ),
+            Contestant(
+                f"joint, {model}, single",
+                lambda p=plan: [p.from_bins(joint_u[k], joint_y[k]) for k in range(50)],
+                50,
+            ),
+        ]
         contestants += [
             Contestant(
                 f"FRF, {model}, batched",
@@ -160,19 +154,6 @@ def compare_methods(quick: bool) -> list[Method]:
                 50,
             ),
         ]
-        try:
-            identify_batch(batch, structure=structure, compiled=True)
-        except ImportError as error:
-            missing.append(_missing(f"FRF compiled, {model}", error))
-            continue
-        contestants.append(
-            Contestant(
-                f"FRF compiled, {model}, batched",
-                lambda s=structure: identify_batch(batch, structure=s, compiled=True),
-                batch.g.shape[0],
-                lambda result: estimates_of(result)[:runs],
-            )
-        )
     few = 40 if quick else 200
     wide_hz, wide_spectra, _, _ = local_polynomial_spectra(
         plant, u[:few], y[:few], wide, (20.0, 1000.0)

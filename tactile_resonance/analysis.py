@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -228,27 +226,6 @@ def _distortion(distortion: Distortion | None) -> dict | None:
         }
         for name, lines in (("even", distortion.even), ("odd", distortion.odd))
     }
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        If something other than a regular file stands there: a device would be replaced.
-    """
-    if path.exists() and not path.is_file():
-        raise ValueError(f"output: {path} is no regular file, expected a new one or one to replace")
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _list(array: npt.NDArray[np.floating] | None) -> list | None:

@@ -31,6 +31,7 @@ TOOLS = ROOT / "tools"
 THIS_PYTHON = f"{sys.version.split()[0]} {sys.executable}"
 PACKAGES_STAMP = packages.VENV / ".stamp.json"
 BUILD_STAMP = build.INSTALL / ".stamp.json"
+FITS_STAMP = build.INSTALL / ".fits.json"
 
 
 def main() -> int:
@@ -64,8 +65,12 @@ def set_up() -> None:
     if not packages_fit:
         packages_key["python"] = THIS_PYTHON
     build_key = wanted_build(packages_key)
+    fits_key = wanted_fits(packages_key)
     built = read(BUILD_STAMP) if packages_fit and build.COLCON_BUILD.is_dir() else {}
     if built == build_key:
+        if read(FITS_STAMP) != fits_key:
+            build.compile_fits()
+            write(FITS_STAMP, fits_key)
         return
     build.check_tools()
     if not ros and (sys.platform, platform.machine()) != ("linux", "x86_64"):
@@ -77,6 +82,8 @@ def set_up() -> None:
     BUILD_STAMP.unlink(missing_ok=True)
     build.build(anew=built.get("base") != build_key["base"])
     write(BUILD_STAMP, build_key)
+    build.compile_fits()
+    write(FITS_STAMP, fits_key)
 
 
 def wanted_packages(ros: str | None) -> Stamp:
@@ -102,6 +109,16 @@ def wanted_build(packages_key: Stamp) -> Stamp:
     return {
         "base": digest([json.dumps(packages_key), *map(str, interfaces), recipe]),
         "update": digest([changing, *map(str, files(build.INSTALLED))]),
+    }
+
+
+def wanted_fits(packages_key: Stamp) -> Stamp:
+    """What numba's cache of the pole fits depends on: it looks at the place and date of the source."""
+    source = ROOT / build.FITS
+    return {
+        "packages": digest([json.dumps(packages_key)]),
+        "source": contents([source]),
+        "date": str(source.stat().st_mtime_ns),
     }
 
 

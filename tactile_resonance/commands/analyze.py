@@ -16,8 +16,8 @@ from tactile_resonance.analysis import (
     Analysis,
     analyse,
     analysis_as_json,
-    write_whole,
 )
+from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record
 from tactile_resonance.identification.order_choice import CANDIDATES

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tactile_resonance.analysis import write_whole
+from tactile_resonance.files import write_whole
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:

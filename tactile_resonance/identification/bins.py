@@ -1,198 +1,202 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bins of the band, what the model is made of on them, and the fit's normal equations.
+"""Bins of the band: what the model ``Y = (B U + C) / A`` is made of on them, and data there.
 
-The model on a bin is ``Y = (B U + C) / A``: A, B and C are polynomials with real coefficients over
-fixed bases, C the numerator of the transient. Bins come in groups: on excited ones there is an
-input, on the bins between harmonics of a periodic input only the transient. An FRF is one group
-with U = 1 and no C.
-
-The Jacobian of the weighted residual is a fixed basis times one complex weight per bin and kind of
-coefficient, so the normal matrices of a whole batch of points are matrix products of these weights
-with products of basis functions that are computed once.
+A, B and C are polynomials with real coefficients over fixed bases, C the numerator of the transient. On
+driven bins there is an input; bins between harmonics of a periodic input hold the transient and noise
+alone. An FRF has driven bins with U = 1 and no C.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from itertools import combinations_with_replacement
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from tactile_resonance.identification.likelihood import (
+    Arrays,
+    Tables,
+    compiled,
+    from_planes,
+    in_blocks,
+    planes,
+)
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class BinData:
-    """Data of a batch on the K bins of a group.
+class Problem:
+    """Basis functions on K bins, the undriven ones first.
 
     Attributes
     ----------
-    y : (batch, K) complex
-    u : (batch, K) complex or None
-        None stands for 1.
-    variance_y : (batch, K) or (batch, 1) float
-        Of y; infinite where the bin is to be left out.
-    variance_u : (batch, K) or (batch, 1) float or None
-        Of u, and with it ``covariance_yu = E dY conj(dU)`` of the same shape, complex.
-    covariance_yu : complex array or None
+    denominator : (K, a + 1) complex
+        The last coefficient of A is fixed at 1.
+    numerator : (K_driven, b) complex
+    transient : (K, c) complex
+        Of no terms where there is no transient.
     """
 
-    y: ComplexArray
-    u: ComplexArray | None
+    denominator: ComplexArray
+    numerator: ComplexArray
+    transient: ComplexArray
+
+    @classmethod
+    def of_lines(cls, denominator: ComplexArray, numerator: ComplexArray) -> Problem:
+        """Driven bins without transient."""
+        return cls(denominator, numerator, np.empty((denominator.shape[0], 0), complex))
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of free coefficients of A, B and C."""
+        a, b, c = (x.shape[1] for x in (self.denominator, self.numerator, self.transient))
+        return a - 1, b, c
+
+    @property
+    def undriven(self) -> int:
+        """Number of bins without input."""
+        return int(self.denominator.shape[0] - self.numerator.shape[0])
+
+    @cached_property
+    def tables(self) -> Tables:
+        """For `likelihood`."""
+        compiled()  # here and not in the first fit, whose time may matter
+        return Tables.of(self.denominator, self.numerator, self.transient)
+
+    @property
+    def from_driven(self) -> bool:
+        """Whether the driven bins hold equations enough for start values.
+
+        Of a record of many periods they are a small part of all bins, and the one that tells most.
+        """
+        return self.undriven > 0 and self.numerator.shape[0] >= sum(self.sizes)
+
+    def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coefficients of A (with its last), B and C, each (..., terms), of theta (..., n)."""
+        a, b, _ = self.sizes
+        one = np.ones((*theta.shape[:-1], 1))
+        return (
+            np.concatenate([theta[..., :a], one], axis=-1),
+            np.ascontiguousarray(theta[..., a : a + b]),
+            np.ascontiguousarray(theta[..., a + b :]),
+        )
+
+    def response(self, theta: FloatArray) -> ComplexArray:
+        """(batch, K_driven) B / A of coefficients (batch, n)."""
+        alpha, beta, _ = self.split(theta)
+        return np.asarray(beta @ self.numerator.T / (alpha @ self.denominator[self.undriven :].T))
+
+
+ARRAYS = ("y_planes", "u_planes", "variance_y", "variance_u", "covariance_yu", "rest")
+
+
+@dataclass(frozen=True, eq=False)
+class BinData:
+    """Data of points on the bins of a `Problem`, of M records each.
+
+    Attributes
+    ----------
+    y_planes, u_planes : float arrays
+        Of Y and U in the blocks of `likelihood.planes`; on undriven bins U is what is seen of noise.
+    undriven, driven : int
+        Numbers of bins.
+    variance_y : (points, M or 1, K_driven or 1) float
+        Of Y on driven bins; infinite where a bin is to be left out.
+    variance_u, covariance_yu : same shape, or None
+        Of U, and ``E dY conj(dU)``.
+    rest : (points, M or 1, K_undriven or 1) float or None
+        Variance of Y on undriven bins.
+    """
+
+    y_planes: FloatArray
+    u_planes: FloatArray
+    undriven: int
+    driven: int
     variance_y: FloatArray
     variance_u: FloatArray | None = None
     covariance_yu: ComplexArray | None = None
+    rest: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        y: npt.NDArray,
+        u: npt.NDArray,
+        undriven: int,
+        *variances: Any,
+        order: npt.NDArray[np.int64] | None = None,
+    ) -> BinData:
+        """Data (points, M, K), of which the undriven bins come first, or do in `order`."""
+        order = np.arange(y.shape[-1]) if order is None else order
+        of_y, of_u = (planes(np.asarray(x, complex), order, undriven) for x in (y, u))
+        return cls(of_y, of_u, undriven, order.size - undriven, *variances)
+
+    @property
+    def y(self) -> ComplexArray:
+        """(points, M, K) the undriven bins first."""
+        return from_planes(self.y_planes, self.undriven, self.driven)
+
+    @property
+    def u(self) -> ComplexArray:
+        """(points, M, K)."""
+        return from_planes(self.u_planes, self.undriven, self.driven)
+
+    @property
+    def records(self) -> int:
+        """M."""
+        return self.y_planes.shape[1]
+
+    @property
+    def y_driven(self) -> ComplexArray:
+        """(points, M, K_driven) on driven bins."""
+        return self.y[..., self.undriven :]
+
+    @property
+    def u_driven(self) -> ComplexArray:
+        """(points, M, K_driven)."""
+        return self.u[..., self.undriven :]
+
+    @cached_property
+    def arrays(self) -> Arrays:
+        """For `likelihood`."""
+        covariance = self.covariance_yu
+        parts = [] if covariance is None else [covariance.real, covariance.imag]
+        return Arrays(
+            self.y_planes,
+            self.u_planes,
+            in_blocks([np.ones((len(self.y_planes), 1, 1)) if self.rest is None else self.rest]),
+            in_blocks([self.variance_y]),
+            in_blocks([] if self.variance_u is None else [self.variance_u], len(self.y_planes)),
+            in_blocks(parts, len(self.y_planes)),
+        )
 
     def rows(self, which: slice | npt.NDArray) -> BinData:
-        """The data of some points of the batch."""
+        """The data of some points."""
 
         def cut(array):
             return None if array is None else array[which]
 
-        return BinData(
-            self.y[which],
-            cut(self.u),
-            self.variance_y[which],
-            cut(self.variance_u),
-            cut(self.covariance_yu),
-        )
+        values = {name: cut(getattr(self, name)) for name in ARRAYS}
+        return replace(self, **values)
 
-    def turned(self, error: ComplexArray) -> ComplexArray:
-        """(batch, K) errors of y turned by the phase of u.
+    def part(self, which: slice) -> BinData:
+        """Some of the records."""
+        values: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
+        for name, array in values.items():
+            if array is not None and array.shape[1] == self.records:
+                values[name] = np.ascontiguousarray(array[:, which])
+        return replace(self, **values)
 
-        Errors of a response are smooth over lines; those of y are so only after this, for the phases
-        of the excitation are random.
-        """
-        if self.u is None:
-            return error
-        size = np.abs(self.u)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return error * np.where(size > 0, self.u.conj() / size, 1.0)
-
-    def residual_variance(self, g: ComplexArray | None) -> FloatArray:
-        """(batch, K or 1) variance of ``y - g u`` for a response g (batch, K)."""
-        if self.variance_u is None or g is None:
+    def residual_variance(self, g: ComplexArray) -> FloatArray:
+        """(points, M or 1, K_driven or 1) variance of ``y - g u`` for a response g (points, K_driven)."""
+        g = g[:, None]
+        if self.variance_u is None:
             return self.variance_y
         variance = self.variance_y + self.variance_u * (g.real**2 + g.imag**2)
         if self.covariance_yu is not None:
             variance = variance - 2 * np.real(self.covariance_yu * np.conj(g))
         return variance
-
-
-@dataclass(frozen=True, eq=False)
-class BinGroup:
-    """Basis functions on the K bins of a group.
-
-    Parameters
-    ----------
-    denominator : (K, n + 1) complex
-        The last coefficient of A is fixed at 1.
-    numerator : (K, m + 1) complex or None
-    transient : (K, t) complex or None
-    """
-
-    denominator: ComplexArray
-    numerator: ComplexArray | None = None
-    transient: ComplexArray | None = None
-    _evaluation: list[FloatArray | None] = field(init=False, repr=False)
-    _gradient: list[FloatArray | None] = field(init=False, repr=False)
-    _products: list[tuple[int, int, slice, FloatArray]] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        blocks = [self.denominator[:, :-1], self.numerator, self.transient]
-        evaluation = [_rows(b) for b in (self.denominator, self.numerator, self.transient)]
-        gradient = [None if b is None else _columns(b) for b in blocks]
-        products = []
-        first_entry = 0
-        for i, j in combinations_with_replacement(range(3), 2):
-            first, second = blocks[i], blocks[j]
-            if first is None or second is None:
-                continue
-            product = first.conj()[:, :, None] * second[:, None, :]  # (K, n_i, n_j)
-            if i == j:
-                row, column = np.triu_indices(first.shape[1])
-                constant = np.ascontiguousarray(product[:, row, column].real)
-            else:
-                constant = _columns(product.reshape(product.shape[0], -1))
-            entries = slice(first_entry, first_entry + constant.shape[1])
-            first_entry = entries.stop
-            products.append((i, j, entries, constant))
-        object.__setattr__(self, "_evaluation", evaluation)
-        object.__setattr__(self, "_gradient", gradient)
-        object.__setattr__(self, "_products", products)
-
-    def places(self, sizes: tuple[int, int, int]) -> npt.NDArray[np.int64]:
-        """(n, n) which entry of `normal_entries` stands where among all coefficients."""
-        offset = np.cumsum([0, *sizes])
-        total = self._products[-1][2].stop
-        places = np.full((offset[3], offset[3]), total)  # the last entry is 0
-        for i, j, entries, _ in self._products:
-            index = np.arange(entries.start, entries.stop)
-            if i == j:
-                row, column = np.triu_indices(sizes[i])
-            else:
-                row, column = (k.ravel() for k in np.indices((sizes[i], sizes[j])))
-            places[row + offset[i], column + offset[j]] = index
-            places[column + offset[j], row + offset[i]] = index
-        return places
-
-    @property
-    def size(self) -> int:
-        """Number of bins K."""
-        return self.denominator.shape[0]
-
-    def evaluate(self, which: int, coefficients: FloatArray) -> ComplexArray:
-        """(batch, K) values of A (0), B (1) or C (2) for coefficients (batch, terms)."""
-        constant = self._evaluation[which]
-        assert constant is not None
-        return (coefficients @ constant).view(complex)
-
-    def gradient(self, which: int, weight: ComplexArray) -> FloatArray:
-        """(batch, terms) ``Re sum_k weight_k basis_k``."""
-        constant = self._gradient[which]
-        assert constant is not None
-        return np.ascontiguousarray(weight).view(float) @ constant
-
-    def normal_entries(self, m: FloatArray, y: ComplexArray, u: ComplexArray | None) -> FloatArray:
-        """(batch, entries + 1) distinct entries of ``Re J^H J``, and a zero.
-
-        J has columns ``y p``, ``-u q`` and ``-t``, each times a root of the real weight `m` (batch,
-        K).
-        """
-        result = np.empty((m.shape[0], self._products[-1][2].stop + 1))
-        result[:, -1] = 0.0
-        my = np.conj(y) * -m
-        for i, j, entries, constant in self._products:
-            weight: npt.NDArray
-            if (i, j) == (0, 0):
-                weight = -(y.real * my.real - y.imag * my.imag)
-            elif (i, j) == (0, 1):
-                weight = my if u is None else my * u
-            elif (i, j) == (0, 2):
-                weight = my
-            elif (i, j) == (1, 1):
-                weight = m if u is None else m * _abs2(u)
-            elif (i, j) == (1, 2):
-                weight = m.astype(complex) if u is None else m * np.conj(u)
-            else:
-                weight = m
-            if i != j:
-                weight = np.ascontiguousarray(weight).view(float)
-            np.matmul(weight, constant, out=result[:, entries])
-        return result
-
-
-def _abs2(x: ComplexArray) -> FloatArray:
-    return x.real**2 + x.imag**2
-
-
-def _rows(basis: ComplexArray | None) -> FloatArray | None:
-    """(terms, 2 K) float: real coefficients times this are complex values."""
-    return None if basis is None else np.ascontiguousarray(basis.T).view(float)
-
-
-def _columns(basis: ComplexArray) -> FloatArray:
-    """(2 K, terms) float: complex weights as floats times this are ``Re sum weight basis``."""
-    return np.ascontiguousarray(np.ascontiguousarray(basis.conj().T).view(float).T)

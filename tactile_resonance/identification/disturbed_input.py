@@ -46,7 +46,8 @@ def poles_with_all_bins(
         At its bins; of M realisations for a plan of these.
     batch : PolesBatch
         Its fit to the excited lines, shape (). A model error found on these by cost or whiteness stays:
-        bins that noise alone moves have found it. A disturbance looks like terms that the model lacks.
+        bins that noise alone moves have found it. Unless it took the disturbance for noise: a fit to all
+        bins then leaves next to nothing of that. A disturbance looks like terms that the model lacks.
 
     Returns
     -------
@@ -54,13 +55,15 @@ def poles_with_all_bins(
         None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`.
     """
     wrong = batch.status() is PolesStatus.MODEL_ERROR and not np.isfinite(batch.lacking[0])
-    if wrong or batch.status() is PolesStatus.TOO_FEW_LINES or not _disturbed(plan, u):
+    if batch.status() is PolesStatus.TOO_FEW_LINES or not _disturbed(plan, u):
         return None
     ratio = 0.0
     of_all = _with_all_bins(plan, u, y, ratio)
     for _ in range(FITS - 1):
         ratio = _input_noise_ratio(plan, of_all, ratio)
         of_all = _with_all_bins(plan, u, y, ratio)
+    if wrong and not of_all.noise_variance[0] * EXPLAINED < batch.noise_variance[0]:
+        return None
     explained = _explained(plan, of_all, u)
     better = of_all.status() is PolesStatus.OK or (
         of_all.status() is PolesStatus.MODEL_ERROR and batch.status() is not PolesStatus.OK

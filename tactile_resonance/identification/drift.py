@@ -23,10 +23,12 @@ from scipy import special
 
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.covariance import f0_damping_covariance, real_covariance
+from tactile_resonance.identification.fit import Linearised
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_fit import ROUNDED
 from tactile_resonance.identification.joint_noise import rough_noise
 from tactile_resonance.identification.joint_weights import noise_of, weighted
+from tactile_resonance.identification.likelihood import moments
 from tactile_resonance.identification.result import (
     Poles,
     PolesBatch,
@@ -188,11 +190,8 @@ class DriftingModes:
         a, b, _ = plan.problem.sizes
         alpha = np.append(theta[:a], 1.0)
         decay = np.zeros(self._s.size, complex)
-        for group, where in zip(
-            plan.problem.groups, (plan.others_at, plan.excited_at), strict=True
-        ):
-            free = np.asarray(group.transient) @ theta[a + b :]
-            decay[where] = free / (group.denominator @ alpha)
+        problem = plan.problem
+        decay[plan.order] = problem.transient @ theta[a + b :] / (problem.denominator @ alpha)
         return decay
 
     def _times(self, degree: int) -> ComplexArray:
@@ -225,40 +224,34 @@ def _linearised(
     """
     plan, u, theta = modes.plan, modes.u, modes.theta
     directions = np.concatenate([modes.directions(row) for row in rows])
-    u_o, u_e = u[None, plan.others_at], u[None, plan.excited_at]
-    one = np.ones((1, 1))
-    data = [
-        BinData(y[None, plan.others_at], None, one),
-        BinData(y[None, plan.excited_at], u_e, one),
-    ]
-    point = plan.problem.one_point(data)
-    value = point.evaluate(theta)
-    error = value.error_of(0)
+    others, one = plan.other_bins.size, np.ones((1, 1, 1))
+    data = BinData.of(y[None, None], u[None, None], others, one, None, None, one, order=plan.order)
     if flat:
-        variance_y, variance_u = rough_noise(error, u_o)
-        data = [replace(values, variance_y=variance_y) for values in data]
-        data[1] = replace(data[1], variance_u=variance_u)
+        error = Linearised.of(plan.problem, data, theta).error[:, :others]
+        variance_y, variance_u = (v[:, None] for v in rough_noise(error, data.u[0, :, :others]))
+        data = replace(data, rest=variance_y, variance_y=variance_y, variance_u=variance_u)
     else:
-        noise = noise_of(plan, error, theta[None], u_o, plan.noise_bands)
+        noise = noise_of(plan, data, theta[None, None], plan.noise_bands)
         data = weighted(data, noise, plan.noise_bands)
-    point = plan.problem.one_point(data)
-    value = point.weight(point.evaluate(theta))
-    gradient, normals = point.normals(value)
-    own = point.jacobian(value)
-    where = np.concatenate([plan.others_at, plan.excited_at])
-    more = np.ascontiguousarray(-directions[:, where] * value.root).view(float)
+    costs, gradients, normals = moments(plan.problem.tables, data.arrays, theta[None, None])
+    cost, gradient = float(costs.sum()), gradients[0, 0]
+    at = Linearised.of(plan.problem, data, theta)
+    root = 1 / np.sqrt(at.variance[0])
+    own = np.ascontiguousarray(-(at.slope[0] * root[:, None]).T).view(float)  # (n, 2 K)
+    residual = np.ascontiguousarray(at.residual[0]).view(float)
+    more = np.ascontiguousarray(-directions[:, plan.order] * root).view(float)
     crossed = own @ more.T  # (n, c)
     try:
-        coefficients = np.linalg.inv(normals.sum(axis=0)) @ crossed
+        coefficients = np.linalg.inv(normals[0, 0].sum(axis=0)) @ crossed
         left = np.linalg.inv(more @ more.T - crossed.T @ coefficients)
     except np.linalg.LinAlgError:
         return None
-    score = more @ value.weighted.view(float) - coefficients.T @ gradient
+    score = more @ residual - coefficients.T @ gradient
     step = -left @ score
     count = len(step)
     dof = plan.bins.size - (theta.size + count) / 2
-    fall = min(float(-score @ step) / value.cost, 1.0)
-    level = value.cost * (1 - fall) / dof
+    fall = min(float(-score @ step) / cost, 1.0)
+    level = cost * (1 - fall) / dof
     return _Step(step, left, coefficients, level, dof)
 
 

@@ -15,7 +15,6 @@ from tactile_resonance.identification.inputs import checked_band, checked_frf, c
 from tactile_resonance.identification.judgement import Evidence, assemble
 from tactile_resonance.identification.line_tones import poles_without_tones
 from tactile_resonance.identification.line_weights import lines_of_frf, lines_of_spectra
-from tactile_resonance.identification.lines_compiled import fit_compiled
 from tactile_resonance.identification.lines_fit import LinesFit, LinesPlan
 from tactile_resonance.identification.model_error import (
     MODEL_ERROR_PROBABILITY,
@@ -91,8 +90,6 @@ def identify_batch(
     frf: FRF,
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
-    *,
-    compiled: bool = False,
 ) -> PolesBatch:
     """As `identify_poles` for FRFs of many points on the same lines.
 
@@ -102,8 +99,6 @@ def identify_batch(
         With (..., F) arrays; a variance (F,) is that of all points. Lines whose variance is not
         above 0 are left out; a point without any variance above 0 is fitted as one without
         variance.
-    compiled : bool
-        One mode through numba (extra ``compiled``): the same answers in less time.
 
     Returns
     -------
@@ -112,8 +107,6 @@ def identify_batch(
 
     Raises
     ------
-    ImportError
-        If `compiled`, without numba.
     ValueError
         If shapes, lines or band are none: names the field, its value, and what is accepted.
     """
@@ -134,7 +127,6 @@ def identify_batch(
         level_known=lines.level_known,
         noise=lines.noise,
         total_known=selected.variance_total is not None,
-        compiled=compiled,
     )
 
 
@@ -211,7 +203,6 @@ def _identify(
     level_known: npt.NDArray[np.bool_],
     noise: FloatArray | None = None,
     total_known: bool = False,
-    compiled: bool = False,
 ) -> PolesBatch:
     lines = usable.sum(axis=-1)
     batch = lines.size
@@ -223,7 +214,7 @@ def _identify(
         nothing = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure)
         return assemble(Evidence.empty(nothing, lines), structure, band_hz, shape, method)
     plan = LinesPlan.on_lines(frequency_hz, structure)
-    fit = fit_compiled(plan, data) if compiled else plan.fit(data)
+    fit = plan.fit(data)
     weighted = fit.covariance * known.information_correction[:, None, None]
     covariance = weighted if noise is None else _propagated(plan, fit, data, noise)
     cost, expected = fit.cost, known.expected_cost(parameters)
@@ -289,8 +280,8 @@ def _systematic(
 def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
     """Covariance (batch, n, n) from a variance (batch, F) other than the one weighted with."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        finite = np.isfinite(data.variance_y)
-        changed = BinData(data.y, None, np.where(finite, data.variance_y**2 / noise, np.inf))
+        finite, weighted = np.isfinite(data.variance_y), data.variance_y**2 / noise[:, None]
+        changed = replace(data, variance_y=np.where(finite, weighted, np.inf))
     inner = plan.weighted_normal(changed, plan.theta(fit.model))
     n = inner.shape[-1]
     inverse = 2 * fit.covariance[:, :n, :n]

@@ -24,6 +24,8 @@ from tactile_resonance.identification.result import PolesBatch
 
 ComplexArray = npt.NDArray[np.complex128]
 
+# Points whose arrays fit the cache.
+CHUNK = 250
 METHOD = "joint maximum likelihood of poles and transient"
 
 
@@ -82,9 +84,8 @@ class JointPlan(JointLayout):
         u, y = self._checked(u, y)
         shape = y.shape[:-1]
         flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
-        chunk = self.problem.chunk_of(flat_u.shape[0])
-        starts = range(0, max(flat_u.shape[0], 1), chunk)
-        parts = [fit_bins(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts]
+        starts = range(0, max(flat_u.shape[0], 1), CHUNK)
+        parts = [fit_bins(self, flat_u[k : k + CHUNK], flat_y[k : k + CHUNK]) for k in starts]
         return result_of(self, JointFit.joined(parts), shape, METHOD, self.level_known)
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:

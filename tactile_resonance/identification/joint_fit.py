@@ -10,16 +10,15 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.covariance import invert_normal
-from tactile_resonance.identification.dense import refit_failed
+from tactile_resonance.identification.fit import Solution, minimise, refit_failed
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_model_error import systematic_of
 from tactile_resonance.identification.joint_noise import BINS_PER_BAND, JointNoise
-from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
+from tactile_resonance.identification.joint_weights import begin, noise_of, weighted
 from tactile_resonance.identification.lacking import asks, lacking_terms
+from tactile_resonance.identification.likelihood import invert
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import KINDS, f_quantile
-from tactile_resonance.identification.solver import Solution, minimise, refine
 from tactile_resonance.identification.whiteness import are_smooth
 
 BoolArray = npt.NDArray[np.bool_]
@@ -148,7 +147,8 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
 
 def _may_return(fit: JointFit | Solution) -> BoolArray:
     """(batch,) whether a fit ended where another one may begin."""
-    return np.asarray(fit.converged & np.isfinite(fit.theta).all(axis=-1))
+    finite = np.isfinite(fit.theta).all(axis=tuple(range(1, fit.theta.ndim)))
+    return np.asarray(fit.converged & finite)
 
 
 def _fit(
@@ -160,63 +160,55 @@ def _fit(
     usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
     if not usable.all():
         u, y = (np.where(usable[:, None], v, 0) for v in (u, y))
-    u_e, y_e = u.take(layout.excited_at, axis=1), y.take(layout.excited_at, axis=1)
-    one = np.ones((batch, 1))
-    problem = layout.problem
-    if layout.other_bins.size == 0:
+    undriven, problem = layout.other_bins.size, layout.problem
+    u, y = u[:, None], y[:, None]  # of one record
+    one = np.ones((batch, 1, 1))
+    if undriven == 0:
         kind = np.full(batch, "flat", "U8")
         ratio = layout.input_noise_ratio or 0.0
-        data = [BinData(y_e, u_e, one, ratio * one if ratio else None, None)]
+        data = BinData.of(y, u, 0, one, ratio * one if ratio else None, order=layout.order)
         solution = minimise(problem, data)
     else:
-        u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
-        data = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
-        points = problem.points(data)
+        data = BinData.of(y, u, undriven, one, None, None, one, order=layout.order)
         if start is None:
-            theta = step_near(points, problem.start(points, data), data, u_o)
-            value = points.evaluate(theta)
+            theta, noise = begin(layout, data, layout.noise_bands)
         else:
-            theta = start
-            value = points.evaluate(theta if batch > 1 else theta[0])
-        theta = theta.reshape(batch, theta.shape[-1])
-        noise = noise_of(layout, value.error_of(0), theta, u_o, layout.noise_bands)
+            theta = start[:, None]
+            noise = noise_of(layout, data, theta, layout.noise_bands)
         kind, data = noise.kind, weighted(data, noise, layout.noise_bands)
-        if noise.through_input is None:
-            points.weigh(data)
-            solution = refine(points, theta, value)
-        else:
-            solution = minimise(problem, data, theta)
+        solution = minimise(problem, data, theta)
     solution = refit_failed(problem, solution, data)
-    inverse, condition = invert_normal(solution.normal.sum(axis=1))
-    if layout.other_bins.size == 0:
+    theta = solution.theta[:, 0]
+    inverse, condition = invert(solution.normal[:, 0].sum(axis=1))
+    if undriven == 0:
         level = _level_from_residuals(layout, solution)
     else:
         level = _level_from_others(layout, solution, inverse, noise)
-    residual = data[-1].turned(solution.residual) / np.sqrt(level.scale)[:, None]
+    residual = solution.residual[:, 0] / np.sqrt(level.scale)[:, None]
     suspect = are_smooth(residual, layout.structure.parameters) | level.suspect
     lacking = np.full((batch, 3), np.nan)
     asked = suspect | (batch == 1) | asks(layout, level.cost, level.expected, residual)
     asked = np.flatnonzero(asked & _may_return(solution))
     if asked.size:
-        part = [values.rows(asked) for values in data]
-        lacking[asked] = lacking_terms(layout, part, solution.theta[asked], inverse[asked])
+        lacking[asked] = lacking_terms(layout, data.rows(asked), theta[asked], inverse[asked])
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
-        suspect &= level.scale * data[-1].variance_y.min(axis=-1) > ROUNDED * mean_power(y_e)
+        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * mean_power(
+            data.y_driven[:, 0]
+        )
         lacking[~suspect] = np.nan
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     wrong = suspect
     if start is None and layout.other_bins.size > 0:  # others are fitted once more
         wrong = suspect & ~_may_return(solution)
     if wrong.any():
-        part = [values.rows(wrong) for values in data]
-        systematic[wrong] = systematic_of(layout, part, solution.theta[wrong])
+        systematic[wrong] = systematic_of(layout, data.rows(wrong), solution.theta[wrong])
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
     unknown = np.full_like(covariance, np.nan)
     known = layout.level_known
     return JointFit(
-        theta=solution.theta,
+        theta=theta,
         covariance=covariance if known else unknown,
         total=unknown if known else covariance,
         condition=condition,
@@ -258,13 +250,13 @@ def _level_from_others(
     noise: JointNoise,
 ) -> _Level:
     """The bins between harmonics tell the level, the excited ones whether the model holds."""
-    n = solution.theta.shape[-1]
+    n = inverse.shape[-1]
     # leverage of the others
-    used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0])
+    used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0, 0])
     dof_o = layout.other_bins.size - used / 2
     dof_e = layout.excited_bins.size - (n - used) / 2
-    level = solution.group_cost[:, 0] / dof_o
-    cost = solution.group_cost[:, 1] / level
+    level = solution.part_cost[:, 0] / dof_o
+    cost = solution.part_cost[:, 1] / level
     expected = dof_e * dof_o / (dof_o - 1)
     limit = dof_e * f_quantile(1 - MODEL_ERROR_PROBABILITY, 2 * dof_e, 2 * dof_o)
     pieces = noise.kind == "per line"
@@ -280,7 +272,7 @@ def _level_from_others(
     correction = student_variance(dof)
     if pieces.any():  # as `VarianceModel.information_correction` line by line
         correction = np.where(pieces, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
-    pooled = solution.group_cost.sum(axis=-1) / dof
+    pooled = solution.part_cost.sum(axis=-1) / dof
     return _Level(
         np.where(suspect, level, pooled),
         cost,

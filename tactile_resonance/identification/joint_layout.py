@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.basis import PolynomialBasis
-from tactile_resonance.identification.bins import BinGroup
+from tactile_resonance.identification.bins import Problem
 from tactile_resonance.identification.covariance import modes_in_band
 from tactile_resonance.identification.joint_noise import NoiseBands
 from tactile_resonance.identification.joint_transient import (
@@ -21,7 +21,6 @@ from tactile_resonance.identification.joint_transient import (
 from tactile_resonance.identification.lacking import Directions
 from tactile_resonance.identification.model import RationalModel, Variable
 from tactile_resonance.identification.model_error import richer
-from tactile_resonance.identification.problem import Problem
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -121,15 +120,14 @@ class JointLayout:
         transient = transient_basis(
             frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
         )
-        groups = [BinGroup(denominator.values[excited], numerator.values, transient[excited])]
-        if others.any():
-            groups.insert(0, BinGroup(denominator.values[others], None, transient[others]))
+        order = np.append(np.flatnonzero(others), np.flatnonzero(excited))
+        problem = Problem(denominator.values[order], numerator.values, transient[order])
         fields = {
             "transient_terms": terms,
             "bins": bins,
             "excited_bins": bins[excited],
             "other_bins": bins[others],
-            "problem": Problem(tuple(groups)),
+            "problem": problem,
             "variable": variable,
             "denominator_basis": denominator,
             "numerator_basis": numerator,
@@ -138,6 +136,11 @@ class JointLayout:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    @cached_property
+    def order(self) -> IntArray:
+        """Places of the bins of `problem` among all: the others first, then the excited ones."""
+        return np.append(self.others_at, self.excited_at)
 
     @cached_property
     def excited_at(self) -> IntArray:

@@ -38,6 +38,8 @@ class NoiseBands:
         First of the values on other bins in each piece.
     counts : (pieces,) int
         Values in each.
+    size : int
+        Bins of a piece.
     dof : int
         Complex degrees of freedom of the variance of a piece.
     """
@@ -46,6 +48,7 @@ class NoiseBands:
     of_excited: IntArray
     starts: IntArray
     counts: IntArray
+    size: int
     dof: int
 
     @classmethod
@@ -65,7 +68,7 @@ class NoiseBands:
         of_others = np.minimum(np.arange(others.size) // size, pieces - 1)
         of_excited = np.minimum(np.searchsorted(others, excited) // size, pieces - 1)
         counts = np.diff(np.append(starts, others.size * records))
-        return cls(of_others, of_excited, starts, counts, size * records)
+        return cls(of_others, of_excited, starts, counts, size, size * records)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +105,8 @@ class JointNoise:
 
 
 def noise_between_harmonics(
-    error: ComplexArray,
-    u: ComplexArray,
-    response: Callable[[], ComplexArray],
+    powers: FloatArray,
+    signals: Callable[[], tuple[ComplexArray, ComplexArray, ComplexArray]],
     bands: NoiseBands,
     terms: int,
 ) -> JointNoise:
@@ -112,10 +114,11 @@ def noise_between_harmonics(
 
     Parameters
     ----------
-    error, u : (batch, K_o) complex
-        Y without its transient, and U, between harmonics of the excitation.
-    response : callable
-        (batch, K_o) response there, from a first fit; asked for only where the channels are alike.
+    powers : (batch, 4, pieces) float
+        Of Y without its transient, and of U, see `likelihood.undriven_powers`.
+    signals : callable
+        These two and the response there from a first fit, (batch, K_o) each; asked for only where the
+        channels are alike.
     bands : NoiseBands
     terms : int
         Real coefficients that the transient has taken from `error`.
@@ -127,24 +130,26 @@ def noise_between_harmonics(
     measurement noise) or into both channels alike; the first is taken where it explains some of Y and
     the second not much more.
     """
-    size = error.shape[1]
+    size = int(bands.counts.sum())
     dof = max(size - terms / 2, 1.0)
     through = covariance = None
-    power_error, power_u, cross, correlated = _powers(error, u)
+    of_error, of_u = powers[:, 0], powers[:, 1]
+    power_error, power_u, re, im = (powers[:, k].sum(axis=-1, keepdims=True) for k in range(4))
+    # how far both channels have anything in common
+    squared = (re**2 + im**2) / np.maximum(power_error * power_u, TINY)
+    correlated = squared > correlation_limit(size)
+    power_error, power_u = power_error / size, power_u / size
     if not correlated.any():
-        if _are_flat(np.concatenate([error, u]), bands):
-            total_power, input_power = power_error * (size / dof), power_u
-            kind = np.full(error.shape[0], KINDS[0], NAMES.dtype)
-        else:
-            total_power, kind_y = _pieces(error, power_error, bands, size / dof)
-            input_power, kind_u = _pieces(u, power_u, bands, 1.0)
-            kind = NAMES[np.maximum(kind_y, kind_u)]
+        total_power, kind_y = _pieces(of_error, power_error, bands, size / dof)
+        input_power, kind_u = _pieces(of_u, power_u, bands, 1.0)
+        kind = NAMES[np.maximum(kind_y, kind_u)]
         variance_y = np.where(total_power > TINY, total_power, 1.0)  # no noise: any weights do
         means = [power_error * (size / dof), input_power.mean(-1, keepdims=True)]
         return JointNoise(
             variance_y, input_power, variance_y, None, None, np.concatenate(means, -1), kind
         )
-    by_g = response() * u
+    error, u, response = signals()
+    by_g, cross = response * u, (re + 1j * im) / size
     gain = cross / np.maximum(power_u, TINY)
     rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
     generator = correlated & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
@@ -155,10 +160,11 @@ def noise_between_harmonics(
     if generator.any():
         through = np.where(generator, by_g, 0.0 if through is None else through)
     rest = error if through is None else error - through
-    power_rest = _mean_power(rest)
-    total_power, _ = _pieces(error, power_error, bands, size / dof)
-    rest_power, kind_rest = _pieces(rest, power_rest, bands, size / dof)
-    input_power, kind_u = _pieces(u, power_u, bands, 1.0)
+    parts = rest.real**2 + rest.imag**2
+    of_rest, power_rest = np.add.reduceat(parts, bands.starts, axis=-1), _mean_power(rest)
+    total_power, _ = _pieces(of_error, power_error, bands, size / dof)
+    rest_power, kind_rest = _pieces(of_rest, power_rest, bands, size / dof)
+    input_power, kind_u = _pieces(of_u, power_u, bands, 1.0)
     kind = np.maximum(kind_rest, np.where(generator[:, 0], 0, kind_u))
     measured = np.where(generator, rest_power, np.where(common, total_power, rest_power))
     variance_u = np.where(generator, 0.0, input_power)
@@ -173,53 +179,35 @@ def noise_between_harmonics(
     )
 
 
+def correlation_limit(size: int) -> float:
+    """Squared correlation of so many complex samples that is beyond chance."""
+    # chance exceeds x with (1 - x)^(n - 1)
+    return float(1 - FALSE_ALARM ** (1 / max(size - 1, 1)))
+
+
 def rough_noise(error: ComplexArray, u: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """(batch, 1) flat variances of Y and of U from the same; none of U where it shows in `error`."""
-    power_error, power_u, _, correlated = _powers(error, u)
-    return (
-        np.where(power_error > TINY, power_error, 1.0),
-        np.where(correlated, 0.0, power_u),
-    )
-
-
-def _powers(
-    error: ComplexArray, u: ComplexArray
-) -> tuple[FloatArray, FloatArray, ComplexArray, npt.NDArray[np.bool_]]:
-    """(batch, 1) mean powers of both, their mean product, and whether that is beyond chance."""
-    size = error.shape[1]
-    power_error, power_u = _mean_power(error), _mean_power(u)
-    cross = np.einsum("bk,bk->b", error, u.conj())[:, None] / size
-    squared = (cross.real**2 + cross.imag**2) / np.maximum(power_error * power_u, TINY)
-    # a squared correlation of n complex samples exceeds x by chance with (1 - x)^(n - 1)
-    return power_error, power_u, cross, squared > 1 - FALSE_ALARM ** (1 / max(size - 1, 1))
+    of_error, of_u = _mean_power(error), _mean_power(u)
+    cross = np.mean(error * u.conj(), axis=-1, keepdims=True)
+    squared = np.abs(cross) ** 2 / np.maximum(of_error * of_u, TINY)
+    limit = correlation_limit(error.shape[1])
+    return np.where(of_error > TINY, of_error, 1.0), np.where(squared > limit, 0.0, of_u)
 
 
 def _pieces(
-    values: ComplexArray, mean_power: FloatArray, bands: NoiseBands, factor: float
+    powers_of: FloatArray, mean_power: FloatArray, bands: NoiseBands, factor: float
 ) -> tuple[FloatArray, IntArray]:
     """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
 
     Flat unless a test says otherwise.
     """
-    mean = mean_power * factor
-    if _are_flat(values, bands):
-        return mean, np.zeros(values.shape[0], np.int64)
-    model = model_variance(_samples(values, bands) * factor, bands.dof)
+    mean, samples = mean_power * factor, powers_of / bands.counts
+    if bands.starts.size < FEWEST_PIECES or is_flat(samples, bands.dof):
+        return mean, np.zeros(mean.shape[0], np.int64)
+    model = model_variance(samples * factor, bands.dof)
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
-
-
-def _are_flat(values: ComplexArray, bands: NoiseBands) -> bool:
-    """Whether all of a batch have a flat variance, or too few pieces to tell."""
-    return bands.starts.size < FEWEST_PIECES or is_flat(_samples(values, bands), bands.dof)
-
-
-def _samples(values: ComplexArray, bands: NoiseBands) -> FloatArray:
-    """(batch, pieces) mean powers."""
-    parts = np.ascontiguousarray(values).view(float)  # real and imaginary ones in turn
-    return np.asarray(np.add.reduceat(parts * parts, 2 * bands.starts, axis=-1) / bands.counts)
 
 
 def _mean_power(values: ComplexArray) -> FloatArray:
     """(batch, 1)."""
-    parts = np.ascontiguousarray(values).view(float)
-    return np.einsum("bk,bk->b", parts, parts)[:, None] / values.shape[-1]
+    return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1, keepdims=True))

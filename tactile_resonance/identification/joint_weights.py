@@ -1,139 +1,101 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the bins of the joint estimator are weighted with: the noise between harmonics.
 
-Data of a point are one row, or several where it is several records; these pool their noise.
+The records of a point pool their noise.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.identification import likelihood
 from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_noise import (
     JointNoise,
     NoiseBands,
+    correlation_limit,
     noise_between_harmonics,
-    rough_noise,
 )
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
-def step_near(
-    points: Any, theta: FloatArray, data: list[BinData], u_o: ComplexArray, records: int = 1
-) -> FloatArray:
-    """One undamped step from start values: residuals are then all but noise.
-
-    With weights as the errors show them at the start.
+def begin(layout: JointLayout, data: BinData, bands: NoiseBands) -> tuple[FloatArray, JointNoise]:
+    """Coefficients (points, M, n) near the minimum, and the noise between harmonics there.
 
     Parameters
     ----------
-    points : OnePoint, ManyPoints or SharedPoints
-    theta : (n,), (batch, n) or (batch, M, n) float
-    data : list of BinData
-        Bins between harmonics, and excited ones.
-    u_o : (batch M, K_o) complex
-        Input between harmonics.
-    records : int
-        M.
+    layout : JointLayout
+    data : BinData
+        With variances of 1.
+    bands : NoiseBands
+        Of as many records.
     """
-    value = points.evaluate(theta)
-    error = value.error_of(0)
-    size = records * error.shape[1]
-    noise = rough_noise(error.reshape(-1, size), u_o.reshape(-1, size))
-    variance_y, variance_u = (v if records == 1 else v.repeat(records, axis=0) for v in noise)
-    others, excited = data
-    points.weigh(
-        [
-            BinData(others.y, None, variance_y),
-            BinData(excited.y, excited.u, variance_y, variance_u),
-        ]
+    limit = correlation_limit(data.records * data.undriven)
+    problem = layout.problem
+    theta, powers = likelihood.begin(
+        problem.tables, problem.from_driven, data.arrays, limit, bands.size, bands.starts.size
     )
-    gradient, normal = points.normals(points.weight(value))
-    moved = theta - points.step(normal, gradient)[0]
-    return np.where(np.isfinite(moved).all(axis=-1, keepdims=True), moved, theta)
+    return theta, _noise(layout, data, theta, bands, powers)
 
 
 def noise_of(
-    layout: JointLayout,
-    error: ComplexArray,
-    theta: FloatArray,
-    u_o: ComplexArray,
-    bands: NoiseBands,
-    records: int = 1,
+    layout: JointLayout, data: BinData, theta: FloatArray, bands: NoiseBands
 ) -> JointNoise:
     """The noise that the bins between harmonics show, pooled over the records of a point.
 
     Parameters
     ----------
     layout : JointLayout
-    error, u_o : (batch M, K_o) complex
-        Y without its transient, and U.
-    theta : (batch, n) float
-        Of which A and B count.
+    data : BinData
+    theta : (points, M, n) float
     bands : NoiseBands
         Of as many records.
-    records : int
-        M.
     """
+    tables, pieces = layout.problem.tables, bands.starts.size
+    powers = likelihood.undriven_powers(tables, data.arrays, theta, bands.size, pieces)
+    return _noise(layout, data, theta, bands, powers)
 
-    def response() -> ComplexArray:
-        alpha, beta, _ = layout.problem.split(theta)
-        g = np.asarray(
-            (beta @ layout.numerator_on_others.T) / (alpha @ layout.problem.groups[0].denominator.T)
-        )
-        return g if records == 1 else g.repeat(records, axis=1)
 
-    return noise_between_harmonics(
-        _bin_by_bin(error, records),
-        _bin_by_bin(u_o, records),
-        response,
-        bands,
-        layout.problem.sizes[2] * records,
+def _noise(
+    layout: JointLayout, data: BinData, theta: FloatArray, bands: NoiseBands, powers: FloatArray
+) -> JointNoise:
+    records, problem = data.records, layout.problem
+
+    def signals() -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        alpha, beta, _ = problem.split(theta[:, 0])
+        of_a = alpha @ problem.denominator[: problem.undriven].T
+        g = np.asarray((beta @ layout.numerator_on_others.T) / of_a)
+        error = likelihood.undriven_errors(problem.tables, data.arrays, theta)
+        u = data.u[..., : data.undriven]
+        return _bin_by_bin(error), _bin_by_bin(u), g.repeat(records, axis=1)
+
+    return noise_between_harmonics(powers, signals, bands, problem.sizes[2] * records)
+
+
+def weighted(data: BinData, noise: JointNoise, bands: NoiseBands) -> BinData:
+    """Data with the variances of their noise, and without what came through the input."""
+    if noise.through_input is not None:
+        y = data.y
+        y[..., : data.undriven] -= noise.through_input.reshape(
+            len(y), data.undriven, data.records
+        ).swapaxes(1, 2)
+        data = BinData.of(y, data.u, data.undriven, data.variance_y)
+    covariance = noise.covariance_yu
+    return replace(
+        data,
+        rest=noise.on(bands.of_others, noise.variance_rest)[:, None],
+        variance_y=noise.on(bands.of_excited, noise.variance_y)[:, None],
+        variance_u=noise.on(bands.of_excited, noise.variance_u)[:, None],
+        covariance_yu=None if covariance is None else covariance[:, None],
     )
 
 
-def weighted(
-    data: list[BinData], noise: JointNoise, bands: NoiseBands, records: int = 1
-) -> list[BinData]:
-    """Data with the variances of their noise, and without what came through the input."""
-    others, excited = data
-    y_o = others.y
-    if noise.through_input is not None:
-        y_o = y_o - _row_by_row(noise.through_input, records)
-
-    def each(variance: npt.NDArray) -> npt.NDArray:
-        return variance if records == 1 else variance.repeat(records, axis=0)
-
-    covariance = noise.covariance_yu
-    return [
-        BinData(y_o, None, each(noise.on(bands.of_others, noise.variance_rest))),
-        BinData(
-            excited.y,
-            excited.u,
-            each(noise.on(bands.of_excited, noise.variance_y)),
-            each(noise.on(bands.of_excited, noise.variance_u)),
-            None if covariance is None else each(covariance),
-        ),
-    ]
-
-
-def _bin_by_bin(values: ComplexArray, records: int) -> ComplexArray:
-    """(batch, K M) of (batch M, K): the records of a bin side by side."""
-    if records == 1:
-        return values
-    size = values.shape[1]
-    return values.reshape(-1, records, size).swapaxes(1, 2).reshape(-1, size * records)
-
-
-def _row_by_row(values: ComplexArray, records: int) -> ComplexArray:
-    """(batch M, K) of (batch, K M)."""
-    if records == 1:
-        return values
-    size = values.shape[1] // records
-    return values.reshape(-1, size, records).swapaxes(1, 2).reshape(-1, size)
+def _bin_by_bin(values: ComplexArray) -> ComplexArray:
+    """(points, K M) of (points, M, K): the records of a bin side by side."""
+    return np.ascontiguousarray(values.swapaxes(1, 2).reshape(len(values), -1))

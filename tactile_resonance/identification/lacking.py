@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from tactile_resonance.identification.basis import PolynomialBasis
 from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.covariance import invert_normal
+from tactile_resonance.identification.likelihood import invert, moments
 from tactile_resonance.identification.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -124,15 +124,15 @@ def asks(
 
 @np.errstate(all="ignore")
 def lacking_terms(
-    layout: JointLayout, data: list[BinData], theta: FloatArray, inverse: FloatArray | None = None
+    layout: JointLayout, data: BinData, theta: FloatArray, inverse: FloatArray | None = None
 ) -> FloatArray:
     """What the model of fitted points lacks.
 
     Parameters
     ----------
     layout : JointLayout
-    data : list of BinData
-        Of each group.
+    data : BinData
+        Of one record each.
     theta : (batch, n) float
         The fit.
     inverse : (batch, n, n) float, optional
@@ -151,31 +151,36 @@ def lacking_terms(
     exceeded by chance with ``(1 - R)^(dof - 1)``.
     """
     problem, directions = layout.problem, layout.directions
-    points = problem.many_points(data)
-    value = points.weight(points.evaluate(theta))
+    costs, _, normal = moments(problem.tables, data.arrays, theta[:, None])
+    cost = costs.sum(axis=-1)
     if inverse is None:
-        inverse = invert_normal(points.normals(value)[1].sum(axis=1))[0]
-    at, last, group = value.groups[-1], data[-1], problem.groups[-1]
-    response, numerator, u = np.asarray(at.g), np.asarray(group.numerator), np.asarray(last.u)
-    weight = 1 / last.residual_variance(response)  # (batch, K)
-    slope = np.conj(at.error) * u * weight  # what a response more takes off half the cost
-    if last.variance_u is not None:
-        by_g = last.variance_u * np.conj(response)
-        if last.covariance_yu is not None:
-            by_g = by_g - np.conj(last.covariance_yu)
-        slope = slope + by_g * np.abs(at.error * weight) ** 2
-    scaled = np.conj(at.inverse) * u * weight
+        inverse = invert(normal[:, 0].sum(axis=1))[0]
+    alpha, beta, gamma = problem.split(theta)
+    driven = slice(problem.undriven, None)
+    denominator, transient = problem.denominator[driven], problem.transient[driven]
+    one_over_a = 1 / (alpha @ denominator.T)  # (batch, K)
+    response = (beta @ problem.numerator.T) * one_over_a
+    u = data.u_driven[:, 0]
+    model = response * u + (gamma @ transient.T) * one_over_a
+    error = data.y_driven[:, 0] - model
+    weight = 1 / data.residual_variance(response)[:, 0]  # (batch, K)
+    slope = np.conj(error) * u * weight  # what a response more takes off half the cost
+    if data.variance_u is not None:
+        by_g = data.variance_u[:, 0] * np.conj(response)
+        if data.covariance_yu is not None:
+            by_g = by_g - np.conj(data.covariance_yu[:, 0])
+        slope = slope + by_g * np.abs(error * weight) ** 2
+    scaled = np.conj(one_over_a) * u * weight
     blocks = [
-        (-np.conj(at.model) * scaled)[:, None] * group.denominator[:, :-1].conj().T,
-        (np.conj(u) * scaled)[:, None] * numerator.conj().T,
+        (-np.conj(model) * scaled)[:, None] * denominator[:, :-1].conj().T,
+        (np.conj(u) * scaled)[:, None] * problem.numerator.conj().T,
+        scaled[:, None] * transient.conj().T,
     ]
-    if group.transient is not None:
-        blocks.append(scaled[:, None] * group.transient.conj().T)
     of_fit = np.ascontiguousarray(np.concatenate(blocks, axis=1))  # (batch, n, K)
     power = weight * (u.real**2 + u.imag**2)
-    terms = at.inverse[..., None] * directions.numerator  # (batch, K, 2)
+    terms = one_over_a[..., None] * directions.numerator  # (batch, K, 2)
     by_terms = np.real(slope[:, None] @ terms)[:, 0]
-    own = (np.abs(at.inverse) ** 2 * power) @ directions.numerator_products
+    own = (np.abs(one_over_a) ** 2 * power) @ directions.numerator_products
     falls = [_fall(inverse, by_terms, own, np.real(of_fit @ terms))]
     if directions.poles_rad_s.size:
         by_modes = np.ascontiguousarray(slope).view(float) @ directions.modes
@@ -183,12 +188,12 @@ def lacking_terms(
         crossed = crossed.reshape(*theta.shape, -1)
         falls.append(_fall(inverse, by_modes, power @ directions.mode_products, crossed))
     fall = np.concatenate(falls, axis=1)  # (batch, 1 + N)
-    dof = sum(values.y.shape[1] for values in data) - theta.shape[1] / 2
-    chance = (dof - 1) * np.log1p(-fall / value.cost[:, None])
+    dof = data.y.shape[-1] - theta.shape[1] / 2
+    chance = (dof - 1) * np.log1p(-fall / cost[:, None])
     chance[:, 1:] += np.log(max(directions.poles_rad_s.size, 1))
     best = np.argmin(np.nan_to_num(chance), axis=1)[:, None]
     fall, chance = (np.take_along_axis(v, best, axis=1) for v in (fall, chance))
-    chi_square = 2 * fall * (dof - 1) / (value.cost[:, None] - fall)
+    chi_square = 2 * fall * (dof - 1) / (cost[:, None] - fall)
     f0_hz = np.append(np.nan, np.abs(directions.poles_rad_s) / (2 * np.pi))[best]
     found = np.concatenate([chi_square, np.where(best > 0, 4.0, 2.0), f0_hz], axis=1)
     return np.where(chance < np.log(FALSE_ALARM), found, np.nan)

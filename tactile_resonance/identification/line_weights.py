@@ -76,7 +76,7 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         known = replace(known, independent_dof=min(frf.dof, bins))
     noise = frf.variance_noise
     return WeightedLines(
-        BinData(g, None, weights),
+        BinData.of(g[:, None], np.ones((len(g), 1, g.shape[1])), 0, weights[:, None]),
         known,
         usable,
         level_known,
@@ -119,7 +119,14 @@ def lines_of_spectra(
     c_yy = np.maximum(c_yy, LEAST_OUTPUT_NOISE * c_uu * power_y / power_u)
     c_yy = np.where(level_known[:, None], c_yy, power_y)
     return WeightedLines(
-        BinData(z[:, 0], z[:, 1], np.where(usable, c_yy, np.inf), c_uu, c_yu),
+        BinData.of(
+            z[:, :1],
+            z[:, 1:],
+            0,
+            np.where(usable, c_yy, np.inf)[:, None],
+            c_uu[:, None],
+            np.asarray(c_yu, complex)[:, None],
+        ),
         known,
         usable,
         level_known,

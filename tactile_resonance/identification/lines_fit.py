@@ -13,19 +13,19 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.identification import likelihood
 from tactile_resonance.identification.basis import PolynomialBasis
-from tactile_resonance.identification.bins import BinData, BinGroup
-from tactile_resonance.identification.covariance import invert_normal
-from tactile_resonance.identification.dense import (
+from tactile_resonance.identification.bins import BinData, Problem
+from tactile_resonance.identification.fit import (
     DenseSolution,
-    jacobian_covariance,
+    Linearised,
+    least_squares,
     linear_step,
-    minimise_dense,
+    minimise,
+    start_values,
 )
 from tactile_resonance.identification.model import RationalModel, Variable
 from tactile_resonance.identification.model_error import COMPARISON_ITERATIONS
-from tactile_resonance.identification.problem import START_ITERATIONS, Problem
-from tactile_resonance.identification.solver import minimise
 from tactile_resonance.identification.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -97,25 +97,21 @@ class LinesPlan:
             return self.rebased(data)._fit_dense(data)
         if self.structure.delay:
             return self._fit_dense(data)
-        solution = minimise(self.problem, [data])
-        inverse, condition = invert_normal(solution.normal[:, 0])
-        converged = solution.converged.copy()
-        theta, cost, residual = solution.theta, solution.cost, solution.residual
-        parameters = 0.5 * inverse
+        solution = minimise(self.problem, data)
+        inverse, condition = likelihood.invert(solution.normal[:, 0, 1])
+        theta, cost, converged = solution.theta[:, 0], solution.cost, solution.converged
+        residual, parameters = solution.residual[:, 0], 0.5 * inverse
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
         if batch == 1 and doubtful.size:
             return self.rebased(data)._fit_dense(data)
-        for k in doubtful:  # exceptions: the batch as a whole has no loop over points
-            row = data.rows(slice(k, k + 1))
-            dense = minimise_dense(self.problem, [row])
-            if dense.group_cost[0] <= cost[k] * (1 + 1e-9) or not converged[k]:
-                theta[k], cost[k], converged[k] = dense.theta, dense.group_cost[0], dense.converged
-                residual[k] = dense.residual
-                half, condition[k] = jacobian_covariance(dense.jacobian)
+        for k in doubtful:
+            dense = least_squares(self.problem, data.rows(slice(k, k + 1)))
+            if dense.cost <= cost[k] * (1 + 1e-9) or not converged[k]:
+                theta[k], cost[k], converged[k] = dense.theta, dense.cost, dense.converged
+                residual[k] = dense.turned[0]
+                half, condition[k] = dense.covariance()
                 parameters[k] = 0.5 * half
-        return LinesFit(
-            self.model_of(theta), cost, parameters, condition, converged, data.turned(residual)
-        )
+        return LinesFit(self.model_of(theta), cost, parameters, condition, converged, residual)
 
     def compared(self, data: BinData) -> ComplexArray:
         """(batch, order) poles [rad/s] of a fit that others are compared with.
@@ -124,8 +120,8 @@ class LinesPlan:
         """
         if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
             return self.fit(data).model.poles_rad_s()
-        theta = minimise(self.problem, [data], None, COMPARISON_ITERATIONS).theta
-        return self.model_of(theta).poles_rad_s()
+        theta = minimise(self.problem, data, None, COMPARISON_ITERATIONS).theta
+        return self.model_of(theta[:, 0]).poles_rad_s()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
@@ -138,11 +134,10 @@ class LinesPlan:
         frequency domain data*, IEEE Trans. Autom. Control 50 (2005) 1835-1839). The first point
         with finite weights stands for all.
         """
-        usable = np.isfinite(data.variance_y).any(axis=-1)
+        usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
         row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
-        y = row.y[0]
-        u = np.ones(y.size, complex) if row.u is None else row.u[0]
-        variance = np.broadcast_to(row.variance_y[0], y.shape)
+        y, u = row.y[0, 0], row.u[0, 0]
+        variance = np.broadcast_to(row.variance_y[0, 0], y.shape)
         x = self.variable.of_frequency(self.frequency_hz)
         order = self.structure.order
         plan = self
@@ -159,11 +154,11 @@ class LinesPlan:
             )
             if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
                 break
-            problem = Problem((BinGroup(denominator.values, numerator.values),))
+            problem = Problem.of_lines(denominator.values, numerator.values)
             plan = LinesPlan(
                 self.frequency_hz, self.structure, problem, self.variable, denominator, numerator
             )
-            theta = linear_step(problem, [row], [np.sqrt(size)])
+            theta = linear_step(problem, row, np.sqrt(size))
             last, size = size, np.abs(denominator.values @ np.append(theta[:order], 1.0)) ** 2
             if not (np.isfinite(size).all() and (size > 0).all()):
                 break
@@ -174,9 +169,7 @@ class LinesPlan:
 
     def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
         """(batch, n, n) ``Re J^H J`` for the weights of `data`."""
-        with np.errstate(all="ignore"):
-            points = self.problem.many_points([data])
-            return points.normals(points.weight(points.evaluate(theta)))[1][:, 0]
+        return likelihood.moments(self.problem.tables, data.arrays, theta[:, None])[2][:, 0, 1]
 
     def theta(self, model: RationalModel) -> FloatArray:
         """(batch, n) free coefficients of a model of this plan."""
@@ -206,27 +199,24 @@ class LinesPlan:
             row = data.rows(slice(k, k + 1))
             solutions.append(self._best_of_starts(row, phase))
         theta = np.stack([s.theta for s in solutions])
-        covariances, conditions = zip(
-            *(jacobian_covariance(s.jacobian) for s in solutions), strict=False
-        )
+        covariances, conditions = zip(*(s.covariance() for s in solutions), strict=True)
         delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
         return LinesFit(
             self.model_of(theta, delay_s),
-            np.array([s.group_cost[0] for s in solutions]),
+            np.array([s.cost for s in solutions]),
             0.5 * np.stack(covariances),
             np.array(conditions),
             np.array([s.converged for s in solutions]),
-            np.stack([np.nan_to_num(s.residual) for s in solutions]),
+            np.stack([s.turned[0] for s in solutions]),
         )
 
     def _best_of_starts(self, row: BinData, phase: FloatArray | None) -> DenseSolution:
         """Of several starts the one with the least cost."""
         solutions = []
-        previous = None if self.start_size is None else [self.start_size]
         for start in self._starts(row, phase):
-            solutions.append(minimise_dense(self.problem, [row], start, phase, previous))
-        finite = [s for s in solutions if np.isfinite(s.group_cost).all()]
-        return min(finite or solutions, key=lambda s: float(s.group_cost.sum()))
+            solutions.append(least_squares(self.problem, row, start, phase, self.start_size))
+        finite = [s for s in solutions if np.isfinite(s.cost)]
+        return min(finite or solutions, key=lambda s: s.cost)
 
     def _starts(self, row: BinData, phase: FloatArray | None) -> list[FloatArray | None]:
         if phase is None:
@@ -241,7 +231,7 @@ def _plan(frequency_hz: bytes, structure: ModelStructure) -> LinesPlan:
     x = variable.of_frequency(lines_hz)
     denominator = PolynomialBasis.on_lines(x, structure.order)
     numerator = PolynomialBasis.on_lines(x, structure.numerator_order)
-    problem = Problem((BinGroup(denominator.values, numerator.values),))
+    problem = Problem.of_lines(denominator.values, numerator.values)
     return LinesPlan(lines_hz, structure, problem, variable, denominator, numerator)
 
 
@@ -253,14 +243,14 @@ def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[Floa
     step = 1.0 / max(float(np.ptp(phase)), 1e-12)
     candidates = []
     for delay in step * np.arange(-2, 13):
-        turned = BinData(
-            row.y * np.exp(1j * phase * delay), row.u, row.variance_y, row.variance_u, None
+        turned = BinData.of(
+            row.y * np.exp(1j * phase * delay), row.u, 0, row.variance_y, row.variance_u
         )
-        point = problem.one_point([turned])
-        theta = point.start(START_ITERATIONS)
+        theta = start_values(problem, turned)[0, 0]
         if not np.isfinite(theta).all():
             continue
-        cost = point.weight(point.evaluate(theta)).cost
+        residual = Linearised.of(problem, turned, theta).residual
+        cost = float(np.sum(residual.real**2 + residual.imag**2))
         candidates.append((cost, np.append(theta, delay)))
     candidates.sort(key=lambda c: c[0])
     return [theta for _, theta in candidates[:3]] or [None]

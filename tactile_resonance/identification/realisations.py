@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.identification.joint import ComplexArray, JointPlan, result_of
+from tactile_resonance.identification.joint import CHUNK, ComplexArray, JointPlan, result_of
 from tactile_resonance.identification.joint_fit import JointFit
 from tactile_resonance.identification.joint_layout import IntArray, JointLayout
 from tactile_resonance.identification.model_error import richer
@@ -62,7 +62,7 @@ class RealisationsPlan(JointPlan):
         if records == 1:
             return self._single.from_bins(u[..., 0, :], y[..., 0, :])
         flat_u, flat_y = (v.reshape(-1, records, size) for v in (u, y))
-        chunk = max(1, self.problem.chunk // records)
+        chunk = max(1, CHUNK // records)
         starts = range(0, max(flat_u.shape[0], 1), chunk)
         parts = [
             fit_realisations(self, flat_u[k : k + chunk], flat_y[k : k + chunk]) for k in starts

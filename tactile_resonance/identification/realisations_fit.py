@@ -7,29 +7,23 @@ stochastic nonlinear distortion together, and what they have in common tells whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.identification.bins import BinData
+from tactile_resonance.identification.fit import Solution, minimise, refit_failed
 from tactile_resonance.identification.joint_fit import ROUNDED, JointFit, mean_power
 from tactile_resonance.identification.joint_layout import JointLayout
 from tactile_resonance.identification.joint_model_error import systematic_of
 from tactile_resonance.identification.joint_noise import JointNoise, NoiseBands
-from tactile_resonance.identification.joint_weights import noise_of, step_near, weighted
+from tactile_resonance.identification.joint_weights import begin, noise_of, weighted
+from tactile_resonance.identification.likelihood import moments
 from tactile_resonance.identification.noise_level import KINDS, are_flat
 from tactile_resonance.identification.realisations_level import Levels
 from tactile_resonance.identification.realisations_spread import Spread
 from tactile_resonance.identification.scatter import Pieces, smooth_variance
-from tactile_resonance.identification.shared_points import (
-    SharedPoints,
-    minimise_shared,
-    refine_shared,
-    rows_of,
-    start_shared,
-)
-from tactile_resonance.identification.solver import Solution
 from tactile_resonance.identification.whiteness import are_smooth
 
 BoolArray = npt.NDArray[np.bool_]
@@ -47,24 +41,21 @@ class _Round:
 
     Attributes
     ----------
-    plain : list of BinData
-        Of (batch M) rows, without variances.
-    u_others : (batch M, K_o) complex
-        Input between harmonics.
-    data : list of BinData
+    plain : BinData
+        Without variances.
+    data : BinData
         With variances, and without what came through the input.
     solution : Solution
     noise : (batch, 2) float
         Mean variances of the noise on both channels that the weights stand for.
     kind : (batch,) int
         Index into `KINDS`.
-    share : (batch M, K_e) float or None
+    share : (batch, K_e) float or None
         Of the variance weighted with that is noise; None where all of it is.
     """
 
-    plain: list[BinData]
-    u_others: ComplexArray
-    data: list[BinData]
+    plain: BinData
+    data: BinData
     solution: Solution
     noise: FloatArray
     kind: IntArray
@@ -72,14 +63,10 @@ class _Round:
 
     def rows(self, which: IntArray) -> _Round:
         """Some of the points."""
-        records = self.solution.theta.shape[1]
-        rows = rows_of(which, records)
-        solution = Solution(*(getattr(self.solution, f.name)[which] for f in fields(Solution)))
         return _Round(
-            [values.rows(rows) for values in self.plain],
-            self.u_others[rows],
-            [values.rows(rows) for values in self.data],
-            solution,
+            self.plain.rows(which),
+            self.data.rows(which),
+            self.solution.rows(which),
             self.noise[which],
             self.kind[which],
         )
@@ -95,13 +82,12 @@ def fit_realisations(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> J
     u, y : (batch, M, K) complex
         At its bins, of M >= 2 realisations.
     """
-    batch, records, size = u.shape
+    records = u.shape[1]
     usable = np.asarray(np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2))))
     if not usable.all():
         u, y = (np.where(usable[:, None, None], v, 0) for v in (u, y))
-    u, y = (v.reshape(batch * records, size) for v in (u, y))
     pieces = Pieces.of(layout.excited_bins.size, records - 1)
-    first = _from_noise(layout, u, y, records)
+    first = _from_noise(layout, u, y)
     levels = _levels(layout, first, pieces)
     changed = _weighted_wrongly(layout, first, levels, pieces)
     if not changed.any():
@@ -119,52 +105,38 @@ def fit_realisations(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> J
     return JointFit.joined([fit, others]).rows(order)
 
 
-def _from_noise(layout: JointLayout, u: ComplexArray, y: ComplexArray, records: int) -> _Round:
+def _from_noise(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> _Round:
     """Weighted with the noise between harmonics, or, without any, as the layout says."""
-    u_e, y_e = u.take(layout.excited_at, axis=1), y.take(layout.excited_at, axis=1)
-    u_o, y_o = u.take(layout.others_at, axis=1), y.take(layout.others_at, axis=1)
-    problem, rows = layout.problem, u.shape[0]
-    one = np.ones((rows, 1))
-    if layout.other_bins.size == 0:
+    problem, others = layout.problem, layout.other_bins.size
+    one = np.ones((len(y), 1, 1))
+    if others == 0:
         ratio = layout.input_noise_ratio or 0.0
-        data = [BinData(y_e, u_e, one, ratio * one if ratio else None)]
-        noise = np.tile([1.0, ratio], (rows // records, 1))
-        solution = minimise_shared(problem, data, records)
-        return _Round(data, u_o, data, solution, noise, np.zeros(noise.shape[0], np.int64))
-    plain = [BinData(y_o, None, one), BinData(y_e, u_e, one)]
-    points = SharedPoints(problem, plain, records)
-    theta = step_near(points, start_shared(problem, plain, records), plain, u_o, records)
-    value = points.evaluate(theta)
-    data, found = _with_noise(layout, plain, u_o, value.error_of(0), theta)
-    if found.through_input is None:
-        points.weigh(data)
-        solution = refine_shared(problem, points, data, theta, value)
-    else:
-        solution = minimise_shared(problem, data, records, theta)
+        data = BinData.of(y, u, 0, one, ratio * one if ratio else None, order=layout.order)
+        noise = np.tile([1.0, ratio], (len(y), 1))
+        solution = refit_failed(problem, minimise(problem, data), data)
+        return _Round(data, data, solution, noise, np.zeros(len(y), np.int64))
+    plain = BinData.of(y, u, others, one, None, None, one, order=layout.order)
+    bands = NoiseBands.of(layout.other_bins, layout.excited_bins, plain.records)
+    theta, found = begin(layout, plain, bands)
+    data = weighted(plain, found, bands)
+    solution = refit_failed(problem, minimise(problem, data, theta), data)
     kind = np.array([KINDS.index(name) for name in found.kind])
-    return _Round(plain, u_o, data, solution, found.mean_variances, kind)
+    return _Round(plain, data, solution, found.mean_variances, kind)
 
 
 def _with_noise(
-    layout: JointLayout,
-    plain: list[BinData],
-    u_others: ComplexArray,
-    error: ComplexArray,
-    theta: FloatArray,
-) -> tuple[list[BinData], JointNoise]:
-    """Data with the noise that errors (batch M, K_o) between harmonics show, and that noise."""
-    records = theta.shape[1]
-    bands = NoiseBands.of(layout.other_bins, layout.excited_bins, records)
-    noise = noise_of(layout, error, theta[:, 0], u_others, bands, records)
-    return weighted(plain, noise, bands, records), noise
+    layout: JointLayout, plain: BinData, theta: FloatArray
+) -> tuple[BinData, JointNoise]:
+    """Data with the noise that errors between harmonics show, and that noise."""
+    bands = NoiseBands.of(layout.other_bins, layout.excited_bins, plain.records)
+    noise = noise_of(layout, plain, theta, bands)
+    return weighted(plain, noise, bands), noise
 
 
 def _levels(layout: JointLayout, fitted: _Round, pieces: Pieces) -> Levels:
     by_piece = (fitted.kind == 2) & (fitted.share is not None)
     variance = _residual_variance(layout, fitted)
-    u = fitted.data[-1].u
-    assert u is not None
-    return Levels.of(layout, fitted.solution, u, variance, pieces, by_piece)
+    return Levels.of(layout, fitted.solution, fitted.data.u_driven, variance, pieces, by_piece)
 
 
 def _weighted_wrongly(
@@ -179,66 +151,54 @@ def _weighted_wrongly(
         changed = changed | ~are_flat(pieces.means(levels.line_variance), pieces.dof)
     if layout.other_bins.size == 0 and layout.input_noise_ratio is None:
         changed[:] = True  # nothing is known of the weights but what realisations differ by
-    power = mean_power(fitted.data[-1].y).reshape(changed.size, -1).mean(axis=1)
+    power = mean_power(fitted.data.y_driven).mean(axis=1)
     variance = _residual_variance(layout, fitted)
     return changed & (levels.excited * variance.min(axis=-1) > ROUNDED * power)
 
 
 def _residual_variance(layout: JointLayout, fitted: _Round) -> FloatArray:
     """(batch, K_e) variance of the residuals of each realisation that is weighted with."""
-    records = fitted.solution.theta.shape[1]
-    return _variance(fitted.data[-1], _response(layout, fitted), records)
+    return _variance(fitted.data, _response(layout, fitted))
 
 
-def _variance(excited: BinData, g: ComplexArray, records: int) -> FloatArray:
-    """(batch, K_e) variance of ``y - g u`` for a response g (batch, K_e): alike in all M rows."""
-    variance = excited.rows(slice(None, None, records)).residual_variance(g)
-    return np.broadcast_to(variance, g.shape)
+def _variance(data: BinData, g: ComplexArray) -> FloatArray:
+    """(batch, K_e) variance of ``y - g u`` for a response g (batch, K_e): alike in all records."""
+    return np.broadcast_to(data.residual_variance(g)[:, 0], g.shape)
 
 
 def _response(layout: JointLayout, fitted: _Round) -> ComplexArray:
     """(batch, K_e)."""
-    alpha, beta, _ = layout.problem.split(fitted.solution.theta[:, 0])
-    group = layout.problem.groups[-1]
-    return np.asarray(group.evaluate(1, beta) / group.evaluate(0, alpha))
+    return layout.problem.response(fitted.solution.theta[:, 0])
 
 
 def _from_scatter(layout: JointLayout, fitted: _Round, pieces: Pieces) -> _Round:
     """Excited lines weighted with what realisations differ by, and fitted again."""
     theta = fitted.solution.theta
-    records = theta.shape[1]
     g = _response(layout, fitted)
     gain = g.real**2 + g.imag**2
     levels = _levels(layout, fitted, pieces)
     sample = levels.line_variance * _residual_variance(layout, fitted)
     total, kind = smooth_variance(sample, gain, pieces)
-    if len(fitted.plain) > 1:
+    if layout.other_bins.size:
         # of distorted lines with too large weights the transients were wrong, and so the noise
-        points = SharedPoints(layout.problem, fitted.plain, records)
-        error = points.evaluate(theta).error_of(0)
-        data, found = _with_noise(layout, fitted.plain, fitted.u_others, error, theta)
-        excited, noise = data[-1], found.mean_variances
-        known = _variance(excited, g, records)
-        more = np.maximum(total - known, 0).repeat(records, axis=0)
-        excited = replace(excited, variance_y=excited.variance_y + more)
+        data, found = _with_noise(layout, fitted.plain, theta)
+        noise = found.mean_variances
+        known = _variance(data, g)
+        more = np.maximum(total - known, 0)
+        data = replace(data, variance_y=data.variance_y + more[:, None])
         share = known / np.maximum(total, known)
     else:
-        data, excited = [], fitted.plain[-1]
         input_noise = levels.excited[:, None] * (layout.input_noise_ratio or 0.0)
         rest = np.maximum(total - input_noise * gain, 1e-3 * total)
-        excited = BinData(
-            excited.y,
-            excited.u,
-            rest.repeat(records, axis=0),
-            input_noise.repeat(records, axis=0) if layout.input_noise_ratio else None,
+        data = replace(
+            fitted.plain,
+            variance_y=rest[:, None],
+            variance_u=input_noise[:, None] if layout.input_noise_ratio else None,
         )
         noise = np.stack([rest.mean(axis=-1), input_noise[:, 0]], axis=-1)
         share = np.ones_like(total)
-    data = [*data[:-1], excited]
-    points = SharedPoints(layout.problem, data, records)
-    solution = refine_shared(layout.problem, points, data, theta)
-    share = share.repeat(records, axis=0)
-    return _Round(fitted.plain, fitted.u_others, data, solution, noise, kind, share)
+    solution = refit_failed(layout.problem, minimise(layout.problem, data, theta), data)
+    return _Round(fitted.plain, data, solution, noise, kind, share)
 
 
 def _judged(
@@ -246,14 +206,13 @@ def _judged(
 ) -> JointFit:
     """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
     solution, data = fitted.solution, fitted.data
-    excited = data[-1]
     batch, records, _ = solution.theta.shape
     a, b, _ = layout.problem.sizes
     levels = _levels(layout, fitted, pieces)
     common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
     suspect = are_smooth(common, layout.structure.parameters)
     if suspect.any():  # what rounding leaves of exact data says nothing
-        floor = ROUNDED * mean_power(excited.y).reshape(batch, records).mean(axis=1)
+        floor = ROUNDED * mean_power(data.y_driven).mean(axis=1)
         variance = levels.excited[:, None] * _residual_variance(layout, fitted)
         suspect &= variance.min(axis=-1) > floor
     suspect |= levels.cost > levels.limit
@@ -261,8 +220,7 @@ def _judged(
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     if suspect.any():
         rows = np.flatnonzero(suspect)
-        part = [values.rows(rows_of(rows, records)) for values in data]
-        systematic[rows] = systematic_of(layout, part, solution.theta[rows])
+        systematic[rows] = systematic_of(layout, data.rows(rows), solution.theta[rows])
     theta = solution.theta
     fit = JointFit(
         theta=np.concatenate(
@@ -295,15 +253,12 @@ def _each_by_itself(layout: JointLayout, fit: JointFit, first: _Round, pieces: P
     of a resonator that is not linear tells of another system.
     """
     theta = first.solution.theta
-    records = theta.shape[1]
     levels = _levels(layout, first, pieces)
     # gradients as independent lines make them, each with the variance that it shows itself
-    line = levels.line_variance.repeat(records, axis=0)
-    inner = _normal_of_excited(layout, first, line)
-    if len(first.data) > 1:
+    inner = _normal_of_excited(layout, first, levels.line_variance)
+    if layout.other_bins.size:
         inner = inner + levels.between[:, None, None, None] * first.solution.normal[:, :, 0]
-    points = SharedPoints(layout.problem, first.data, records)
-    spread = Spread.of(layout, points, theta, inner, levels.excited_dof)
+    spread = Spread.of(layout, first.data, theta, inner, levels.excited_dof)
     distorted = levels.distorted() & spread.known
     weight = np.where(distorted, 1.0, spread.weight)
     of_first = _covariances(layout, first, levels, np.zeros(weight.size, bool))
@@ -335,7 +290,7 @@ def _covariances(
     layout: JointLayout, fitted: _Round, levels: Levels, suspect: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
-    noise_alone = fitted.share is None or len(fitted.data) == 1
+    noise_alone = fitted.share is None or not layout.other_bins.size
     return levels.covariances(suspect, None if noise_alone else _noise_normal(layout, fitted))
 
 
@@ -350,12 +305,11 @@ def _normal_of_excited(layout: JointLayout, fitted: _Round, part: FloatArray) ->
 
     Parameters
     ----------
-    part : (batch M, K_e) float
+    part : (batch, K_e) float
         Their variance, of that weighted with.
     """
-    records = fitted.solution.theta.shape[1]
-    variance = _residual_variance(layout, fitted).repeat(records, axis=0)
-    excited = fitted.data[-1]
-    changed = BinData(excited.y, excited.u, variance / part)
-    points = SharedPoints(layout.problem, [*fitted.data[:-1], changed], records)
-    return points.normals(points.weight(points.evaluate(fitted.solution.theta)))[1][:, :, -1]
+    variance = _residual_variance(layout, fitted) / part
+    changed = replace(
+        fitted.data, variance_y=variance[:, None], variance_u=None, covariance_yu=None
+    )
+    return moments(layout.problem.tables, changed.arrays, fitted.solution.theta)[2][:, :, 1]

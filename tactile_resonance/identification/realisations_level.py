@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.identification.arrow import ArrowInverse
-from tactile_resonance.identification.covariance import invert_normal
+from tactile_resonance.identification.fit import RecordsInverse, Solution
 from tactile_resonance.identification.joint_fit import student_variance
 from tactile_resonance.identification.joint_layout import JointLayout
+from tactile_resonance.identification.likelihood import invert
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.noise_level import f_quantile
 from tactile_resonance.identification.scatter import Pieces, Scatter
-from tactile_resonance.identification.solver import Solution
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -32,8 +31,9 @@ class Levels:
     Attributes
     ----------
     scatter : Scatter
-    inverse : ArrowInverse
-    normal : (batch, M, groups, n, n) float
+    inverse : RecordsInverse
+    normal : (batch, M, 2, n, n) float
+        Of undriven and driven bins.
     between : (batch,) float
         From the bins between harmonics: noise; NaN where there are none.
     between_dof : (batch,) float
@@ -58,7 +58,7 @@ class Levels:
     """
 
     scatter: Scatter
-    inverse: ArrowInverse
+    inverse: RecordsInverse
     normal: FloatArray
     between: FloatArray
     between_dof: FloatArray
@@ -87,7 +87,7 @@ class Levels:
         ----------
         layout : JointLayout
         solution : Solution
-        u : (batch M, K_e) complex
+        u : (batch, M, K_e) complex
             Input on excited lines.
         variance : (batch, K_e) float
             That these were weighted with.
@@ -98,9 +98,9 @@ class Levels:
         a, b, _ = layout.problem.sizes
         shared = a + b
         batch, records, lines = solution.residual.shape
-        scatter = Scatter.of(solution.residual, u.reshape(batch, records, lines))
-        inverse = ArrowInverse.of(solution.normal.sum(axis=2), shared)
-        used = inverse.leverage(solution.normal[:, :, -1])
+        scatter = Scatter.of(solution.residual, u)
+        inverse = RecordsInverse.of(solution.normal.sum(axis=2), shared)
+        used = inverse.leverage(solution.normal[:, :, 1])
         # what the transients take from a line: of each a part 1/M of what all have in common
         taken = _taken_by_transients(layout, solution, variance)
         line_dof = (records - 1) * np.maximum(1 - taken / (2 * records), 0.05)
@@ -108,10 +108,10 @@ class Levels:
         common_dof = np.maximum(records * lines - used / 2 - excited_dof, 0.5)
         excited = scatter.differing_cost / excited_dof
         between = between_dof = np.full(batch, np.nan)
-        if solution.normal.shape[2] > 1:
+        if layout.other_bins.size > 0:
             used_between = inverse.leverage(solution.normal[:, :, 0])
             between_dof = records * layout.other_bins.size - used_between / 2
-            between = solution.group_cost[:, 0] / between_dof
+            between = solution.part_cost[:, 0] / between_dof
         cost = scatter.common_cost / excited
         nu = np.where(by_piece, float(pieces.dof), excited_dof)
         expected = common_dof * np.where(nu > 1, nu / (nu - 1), np.nan)
@@ -185,7 +185,7 @@ class Levels:
         with np.errstate(divide="ignore", invalid="ignore"):
             nu = self.piece_dof
             pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
-            last = self.normal[:, :, -1]
+            last = self.normal[:, :, 1]
             if np.isnan(self.between_dof).all():
                 both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
                 return both * self.inverse.shared, both * self.inverse.shared
@@ -216,13 +216,13 @@ def _taken_by_transients(
     there.
     """
     a, b, own = layout.problem.sizes
-    group = layout.problem.groups[-1]
+    problem = layout.problem
+    driven = slice(problem.undriven, None)
     alpha, _, _ = layout.problem.split(solution.theta[:, 0])
-    size = group.evaluate(0, alpha)
-    basis = group.transient
-    assert basis is not None
+    size = alpha @ problem.denominator[driven].T
+    basis = problem.transient[driven]
     blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
-    inverse = invert_normal(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
+    inverse = invert(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
     products = np.real(basis.conj()[:, :, None] * basis[:, None, :]).reshape(-1, own * own)
     return (inverse.reshape(-1, own * own) @ products.T) / (
         variance * (size.real**2 + size.imag**2)

@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from tactile_resonance.identification.arrow import ArrowInverse, solve_arrow
+from tactile_resonance.identification.bins import BinData
 from tactile_resonance.identification.joint_layout import JointLayout
+from tactile_resonance.identification.likelihood import invert, moments
 from tactile_resonance.identification.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.identification.result import natural_frequency_and_damping_jacobian
-from tactile_resonance.identification.shared_points import SharedPoints
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -61,7 +61,7 @@ class Spread:
     def of(
         cls,
         layout: JointLayout,
-        points: SharedPoints,
+        data: BinData,
         theta: FloatArray,
         inner: FloatArray,
         dof: FloatArray,
@@ -71,7 +71,7 @@ class Spread:
         Parameters
         ----------
         layout : JointLayout
-        points : SharedPoints
+        data : BinData
             With the variances that it was weighted with.
         theta : (batch, M, n) float
             The fit.
@@ -82,10 +82,10 @@ class Spread:
         """
         a, b, _ = layout.problem.sizes
         batch, records, n = theta.shape
-        gradient, normal = points.normals(points.weight(points.evaluate(theta)))
-        alone = normal.sum(axis=2).reshape(-1, 1, n, n)
-        step = -solve_arrow(alone, gradient.reshape(-1, 1, n), a + b)[0][:, 0, : a + b]
-        inverse = ArrowInverse.of(alone, a + b).marginal[:, 0, :a]  # (batch M, a, n)
+        _, gradient, normal = moments(layout.problem.tables, data.arrays, theta)
+        inverse = invert(normal.sum(axis=2).reshape(-1, n, n))[0]
+        step = -(inverse @ gradient.reshape(-1, n, 1))[:, : a + b, 0]
+        inverse = inverse[:, :a]  # (batch M, a, n)
         covariance = 0.5 * inverse @ inner.reshape(-1, n, n) @ inverse.swapaxes(-1, -2)
         step = step.reshape(batch, records, a + b)
         covariance = covariance.reshape(batch, records, a, a)

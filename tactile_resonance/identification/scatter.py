@@ -39,7 +39,7 @@ class Scatter:
     common : (batch, K) complex
         Turned by the phase of the input; of the variance of one residual. 0 on lines without input.
     differing : (batch, M, K) complex
-        The rest, M - 1 degrees of freedom a line.
+        The rest, turned too; M - 1 degrees of freedom a line.
     """
 
     common: ComplexArray
@@ -47,11 +47,12 @@ class Scatter:
 
     @classmethod
     def of(cls, residual: ComplexArray, u: ComplexArray) -> Scatter:
-        """Of weighted residuals (batch, M, K) with inputs (batch, M, K)."""
-        size = np.sqrt(np.sum(u.real**2 + u.imag**2, axis=1, keepdims=True))
+        """Of weighted residuals (batch, M, K), turned by the phases of inputs (batch, M, K)."""
+        size = np.abs(u)
         with np.errstate(divide="ignore", invalid="ignore"):
-            direction = np.where(size > 0, u / size, 0.0)
-        common = np.einsum("bmk,bmk->bk", direction.conj(), residual)
+            whole = np.sqrt(np.sum(size**2, axis=1, keepdims=True))
+            direction = np.where(whole > 0, size / whole, 0.0)
+        common = np.einsum("bmk,bmk->bk", direction, residual)
         return cls(common, residual - direction * common[:, None])
 
     @property

@@ -6,6 +6,7 @@ from __future__ import annotations
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.identification.estimator import POLES_METHODS, poles_of_frf
+from tactile_resonance.identification.likelihood import compiled
 from tactile_resonance.identification.order_choice import choose_among
 from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.identification.structure import ModelStructure
@@ -51,7 +52,8 @@ class PolesNode(ManagedNode):
         super().__init__("poles_node", PARAMETERS)
 
     def configure(self) -> None:
-        """Topics in and out."""
+        """Topics in and out; the compiled fits are loaded before the first FRF is here."""
+        compiled()
         self._publisher = self.publish_on(msg.Poles, "poles", POLES)
         self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tactile_resonance.analysis import write_whole
+from tactile_resonance.files import write_whole
 
 SIMULATED = "simulated, not measured"
 

@@ -26,7 +26,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
 
-from tactile_resonance.analysis import write_whole
+from tactile_resonance.files import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.messages import (
     OtherVersionError,

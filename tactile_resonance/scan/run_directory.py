@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Qos
 
-from tactile_resonance.analysis import write_whole
+from tactile_resonance.files import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.messages import definition_and_hash, message_types

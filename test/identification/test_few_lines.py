@@ -2,14 +2,12 @@
 """Lines just enough, and fewer: a status with its reason, or a `ValueError` that names the field."""
 
 import warnings
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from benchmarks.poles_plant import HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.single_point import single
@@ -44,15 +42,10 @@ def test_every_count_of_lines_has_an_answer(periods, structure, ratio):
     for lines in (1, 3, 5, 7, 9, 13):
         for plan, realisations in (
             (JointPlan, 1),
-            (CompiledJointPlan, 1),
             (RealisationsPlan, 1),
             (RealisationsPlan, 2),
             (RealisationsPlan, 3),
         ):
-            if plan is CompiledJointPlan and not (
-                periods > 1 and structure.order == 2 and find_spec("numba")
-            ):
-                continue
             try:
                 made = plan_on(plan, lines, periods, structure, ratio)
             except ValueError as error:

@@ -115,24 +115,10 @@ def test_a_complete_model_lacks_nothing(cell, structure):
     fit = plan.from_bins(u, y)
     theta = [fit.fit.denominator[:, :-1], fit.fit.numerator, fit.fit.transient]
     variance_y, variance_u = (np.ascontiguousarray(v) for v in np.split(fit.noise_variance, 2, 1))
-    u_e, y_e = (v[:, plan.excited_at] for v in (u, y))
-    data = [BinData(y_e, u_e, variance_y, variance_u)]
-    if plant.periods > 1:
-        data.insert(0, BinData(y[:, plan.others_at], None, variance_y))
+    of_y, of_u = (v[:, None] for v in (variance_y, variance_u))
+    data = BinData.of(
+        y[:, None], u[:, None], plan.other_bins.size, of_y, of_u, None, of_y, order=plan.order
+    )
     lacking = lacking_terms(plan, data, np.concatenate(theta, axis=1))
     alarms = np.isfinite(lacking[:, 0]).sum()
     assert stats.binom.sf(alarms - 1, runs, 4e-4) > 0.0005
-
-
-def test_compiled_points_are_asked_too():
-    pytest.importorskip("numba")
-    from tactile_resonance.identification.joint_compiled import CompiledJointPlan
-
-    plant = Plant(0.02, 14.0, 2)
-    u, y = with_mode(plant, 100, 254.0, 0.02, 0.33)
-    plain, compiled = (
-        plan_for(plant, kind=k).from_bins(u, y) for k in (JointPlan, CompiledJointPlan)
-    )
-    assert plain.has_status(PolesStatus.MODEL_ERROR).mean() > 0.4
-    assert np.mean(compiled.status_code != plain.status_code) <= 0.02
-    assert compiled.lacking == pytest.approx(plain.lacking, rel=1e-2, nan_ok=True)

@@ -19,7 +19,6 @@ from scipy import stats
 
 from tactile_resonance.identification.identify import identify_batch
 from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.joint_compiled import CompiledJointPlan
 from tactile_resonance.identification.result import PolesStatus
 from tactile_resonance.identification.significance import squared_distance
 from tactile_resonance.identification.single_point import single
@@ -56,15 +55,9 @@ def test_frfs_without_a_mode_have_none():
     ).mean() < 0.5  # some fits found one
 
 
-def compiled_plan(*kind):
-    pytest.importorskip("numba", reason="the compiled estimator needs numba, which is optional")
-    return CompiledJointPlan(*kind)
-
-
-@pytest.mark.parametrize("plan_of", [JointPlan, compiled_plan], ids=["plain", "compiled"])
 @pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
-def test_records_of_noise_have_none(plan_of, structure):
-    result = from_noise(plan_of, structure)
+def test_records_of_noise_have_none(structure):
+    result = from_noise(JointPlan, structure)
     told = result.has_status(PolesStatus.OK) | result.has_status(PolesStatus.MODEL_ERROR)
     assert stats.binom.sf(told.sum() - 1, RUNS, 1e-3) > 1e-3
 

@@ -19,16 +19,11 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
-from tactile_resonance.identification.arrow import ArrowInverse
-from tactile_resonance.identification.bins import BinData
-from tactile_resonance.identification.dense import jacobian_covariance, minimise_dense
 from tactile_resonance.identification.joint import JointPlan
 from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.identification.realisations import RealisationsPlan
 from tactile_resonance.identification.result import PolesStatus
-from tactile_resonance.identification.shared_points import minimise_shared, side_by_side
 from tactile_resonance.identification.single_point import single
-from tactile_resonance.identification.solver import minimise
 from tactile_resonance.identification.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)
@@ -138,7 +133,9 @@ def test_one_realisation_that_departs_from_all_others_is_named(odd):
     all_plants[odd] = Plant(0.0205, 40.0, 2, seed=10 + odd)
     result = plan_of(2).from_bins(*spectra(all_plants, rng, 50))
     assert result.has_status(PolesStatus.MODEL_ERROR).all()
-    named = [f"realisation {odd + 1} departs from the other 3, which agree" in r for r in result.remark]
+    named = [
+        f"realisation {odd + 1} departs from the other 3, which agree" in r for r in result.remark
+    ]
     assert np.mean(named) > 0.7  # the others differ as much by chance in half of the cases at most
     agreeing = plan_of(2).from_bins(*spectra(plants(0.02, 40.0, 2, 4), rng, RUNS))
     wrongly = sum("departs" in remark for remark in agreeing.remark)
@@ -187,39 +184,6 @@ def test_a_neighbouring_mode_is_a_model_error(realisations, periods, distorted):
     assert np.all(total > 2 * noise)
 
 
-@pytest.mark.parametrize("periods", [1, 3])
-def test_eliminated_transients_equal_all_side_by_side(periods):
-    """Coefficients, their covariance and the condition number of the whole block arrow."""
-    all_plants = plants(0.02, 40.0, periods, 3)
-    u, y = (v.reshape(-1, v.shape[-1]) for v in spectra(all_plants, np.random.default_rng(6), 2))
-    plan = plan_of(periods)
-    variance = np.full((u.shape[0], 1), all_plants[0].noise[0])
-    data = [BinData(y[:, plan.excited_at], u[:, plan.excited_at], variance, variance)]
-    if periods > 1:
-        data.insert(0, BinData(y[:, plan.others_at], None, variance))
-    solution = minimise_shared(plan.problem, data, 3)
-    assert solution.converged.all()
-    shared = sum(plan.problem.sizes[:2])
-    inverse = ArrowInverse.of(solution.normal.sum(axis=2), shared)
-    for k in range(2):
-        stacked, parts = side_by_side(
-            plan.problem, [values.rows(slice(3 * k, 3 * k + 3)) for values in data]
-        )
-        dense = minimise_dense(stacked, parts)
-        covariance, condition = jacobian_covariance(dense.jacobian)
-        std = np.sqrt(0.5 * np.diag(covariance))
-        found = np.concatenate(
-            [solution.theta[k, 0, :shared], solution.theta[k, :, shared:].ravel()]
-        )
-        assert np.all(np.abs(found - dense.theta) < 1e-3 * std)
-        assert np.allclose(
-            solution.theta[k, :, :shared], solution.theta[k, :1, :shared], rtol=1e-12
-        )
-        assert inverse.shared[k] == pytest.approx(covariance[:shared, :shared], rel=1e-2)
-        assert solution.cost[k] == pytest.approx(dense.group_cost.sum(), rel=1e-6)
-        assert 1 / 3 < inverse.condition[k] / condition < 11
-
-
 @pytest.mark.parametrize("periods", [1, 4])
 def test_one_realisation_is_what_it_always_was(periods):
     plant = Plant(0.02, 40.0, periods)
@@ -230,14 +194,6 @@ def test_one_realisation_is_what_it_always_was(periods):
     result = plan.from_bins(u[:, None], y[:, None])
     for name in ("f0_hz", "damping_ratio", "covariance", "cost", "residual", "status_code"):
         assert getattr(result, name) == pytest.approx(getattr(alone, name), rel=1e-9, nan_ok=True)
-    # and so is the fit itself where a transient is eliminated that could have stayed
-    one = np.ones((4, 1))
-    data = [BinData(y[:, plan.excited_at], u[:, plan.excited_at], one, 0.3 * one)]
-    if periods > 1:
-        data.insert(0, BinData(y[:, plan.others_at], None, one))
-    found, expected = minimise_shared(plan.problem, data, 1), minimise(plan.problem, data)
-    assert found.theta[:, 0] == pytest.approx(expected.theta, rel=1e-9)
-    assert found.normal[:, 0] == pytest.approx(expected.normal, rel=1e-6)
 
 
 @pytest.mark.parametrize("periods", [1, 2])

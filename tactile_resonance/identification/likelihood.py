@@ -1,0 +1,1044 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cost of ``Y = (B U + C) / A`` on bins, for (points, records, bins), compiled by numba.
+
+A record has undriven bins, on which there is only a transient C and noise, and then driven ones:
+
+    cost = sum_undriven |Y - C/A|^2 / s_rest^2
+         + sum_driven |Y - (B U + C)/A|^2 / (s_Y^2 + s_U^2 |B/A|^2 - 2 Re(s_YU conj(B/A)))
+
+(Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012), sections
+8.3, 9.11 and 12.3). The records of a point share A and B; each has a C of its own. An FRF is one record
+of driven bins with U = 1 and without C.
+
+Derivatives of the error are basis functions times one complex factor for A, one for B, one for C. So the
+normal matrix ``Re J^H J`` and the gradient are sums over bins of products of two basis functions, which
+are computed once (`Tables`), times weights that all coefficients of a kind share (`_weigh`). The gradient
+is exact; the normal matrix leaves out the derivative of the variance, which is smaller by the
+signal-to-noise ratio of the input.
+
+numba keeps the machine code beside this file, or in its own cache directory (NUMBA_CACHE_DIR). It looks
+at the date of this file alone: whatever is compiled for the fit is in here.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cache, wraps
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    # Sums may be reordered, else no loop that adds up uses vector instructions; NaN and infinity keep
+    # their meaning.
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+    # A division by zero is infinite, as in numpy, and not an exception that every loop would test for.
+    "error_model": "numpy",
+}
+
+_KERNELS: list[Any] = []
+
+
+def _entry(kernel: Callable) -> Callable:
+    """What Python calls: one kind of arrays, whatever it is given, so that a kernel is compiled once."""
+    _KERNELS.append(kernel)
+
+    @wraps(kernel)
+    def call(*arguments):
+        return kernel(
+            *(np.require(x, None, ["C", "W"]) if isinstance(x, np.ndarray) else x for x in arguments)
+        )
+
+    return call
+
+
+BLOCK = 48
+"""Bins taken together: a multiple of the vectors of all processors, and few enough for the cache."""
+
+# Rows of a block in the memory of a kernel: real parts of A, B, C, the error E, and behind each the
+# imaginary ones; one over the variance of E; the variances of Y and U, their covariance.
+_A, _B, _C, _E, _V, _VY, _VU, _COV = 0, 2, 4, 6, 8, 9, 10, 11
+# Then weights, in the order of their rows, complex ones real part first. With X = Y - E and w = 1 / (|A|^2
+# v): w |X|^2, -w conj(X), w; the gradient by A, and minus that by C. With an input: -w conj(X) U, w |U|^2,
+# w conj(U); minus the gradient by B.
+_AA, _AC, _CC, _OF_A, _OF_C, _AB, _BB, _BC, _OF_B = 13, 14, 16, 17, 19, 21, 23, 24, 26
+_ROWS = 28
+
+# What is linearised: the error, or ``A Y - B U - C`` over |A| or over 1 (Sanathanan-Koerner iterations).
+EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
+
+TINY = float(np.finfo(float).tiny)
+MOST_DAMPING = 1e10
+LEAST_DAMPING = 1e-3
+
+
+# Weight of the products of two kinds of coefficients, of C, A and B in this order.
+_WEIGHTS = {(0, 0): _CC, (0, 1): _AC, (0, 2): _BC, (1, 1): _AA, (1, 2): _AB, (2, 2): _BB}
+
+
+class Part(NamedTuple):
+    """Undriven or driven bins in blocks, the last one filled up with bins that add nothing.
+
+    Attributes
+    ----------
+    bins : int
+    last : (blocks, 2, BLOCK) float
+        Polynomial of A whose coefficient is 1: real and imaginary part.
+    basis : (blocks, pairs, 2, BLOCK) float
+        Real or imaginary parts of basis functions, those that are not 0 throughout: of polynomials of an
+        imaginary variable every second one is. In pairs that add to the same row of the memory.
+    row : (pairs,) int
+        That row; less one and with a minus where nothing is there yet.
+    place : (pairs, 2) int
+        Which coefficient each belongs to, in the order C, A, B and 1.
+    products : (blocks, pairs, 2, BLOCK) float
+        Products of basis functions, real or imaginary parts, in pairs with the same weight.
+    weight : (pairs,) int
+        Its row in the memory.
+    target : (pairs, 2) int
+        Where each sum goes in a flat (n, n + 1) matrix: above the diagonal, the gradient in the last
+        column; one beyond the end for a row that fills a pair.
+    """
+
+    bins: int
+    last: FloatArray
+    basis: FloatArray
+    row: IntArray
+    place: IntArray
+    products: FloatArray
+    weight: IntArray
+    target: IntArray
+
+    @classmethod
+    def of(cls, last: ComplexArray, bases: Sequence[ComplexArray], n: int) -> Part:
+        """Of the last polynomial of A (K,), bases (K, terms) of C, A and B, and all coefficients."""
+        bins, empty = last.size, -last.size % BLOCK
+        last = np.append(last, np.ones(empty))
+        functions = [
+            (np.append(f, np.zeros(empty)), kind)
+            for kind, basis in enumerate(bases)
+            for f in basis.T
+        ]
+        by_row: dict[int, list[tuple[FloatArray, int]]] = {_A: [], _A + 1: []}
+        by_weight: dict[int, list[tuple[FloatArray, int]]] = {}
+        for i, (f, kind) in enumerate(functions):
+            row, weight = (_C, _A, _B)[kind], (_OF_C, _OF_A, _OF_B)[kind]
+            for k, values in enumerate((f.real, f.imag)):
+                if np.any(values):
+                    by_row.setdefault(row + k, []).append((values, i))
+            # a complex weight times the product, its real part
+            products = [(weight, f, n)]
+            for j, (g, its) in enumerate(functions[i:], i):
+                backwards = kind == 0 and its > 0  # weights are of conj(A) C and conj(B) C
+                products.append(
+                    (_WEIGHTS[kind, its], f * g.conj() if backwards else f.conj() * g, j)
+                )
+            for weight, values, j in products:
+                parts = [values.real] if weight in (_AA, _BB, _CC) else [values.real, -values.imag]
+                for k, part in enumerate(parts):
+                    if np.any(part):
+                        by_weight.setdefault(weight + k, []).append((part, i * (n + 1) + j))
+        for k, values in enumerate((last.real, last.imag)):
+            by_row[_A + k].append((values, n))
+        zeros, blocks = np.zeros(last.size), last.size // BLOCK
+        added = [
+            (-1 - row if k == 0 else row, *pair)
+            for row, entries in by_row.items()
+            for k, pair in enumerate(zip(entries[::2], [*entries[1::2], (zeros, n)], strict=False))
+        ]
+        pairs = [
+            (weight, *pair)
+            for weight, entries in sorted(by_weight.items())
+            for pair in zip(entries[::2], [*entries[1::2], (zeros, n * (n + 1))], strict=False)
+        ]
+        return cls(
+            bins,
+            _blocks([last.real, last.imag], blocks),
+            _paired([pair for _, *pair in added], blocks),
+            *_numbers(added),
+            _paired([pair for _, *pair in pairs], blocks),
+            *_numbers(pairs),
+        )
+
+
+def _paired(pairs: list[list[tuple[FloatArray, int]]], blocks: int) -> FloatArray:
+    """(blocks, pairs, 2, BLOCK)."""
+    rows = _blocks([values for pair in pairs for values, _ in pair], blocks)
+    return rows.reshape(blocks, len(pairs), 2, BLOCK)
+
+
+def _numbers(pairs: list[tuple]) -> tuple[IntArray, IntArray]:
+    """(pairs,) first entries, (pairs, 2) last entries of both."""
+    return (
+        np.array([first for first, *_ in pairs], np.int64),
+        np.array([[place for _, place in pair] for _, *pair in pairs], np.int64).reshape(-1, 2),
+    )
+
+
+def _blocks(rows: list[FloatArray], blocks: int) -> FloatArray:
+    """(blocks, rows, BLOCK) of rows (blocks BLOCK,)."""
+    values = np.array(rows, float).reshape(len(rows), blocks, BLOCK)
+    return np.ascontiguousarray(values.swapaxes(0, 1))
+
+
+class Tables(NamedTuple):
+    """Basis functions on all bins, and the numbers of coefficients of A, B and C."""
+
+    undriven: Part
+    driven: Part
+    a: int
+    b: int
+    c: int
+
+    @classmethod
+    def of(
+        cls, denominator: ComplexArray, numerator: ComplexArray, transient: ComplexArray
+    ) -> Tables:
+        """Of bases (K, a + 1), (K_driven, b) and (K, c) with the undriven bins first."""
+        first = denominator.shape[0] - numerator.shape[0]
+        a, b, c = denominator.shape[1] - 1, numerator.shape[1], transient.shape[1]
+        n = a + b + c
+        undriven, driven = (
+            Part.of(denominator[here, a], [transient[here], denominator[here, :a], *more], n)
+            for here, more in ((slice(0, first), ()), (slice(first, None), (numerator,)))
+        )
+        return cls(undriven, driven, a, b, c)
+
+
+class Arrays(NamedTuple):
+    """Data of a batch, in blocks.
+
+    Attributes
+    ----------
+    y, u : (points, M, blocks, 2, BLOCK) float
+        Real and imaginary parts; on undriven bins u is what is seen of noise.
+    rest, variance_y, variance_u : (points, M or 1, blocks or 1, 1, BLOCK or 1) float
+        Of Y on undriven bins, and of Y and U on driven ones; infinite where a bin is to be left out. The
+        third axis of `variance_u` is 0 long where U is exact.
+    covariance_yu : (points, M or 1, blocks or 1 or 0, 2, BLOCK or 1) float
+    """
+
+    y: FloatArray
+    u: FloatArray
+    rest: FloatArray
+    variance_y: FloatArray
+    variance_u: FloatArray
+    covariance_yu: FloatArray
+
+
+@_entry
+@njit(**OPTIONS)
+def planes(values, order, undriven):
+    """Complex values (points, M, K) in blocks (points, M, blocks, 2, BLOCK).
+
+    In `order` (bins,), the undriven ones first and in blocks of their own.
+    """
+    points, records, _ = values.shape
+    before = -(-undriven // BLOCK)
+    out = np.zeros((points, records, before + -(-(order.size - undriven) // BLOCK), 2, BLOCK))
+    for point in range(points):
+        for m in range(records):
+            source = values[point, m]
+            for block in range(out.shape[2]):
+                driven = block >= before
+                first = undriven + BLOCK * (block - before) if driven else BLOCK * block
+                here = out[point, m, block]
+                for k in range(min(BLOCK, (order.size if driven else undriven) - first)):
+                    value = source[order[first + k]]
+                    here[0, k], here[1, k] = value.real, value.imag
+    return out
+
+
+def from_planes(blocks: FloatArray, undriven: int, driven: int) -> ComplexArray:
+    """Complex values (points, M, K) of `planes`."""
+    values = (blocks[..., 0, :] + 1j * blocks[..., 1, :]).reshape(*blocks.shape[:2], -1)
+    first = -(-undriven // BLOCK) * BLOCK
+    return np.concatenate([values[..., :undriven], values[..., first : first + driven]], axis=-1)
+
+
+def in_blocks(values: Sequence[npt.NDArray], points: int = 1) -> FloatArray:
+    """Real values (points, M or 1, K or 1) in blocks (points, M or 1, blocks, how many, BLOCK), filled with 1.
+
+    One block of one for all bins where the last axis is 1 long; no block where there are no values.
+    """
+    if not values:
+        return np.empty((points, 1, 0, 1, 1))
+    shape, bins = values[0].shape[:-1], values[0].shape[-1]
+    if bins == 1:
+        return np.ascontiguousarray(np.stack(values, axis=-2), float)[..., None, :, :]
+    blocks = -(-bins // BLOCK)
+    out = np.ones((*shape, blocks * BLOCK, len(values)))
+    for k, value in enumerate(values):
+        out[..., :bins, k] = value
+    out = out.reshape(*shape, blocks, BLOCK, len(values))
+    return np.ascontiguousarray(out.swapaxes(-1, -2))
+
+
+@njit(**OPTIONS)
+def _set(row, value, rows):
+    for k in range(BLOCK):
+        rows[row, k] = value
+
+
+@njit(**OPTIONS)
+def _fill(values, block, row, count, rows):
+    """Rows from values (blocks, count, BLOCK), or (1, count, 1) for all bins, or 0 from none.
+
+    What is the same for all bins stays from the first block on.
+    """
+    if block > 0 and (values.shape[0] == 0 or values.shape[2] == 1):
+        return
+    for i in range(count):
+        if values.shape[0] == 0:
+            _set(row + i, 0.0, rows)
+        elif values.shape[2] == 1:
+            _set(row + i, values[0, i, 0], rows)
+        else:
+            for k in range(BLOCK):
+                rows[row + i, k] = values[block, i, k]
+
+
+@njit(**OPTIONS)
+def _combine(basis, row, place, block, coefficients, linear, rows):
+    """A, B and C of a block; of a linear kind A alone."""
+    for i in range(row.size):
+        to = row[i]
+        f, g = coefficients[place[i, 0]], coefficients[place[i, 1]]
+        if to >= 0:
+            if not (linear and to >= _B):
+                for k in range(BLOCK):
+                    rows[to, k] += f * basis[block, i, 0, k] + g * basis[block, i, 1, k]
+        else:
+            to = -1 - to
+            if not (linear and to >= _B):
+                for k in range(BLOCK):
+                    rows[to, k] = f * basis[block, i, 0, k] + g * basis[block, i, 1, k]
+
+
+@njit(**OPTIONS)
+def _weigh_linear(y, u, last, block, weighted, flat):
+    """Weights of ``A Y - B U - C`` over ``|A|``, or over 1, with the derivatives at 0."""
+    for k in range(BLOCK):
+        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
+        w = 1 / flat[_VY * BLOCK + k]
+        if weighted:
+            w /= re * re + im * im
+        l_re, l_im = last[block, 0, k], -last[block, 1, k]
+        y_re, y_im = y[0, k], y[1, k]
+        u_re, u_im = u[0, k], u[1, k]
+        squared, x_re, x_im = w * (y_re * y_re + y_im * y_im), -w * y_re, w * y_im
+        z_re, z_im = x_re * l_re - x_im * l_im, x_re * l_im + x_im * l_re
+        flat[_AA * BLOCK + k] = squared
+        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = x_re, x_im
+        flat[_CC * BLOCK + k] = w
+        flat[_OF_A * BLOCK + k], flat[(_OF_A + 1) * BLOCK + k] = squared * l_re, squared * l_im
+        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = z_re, z_im
+        flat[_AB * BLOCK + k] = x_re * u_re - x_im * u_im
+        flat[(_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
+        flat[_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
+        flat[_BC * BLOCK + k], flat[(_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
+        flat[_OF_B * BLOCK + k] = z_re * u_re - z_im * u_im
+        flat[(_OF_B + 1) * BLOCK + k] = z_re * u_im + z_im * u_re
+
+
+@njit(**OPTIONS)
+def _weigh_undriven(y, flat):
+    """Errors and weights of a block of undriven bins; its cost."""
+    cost = 0.0
+    for k in range(BLOCK):
+        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
+        v = 1 / flat[_VY * BLOCK + k]
+        squared = 1 / (re * re + im * im)
+        i_re, i_im = re * squared, -im * squared
+        c_re, c_im = flat[_C * BLOCK + k], flat[(_C + 1) * BLOCK + k]
+        m_re, m_im = c_re * i_re - c_im * i_im, c_re * i_im + c_im * i_re
+        e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
+        w = v * squared
+        z_re, z_im = v * (e_re * i_re + e_im * i_im), v * (e_re * i_im - e_im * i_re)
+        cost += v * (e_re * e_re + e_im * e_im)
+        flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k] = e_re, e_im
+        flat[_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
+        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = -w * m_re, w * m_im
+        flat[_CC * BLOCK + k] = w
+        flat[_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im
+        flat[(_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re
+        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = -z_re, -z_im
+    return cost
+
+
+@njit(**OPTIONS)
+def _weigh_driven(y, u, flat):
+    """Errors and weights of a block of driven bins; its cost.
+
+    The variance of the error depends on the response: the gradient has its derivative too.
+    """
+    cost = 0.0
+    for k in range(BLOCK):
+        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
+        squared = 1 / (re * re + im * im)
+        i_re, i_im = re * squared, -im * squared
+        b_re, b_im = flat[_B * BLOCK + k], flat[(_B + 1) * BLOCK + k]
+        g_re, g_im = b_re * i_re - b_im * i_im, b_re * i_im + b_im * i_re
+        u_re, u_im = u[0, k], u[1, k]
+        c_re, c_im = flat[_C * BLOCK + k], flat[(_C + 1) * BLOCK + k]
+        m_re = c_re * i_re - c_im * i_im + g_re * u_re - g_im * u_im
+        m_im = c_re * i_im + c_im * i_re + g_re * u_im + g_im * u_re
+        e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
+        s_re, s_im = flat[_COV * BLOCK + k], flat[(_COV + 1) * BLOCK + k]
+        # half the derivative of the variance by g
+        d_re = flat[_VU * BLOCK + k] * g_re - s_re
+        d_im = s_im - flat[_VU * BLOCK + k] * g_im
+        v = 1 / (flat[_VY * BLOCK + k] + (d_re - s_re) * g_re - (d_im + s_im) * g_im)
+        power = v * (e_re * e_re + e_im * e_im)
+        cost += power
+        w = v * squared
+        z_re, z_im = v * (e_re * i_re + e_im * i_im), v * (e_re * i_im - e_im * i_re)
+        h = v * power
+        h_re, h_im = h * (d_re * i_re - d_im * i_im), h * (d_re * i_im + d_im * i_re)
+        x_re, x_im = -w * m_re, w * m_im
+        flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k], flat[_V * BLOCK + k] = e_re, e_im, v
+        flat[_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
+        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = x_re, x_im
+        flat[_CC * BLOCK + k] = w
+        flat[_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im + h_re * g_re - h_im * g_im
+        flat[(_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re + h_re * g_im + h_im * g_re
+        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = -z_re, -z_im
+        flat[_AB * BLOCK + k] = x_re * u_re - x_im * u_im
+        flat[(_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
+        flat[_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
+        flat[_BC * BLOCK + k], flat[(_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
+        flat[_OF_B * BLOCK + k] = -(z_re * u_re - z_im * u_im + h_re)
+        flat[(_OF_B + 1) * BLOCK + k] = -(z_re * u_im + z_im * u_re + h_im)
+    return cost
+
+
+@njit(**OPTIONS)
+def _add_up(products, weight, target, block, rows, gram):
+    """Add the normal matrix and half the gradient of a block."""
+    for pair in range(weight.size):
+        row = weight[pair]
+        first = second = 0.0
+        for k in range(BLOCK):
+            w = rows[row, k]
+            first += products[block, pair, 0, k] * w
+            second += products[block, pair, 1, k] * w
+        gram[target[pair, 0]] += first
+        gram[target[pair, 1]] += second
+
+
+@njit(**OPTIONS)
+def _turn(u, flat):
+    """Weighted errors, turned by the phase of the input, in place of the weights of A with C."""
+    for k in range(BLOCK):
+        re, im = u[0, k], u[1, k]
+        e_re, e_im = flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k]
+        squared = re * re + im * im
+        nothing = not squared > 0
+        re, squared = (1.0 if nothing else re), (1.0 if nothing else squared)
+        scale = np.sqrt(flat[_V * BLOCK + k] / squared)
+        flat[_AC * BLOCK + k] = scale * (e_re * re + e_im * im)
+        flat[(_AC + 1) * BLOCK + k] = scale * (e_im * re - e_re * im)
+
+
+@njit(**OPTIONS)
+def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, errors, sums, size):
+    """Sums over the undriven or driven bins of a record; the cost.
+
+    Written are, where they are not empty, the normal matrix with half the gradient as a flat (n, n + 1)
+    matrix; errors (K,), of undriven bins as they are, of driven ones weighted and turned by the phase of the
+    input; and added to are `sums`, see `undriven_powers`.
+    """
+    bins, last, basis, row, place, products, weight, target = part
+    y, u, rest, variance_y, variance_u, covariance_yu = data
+    flat, rows = memory
+    of_bins = variance_y if driven else rest
+    variance = of_bins[point, min(m, of_bins.shape[1] - 1)]
+    of_input = variance_u[point, min(m, variance_u.shape[1] - 1)]
+    covariance = covariance_yu[point, min(m, covariance_yu.shape[1] - 1)]
+    for i in range(gram.size):
+        gram[i] = 0.0
+    cost = 0.0
+    before = y.shape[2] - last.shape[0] if driven else 0
+    for block in range(last.shape[0]):
+        here, its = y[point, m, before + block], u[point, m, before + block]
+        _fill(variance, block, _VY, 1, rows)
+        if kind != LINEAR_UNWEIGHTED:
+            _combine(basis, row, place, block, coefficients, kind == LINEAR, rows)
+        if kind != EXACT:
+            _weigh_linear(here, its, last, block, kind == LINEAR, flat)
+        elif driven:
+            _fill(of_input, block, _VU, 1, rows)
+            _fill(covariance, block, _COV, 2, rows)
+            cost += _weigh_driven(here, its, flat)
+        else:
+            cost += _weigh_undriven(here, flat)
+        if gram.size > 0:
+            _add_up(products, weight, target, block, rows, gram)
+        if sums.size > 0:
+            _add_power(its, BLOCK * block, bins, size, rows, sums)
+        if errors.size > 0:
+            out, first = _E, BLOCK * block
+            if driven:
+                _turn(its, flat)
+                out = _AC
+            for k in range(min(BLOCK, bins - first)):
+                errors[first + k] = complex(rows[out, k], rows[out + 1, k])
+    return cost
+
+
+@njit(**OPTIONS)
+def _gram(tables, data, point, theta, kind, memory, gram, cost):
+    """Normal matrices and half the gradients of undriven and driven bins, (M, 2, n (n + 1) + 1).
+
+    Theta (M, n + 1) and these in the order C, A, B: what records do not share comes first; theta ends with
+    1. Costs (2,) of the point are written too.
+    """
+    cost[0] = cost[1] = 0.0
+    undriven, driven, none, sums = tables.undriven, tables.driven, memory[2], memory[3]
+    block = memory[:2]
+    for m in range(theta.shape[0]):
+        at = theta[m]
+        if undriven.bins > 0:
+            cost[0] += _of_part(
+                undriven, False, data, point, m, at, kind, block, gram[m, 0], none, sums, 1
+            )
+        cost[1] += _of_part(
+            driven, True, data, point, m, at, kind, block, gram[m, 1], none, sums, 1
+        )
+    return cost[0] + cost[1]
+
+
+@njit(**OPTIONS)
+def _solve(gram, c, n, damping, work, total, step):
+    """Solve the normal equations of all records; the step's decrement of the cost, NaN without a step.
+
+    Own coefficients of each record are eliminated first: the cost of a step grows as M, not as its cube
+    (Golub & Van Loan, *Matrix Computations*, 4th ed. (2013), section 3.2.11). Without pivoting, whose
+    rounding is that of Cholesky's method whatever the scales of the unknowns.
+
+    Parameters
+    ----------
+    work : (M, n, n + 1) float
+        Overwritten.
+    total : (n - c, n - c + 1) float
+        Overwritten.
+    step : (M, n) float
+        Out.
+    """
+    records, shared, width = gram.shape[0], n - c, n + 1
+    for i in range(shared):
+        for j in range(shared + 1):
+            total[i, j] = 0.0
+    more = 1 + 1e-15 + damping
+    for m in range(records):
+        matrix, first, second = work[m], gram[m, 0], gram[m, 1]
+        for i in range(n):
+            for j in range(i, width):
+                matrix[i, j] = first[i * width + j] + second[i * width + j]
+            matrix[i, i] *= more
+        for i in range(c):
+            if not matrix[i, i] > 0:
+                return np.nan
+            inverse = 1 / matrix[i, i]
+            for j in range(i + 1, n):
+                factor = matrix[i, j] * inverse
+                for k in range(j, width):
+                    matrix[j, k] -= factor * matrix[i, k]
+        for i in range(shared):
+            for j in range(i, shared + 1):
+                total[i, j] += matrix[c + i, c + j]
+    for i in range(shared):
+        if not total[i, i] > 0:
+            return np.nan
+        inverse = 1 / total[i, i]
+        for j in range(i + 1, shared):
+            factor = total[i, j] * inverse
+            for k in range(j, shared + 1):
+                total[j, k] -= factor * total[i, k]
+    for i in range(shared - 1, -1, -1):
+        value = total[i, shared]
+        for j in range(i + 1, shared):
+            value -= total[i, j] * step[0, c + j]
+        step[0, c + i] = value / total[i, i]
+    decrement = 0.0
+    for m in range(records):
+        matrix = work[m]
+        for i in range(c, n):
+            step[m, i] = step[0, i]
+        for i in range(c - 1, -1, -1):
+            value = matrix[i, n]
+            for j in range(i + 1, n):
+                value -= matrix[i, j] * step[m, j]
+            step[m, i] = value / matrix[i, i]
+        for i in range(n):
+            at = i * width + n
+            decrement += step[m, i] * (gram[m, 0, at] + gram[m, 1, at])
+    return decrement
+
+
+@njit(**OPTIONS)
+def _inside(theta, c, out):
+    """Coefficients (M, n + 1) in the order C, A, B and 1 from [A, B, C]."""
+    n = theta.shape[1]
+    for m in range(theta.shape[0]):
+        for i in range(n):
+            out[m, i] = theta[m, i + n - c if i < c else i - c]
+
+
+@njit(**OPTIONS)
+def _outside(coefficients, c, out):
+    """Coefficients (M, n) in the order [A, B, C] from C, A, B."""
+    n = out.shape[1]
+    for m in range(out.shape[0]):
+        for i in range(n):
+            out[m, i + n - c if i < c else i - c] = coefficients[m, i]
+
+
+@njit(**OPTIONS)
+def _unpacked(gram, c, gradient, normal):
+    """Gradient (M, n) and normal matrices (M, 2, n, n) in the order of theta."""
+    n = gradient.shape[1]
+    for m in range(gram.shape[0]):
+        for i in range(n):
+            at = i + n - c if i < c else i - c
+            gradient[m, at] = gram[m, 0, i * (n + 1) + n] + gram[m, 1, i * (n + 1) + n]
+            for j in range(i, n):
+                to = j + n - c if j < c else j - c
+                for part in range(2):
+                    value = gram[m, part, i * (n + 1) + j]
+                    normal[m, part, at, to] = value
+                    normal[m, part, to, at] = value
+
+
+@njit(**OPTIONS)
+def _memory(records, c, n):
+    """Memory of a block, a gram, what `_solve` computes in, coefficients, a step, costs."""
+    rows = np.zeros((_ROWS, BLOCK))
+    return (
+        (rows.reshape(-1), rows, np.empty(0, np.complex128), np.empty((4, 0))),
+        np.zeros((records, 2, n * (n + 1) + 1)),
+        np.empty((records, n, n + 1)),
+        np.empty((n - c, n - c + 1)),
+        np.ones((records, n + 1)),
+        np.empty((records, n)),
+        np.empty(2),
+    )
+
+
+@_entry
+@njit(**OPTIONS)
+def moments(tables, data, theta):
+    """Cost, gradient and normal matrices of a batch.
+
+    Parameters
+    ----------
+    tables : Tables
+    data : Arrays
+    theta : (points, M, n) float
+        Coefficients [A without its last, B, C] of each record, A and B alike in all.
+
+    Returns
+    -------
+    cost : (points, 2) float
+        Of undriven and of driven bins.
+    gradient : (points, M, n) float
+        Half of it.
+    normal : (points, M, 2, n, n) float
+    """
+    points, records, n = theta.shape
+    memory, gram, _, _, at, _, _ = _memory(records, tables.c, n)
+    cost, gradient = np.empty((points, 2)), np.empty((points, records, n))
+    normal = np.empty((points, records, 2, n, n))
+    for point in range(points):
+        _inside(theta[point], tables.c, at)
+        _gram(tables, data, point, at, EXACT, memory, gram, cost[point])
+        _unpacked(gram, tables.c, gradient[point], normal[point])
+    return cost, gradient, normal
+
+
+@_entry
+@njit(**OPTIONS)
+def linear_fit(tables, data, theta, kind):
+    """Theta (points, M, n) of a Sanathanan-Koerner iteration, NaN where there is none.
+
+    `kind` is LINEAR, weighted over ``|A|`` at theta, or LINEAR_UNWEIGHTED; other parameters as of `moments`.
+    """
+    points, records, n = theta.shape
+    c = tables.c
+    memory, gram, systems, total, at, step, cost = _memory(records, c, n)
+    out = np.full_like(theta, np.nan)
+    for point in range(points):
+        _inside(theta[point], c, at)
+        _gram(tables, data, point, at, kind, memory, gram, cost)
+        if np.isfinite(_solve(gram, c, n, 0.0, systems, total, step)):
+            _outside(-step, c, out[point])
+    return out
+
+
+@njit(**OPTIONS)
+def _add_power(u, first, bins, size, rows, sums):
+    """Add the powers of a block of undriven bins to `sums`; see `undriven_powers`."""
+    pieces = sums.shape[1]
+    end = min(BLOCK, bins - first)
+    piece, k = min(first // size, pieces - 1), 0
+    while k < end:
+        until = min(end, (piece + 1) * size - first) if piece < pieces - 1 else end
+        of_error = of_u = cross_re = cross_im = 0.0
+        for i in range(k, until):
+            e_re, e_im, u_re, u_im = rows[_E, i], rows[_E + 1, i], u[0, i], u[1, i]
+            of_error += e_re * e_re + e_im * e_im
+            of_u += u_re * u_re + u_im * u_im
+            cross_re += e_re * u_re + e_im * u_im
+            cross_im += e_im * u_re - e_re * u_im
+        sums[0, piece] += of_error
+        sums[1, piece] += of_u
+        sums[2, piece] += cross_re
+        sums[3, piece] += cross_im
+        piece, k = piece + 1, until
+
+
+@_entry
+@njit(**OPTIONS)
+def undriven_powers(tables, data, theta, size, pieces):
+    """What errors and inputs of undriven bins add up to, over all records, in pieces of the band.
+
+    Parameters
+    ----------
+    tables, data, theta
+        As of `moments`.
+    size, pieces : int
+        Bins of a piece, the last one is longer; how many pieces.
+
+    Returns
+    -------
+    (points, 4, pieces) float
+        Squared moduli of errors, of inputs, real and imaginary parts of ``error conj(u)``.
+    """
+    points, records, n = theta.shape
+    memory, _, _, _, at, _, _ = _memory(records, tables.c, n)
+    part, none = tables.undriven, np.empty(0)
+    out = np.zeros((points, 4, pieces))
+    for point in range(points):
+        _inside(theta[point], tables.c, at)
+        for m in range(records):
+            sums = out[point]
+            _of_part(
+                part, False, data, point, m, at[m], EXACT, memory[:2], none, memory[2], sums, size
+            )
+    return out
+
+
+@_entry
+@njit(**OPTIONS)
+def begin(tables, of_driven, data, chance, size, pieces):
+    """Coefficients near the minimum, and the noise that undriven bins show there.
+
+    Two Sanathanan-Koerner iterations, then one undamped step with flat weights as the errors show them:
+    residuals are then all but noise.
+
+    Parameters
+    ----------
+    tables : Tables
+    of_driven : bool
+        Whether driven bins hold equations enough for start values.
+    data : Arrays
+        With variances of 1.
+    chance : float
+        Squared correlation of errors and inputs on undriven bins beyond which the input is taken for exact:
+        what is seen there has come through the system then.
+    size, pieces : int
+        See `undriven_powers`.
+
+    Returns
+    -------
+    theta : (points, M, n) float
+        NaN where there are no start values.
+    powers : (points, 4, pieces) float
+        Of `undriven_powers`.
+    """
+    points, records = data.y.shape[:2]
+    a, b, c = tables.a, tables.b, tables.c
+    n = a + b + c
+    memory, gram, systems, total, at, step, cost = _memory(records, c, n)
+    block, none, nothing = memory[:2], memory[2], memory[3]
+    y, u, rest, _, _, covariance = data
+    variance_y, variance_u = np.ones((points, 1, 1, 1, 1)), np.zeros((points, 1, 1, 1, 1))
+    weighted = Arrays(y, u, rest, variance_y, variance_u, covariance)
+    theta, powers = np.full((points, records, n), np.nan), np.zeros((points, 4, pieces))
+    sums, no_gram = np.zeros((4, 1)), np.empty(0)
+    for point in range(points):
+        found = True
+        for kind in (LINEAR_UNWEIGHTED, LINEAR):
+            for m in range(records):
+                here, now = gram[m, 0], at[m]
+                if of_driven:
+                    here[:] = 0.0
+                else:
+                    _of_part(
+                        tables.undriven, False, data, point, m, now, kind, block, here, none, nothing, 1
+                    )  # fmt: skip
+                here = gram[m, 1]
+                _of_part(
+                    tables.driven, True, data, point, m, now, kind, block, here, none, nothing, 1
+                )
+            found = found and np.isfinite(_solve(gram, c, n, 0.0, systems, total, step))
+            for m in range(records):
+                for i in range(n):
+                    at[m, i] = -step[m, i]
+        if not found:
+            continue
+        sums[:] = 0.0
+        for m in range(records):
+            here, now = gram[m, 0], at[m]
+            _of_part(
+                tables.undriven, False, data, point, m, now, EXACT, block, here, none, sums,
+                tables.undriven.bins,
+            )  # fmt: skip
+        of_error, of_u = sums[0, 0], sums[1, 0]
+        cross = sums[2, 0] ** 2 + sums[3, 0] ** 2
+        if of_error > TINY:
+            variance_y[point] = of_error / (records * tables.undriven.bins)
+        if not cross > chance * of_error * of_u:
+            variance_u[point] = of_u / (records * tables.undriven.bins)
+        for m in range(records):
+            here, now, factor = gram[m, 0], at[m], 1 / variance_y[point, 0, 0, 0, 0]
+            for i in range(here.size):
+                here[i] *= factor
+            here = gram[m, 1]
+            _of_part(
+                tables.driven, True, weighted, point, m, now, EXACT, block, here, none, nothing, 1
+            )
+        if np.isfinite(_solve(gram, c, n, 0.0, systems, total, step)):
+            for m in range(records):
+                for i in range(n):
+                    at[m, i] -= step[m, i]
+        for m in range(records):
+            now, its = at[m], powers[point]
+            _of_part(
+                tables.undriven, False, data, point, m, now, EXACT, block, no_gram, none, its, size
+            )  # fmt: skip
+        _outside(at, c, theta[point])
+    return theta, powers
+
+
+@_entry
+@njit(**OPTIONS)
+def undriven_errors(tables, data, theta):
+    """(points, M, K_undriven) Y less that of the model on undriven bins; parameters as of `moments`."""
+    points, records, n = theta.shape
+    memory, _, _, _, at, _, _ = _memory(records, tables.c, n)
+    part, none = tables.undriven, np.empty(0)
+    out = np.empty((points, records, part.bins), np.complex128)
+    for point in range(points):
+        _inside(theta[point], tables.c, at)
+        for m in range(records):
+            here = out[point, m]
+            _of_part(
+                part, False, data, point, m, at[m], EXACT, memory[:2], none, here, memory[3], 1
+            )
+    return out
+
+
+@_entry
+@njit(**OPTIONS)
+def minimise(tables, data, start, iterations, tolerance, rounding):
+    """Minimise the cost of each point: Levenberg-Marquardt steps.
+
+    Parameters
+    ----------
+    tables : Tables
+    data : Arrays
+    start : (points, M, n) float
+    iterations : int
+        Most steps tried.
+    tolerance : float
+        A step below this many standard deviations, as the residuals show them, is the last one taken.
+    rounding : float
+        Of a residual relative to the data it is the residual of.
+
+    Returns
+    -------
+    theta : (points, M, n) float
+    normal : (points, M, 2, n, n) float
+        Where the last step began.
+    cost : (points,) float
+    part_cost : (points, 2) float
+        Of undriven and driven bins, where the last step began.
+    residual : (points, M, K_driven) complex
+        Weighted errors, turned by the phase of the input: errors of a response are smooth over lines,
+        those of Y only after this, for the phases of the excitation are random.
+    converged : (points,) bool
+    """
+    points, records, n = start.shape
+    c = tables.c
+    memory, here, systems, total, at, step, part_now = _memory(records, c, n)
+    there, trial, gradient = np.zeros_like(here), np.ones_like(at), np.empty_like(step)
+    part_then, none, driven = np.empty(2), np.empty(0), tables.driven
+    theta, normal = np.empty_like(start), np.empty((points, records, 2, n, n))
+    cost, part_cost = np.empty(points), np.empty((points, 2))
+    residual = np.empty((points, records, tables.driven.bins), np.complex128)
+    converged = np.zeros(points, np.bool_)
+    bins = tables.undriven.bins + tables.driven.bins
+    tolerance = tolerance**2 / max(records * (2 * bins - c) - (n - c), 1)
+    for point in range(points):
+        _inside(start[point], c, at)
+        floor = rounding**2 * _weighted_power(data, point, tables.undriven.last.shape[0])
+        now = _gram(tables, data, point, at, EXACT, memory, here, part_now)
+        damping = 0.0
+        for _ in range(iterations):
+            if not np.isfinite(now) or damping > MOST_DAMPING:
+                break
+            decrement = _solve(here, c, n, damping, systems, total, step)
+            if np.isfinite(decrement):
+                for m in range(records):
+                    for i in range(n):
+                        trial[m, i] = at[m, i] - step[m, i]
+                if damping == 0 and decrement <= max(tolerance * now, floor):
+                    at[:] = trial
+                    now -= decrement
+                    converged[point] = True
+                    break
+                then = _gram(tables, data, point, trial, EXACT, memory, there, part_then)
+                # rounding of the cost itself must not count as an increase
+                if then <= now * (1 + 1e-12) + floor:
+                    at[:] = trial
+                    now = then
+                    here, there = there, here
+                    part_now, part_then = part_then, part_now
+                    damping = 0.0 if damping < 0.1 * LEAST_DAMPING else damping / 10
+                    continue
+            damping = max(10 * damping, LEAST_DAMPING)
+        cost[point] = now
+        part_cost[point] = part_now
+        for m in range(records):
+            errors, block = residual[point, m], memory[:2]
+            _of_part(driven, True, data, point, m, at[m], EXACT, block, none, errors, memory[3], 1)
+        _unpacked(here, c, gradient, normal[point])
+        _outside(at, c, theta[point])
+    return theta, normal, cost, part_cost, residual, converged
+
+
+@njit(**OPTIONS)
+def _weighted_power(data, point, undriven_blocks):
+    """``sum |Y|^2 / s_Y^2`` of a point."""
+    y, _, rest, variance_y, _, _ = data
+    power = 0.0
+    for m in range(y.shape[1]):
+        for block in range(y.shape[2]):
+            driven = block >= undriven_blocks
+            variances = variance_y if driven else rest
+            at = block - undriven_blocks if driven else block
+            its = variances[
+                point, min(m, variances.shape[1] - 1), min(at, variances.shape[2] - 1), 0
+            ]
+            if its.size == 1:
+                total = 0.0
+                for k in range(BLOCK):
+                    re, im = y[point, m, block, 0, k], y[point, m, block, 1, k]
+                    total += re * re + im * im
+                power += total / its[0]
+            else:
+                for k in range(BLOCK):
+                    re, im = y[point, m, block, 0, k], y[point, m, block, 1, k]
+                    power += (re * re + im * im) / its[k]
+    return power
+
+
+@_entry
+@njit(**OPTIONS)
+def invert(matrices):
+    """Inverses (batch, n, n) of positive definite matrices, and condition numbers of their roots.
+
+    Returns
+    -------
+    inverse : (batch, n, n) float
+        NaN where a matrix is singular or not finite.
+    condition : (batch,) float
+        Root of the Frobenius condition number with unit diagonal: that of a Jacobian with unit columns,
+        within a factor n. Infinite where there is no inverse.
+    """
+    batch, n = matrices.shape[0], matrices.shape[1]
+    inverses, conditions = np.empty((batch, n, n)), np.empty(batch)
+    scale, row = np.empty(n), np.empty(n)
+    for point in range(batch):
+        matrix, inverse = matrices[point], inverses[point]
+        before, good = 0.0, True
+        for i in range(n):
+            scale[i] = 1 / np.sqrt(matrix[i, i])
+        for i in range(n):
+            for j in range(n):
+                value = matrix[i, j] * scale[i] * scale[j]
+                inverse[i, j] = value
+                before += value * value
+        good = np.isfinite(before)
+        for k in range(n):  # sweeps
+            if not good:
+                break
+            pivot = inverse[k, k]
+            if not pivot > 0:
+                good = False
+                break
+            factor = 1 / pivot
+            for j in range(n):
+                row[j] = inverse[k, j]
+            for i in range(n):
+                if i != k:
+                    times = row[i] * factor
+                    for j in range(n):
+                        inverse[i, j] -= times * row[j]
+                    inverse[i, k] = times
+            for j in range(n):
+                inverse[k, j] *= factor
+            inverse[k, k] = -factor
+        after = 0.0
+        for i in range(n):
+            for j in range(i + 1):  # both halves: rounding made them differ
+                value = -0.5 * (inverse[i, j] + inverse[j, i])
+                after += value * value * (1.0 if i == j else 2.0)
+                value *= scale[i] * scale[j]
+                inverse[i, j], inverse[j, i] = value, value
+            good = good and inverse[i, i] > 0
+        conditions[point] = np.sqrt(np.sqrt(before * after)) if good else np.inf
+        if not good:
+            inverse[:] = np.nan
+    return inverses, conditions
+
+
+@cache
+def compiled() -> int:
+    """How many kernels were not in the cache and had to be compiled, of those that fits call.
+
+    Some ten seconds of work, once per installation: what was compiled is said on the log.
+    """
+    bins, undriven = 4 * BLOCK, 3 * BLOCK
+    s = 1j * np.linspace(0.8, 1.2, bins)
+    one = np.ones((bins, 1), complex)
+    tables = Tables.of(np.stack([one[:, 0], s, s**2 + 0.5], axis=-1), one[undriven:], one)
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((1, 1, bins, 2)).view(complex)[..., 0]
+    y = u / (s**2 + 0.04 * s + 1)
+    flat = in_blocks([np.ones((1, 1, 1))])
+    order = np.arange(bins)
+    data = Arrays(
+        planes(y, order, undriven), planes(u, order, undriven), flat, flat, flat, in_blocks([])
+    )
+    theta, _ = begin(tables, True, data, 1.0, BLOCK, 3)
+    linear_fit(tables, data, theta, LINEAR)
+    undriven_powers(tables, data, theta, BLOCK, 3)
+    undriven_errors(tables, data, theta)
+    minimise(tables, data, theta, 2, 1e-2, 1e-14)
+    invert(moments(tables, data, theta)[2][:, 0, 1])
+    missing = sum(sum(kernel.stats.cache_misses.values()) for kernel in _KERNELS)
+    if missing:
+        logging.getLogger(__name__).warning(
+            "pole fits: %d kernels compiled, which is done once per installation", missing
+        )
+    return missing
