@@ -182,7 +182,8 @@ class Withdrawal:
         self._felt_s += self._parameters.period_s
         if self._felt_s <= FEEL_NOT_S:
             self._left_n = self._smooth_n
-        if observer.tared and self._smooth_n < self._left_n - self._grown_n():
+        # what still presses goes as the tip rises
+        if observer.tared and self._smooth_n < min(self._left_n, 0.0) - self._grown_n():
             return self._held(height_m)
         begun_m, forces_n = self._step
         forces_n.append(force_n)

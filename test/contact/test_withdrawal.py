@@ -2,6 +2,7 @@
 """A tip that is drawn back: by what it is held, what still presses on it, and where its zero went."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from tactile_resonance.simulation.surfaces import FlatSurface
 from tactile_resonance.simulation.tip import RigidTip
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import RADIUS_M, SOFT, contact, started, stiffer
+from contacts import QUICK, RADIUS_M, SOFT, contact, started, stiffer
 
 PULL_N = Limits().pull_force_n
 
@@ -105,8 +106,10 @@ def test_steady_zero_is_not_reported():
     assert result.force_std_n == pytest.approx(std_n, rel=0.2)
 
 
-def test_surface_above_the_standoff_is_left_before_the_tip_is_idle():
-    made = contact(stiffer(SOFT, 3.0), height_m=2.0e-3, start_m=2.2e-3)
+@pytest.mark.parametrize("tare_drift_n_per_s", [0.002, 0.01])  # refused by the tare, or later
+def test_surface_above_the_standoff_is_left_before_the_tip_is_idle(tare_drift_n_per_s):
+    parameters = replace(QUICK, tare_drift_n_per_s=tare_drift_n_per_s)
+    made = contact(stiffer(SOFT, 3.0), height_m=2.0e-3, start_m=2.2e-3, parameters=parameters)
     made.loop.start(made.goal)
     assert made.run_until(State.TARE)
     made.run(0.08)
