@@ -27,9 +27,9 @@ from benchmarks.poles_methods import (
 )
 from benchmarks.poles_plant import BAND_HZ, Plant, judge
 from benchmarks.poles_realisations import grid_table
-from tactile_resonance.identification.identify import identify_spectra
-from tactile_resonance.identification.result import PolesBatch, PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.identify import identify_spectra
+from tactile_resonance.poles.result import PolesBatch, PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
 
 DAMPING = (0.005, 0.01, 0.02, 0.05, 0.1)
 SNR_DB = (10.0, 20.0, 40.0, 60.0, 80.0)

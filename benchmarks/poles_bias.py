@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD
 from tactile_resonance.configuration import share_path
-from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.simulation.acquisition import BenchEffects
 from tactile_resonance.simulation.bench import SimulatedBench
 from tactile_resonance.simulation.library import read_tissues

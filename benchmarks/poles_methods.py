@@ -23,10 +23,10 @@ from benchmarks.poles_plant import (
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
-from tactile_resonance.identification.identify import identify_batch, identify_poles
-from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.result import PolesBatch
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.identify import identify_batch, identify_poles
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.result import PolesBatch
+from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)
 # Points of a batch: a whole set of scans, whose few suspects are compared with other models together.

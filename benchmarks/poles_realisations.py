@@ -20,9 +20,9 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
-from tactile_resonance.identification.realisations import RealisationsPlan
-from tactile_resonance.identification.result import PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
 
 REALISATIONS = (2, 4, 7)
 PERIODS = (1, 2, 8)
@@ -125,7 +125,7 @@ def measure_cell(
     variance_y, variance_u = plants[0].noise
     level = 0.0 if distortion_db is None else variance_y * 10 ** (distortion_db / 10)
     known = periods == 1 and distortion_db is None
-    plan = RealisationsPlan(
+    plan = PoleEstimator(
         SAMPLE_RATE_HZ,
         SAMPLES_PER_PERIOD,
         periods,

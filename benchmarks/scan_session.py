@@ -15,10 +15,10 @@ from tactile_resonance.srv import Truth
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.identification.result import Poles
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
 from tactile_resonance.nodes.messages import frf_from_message, pose_to_message
 from tactile_resonance.nodes.running import RESULTS, STREAM, TRUTHS
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import poles_from_message
 

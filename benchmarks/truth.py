@@ -22,17 +22,17 @@ from benchmarks.cubic_resonator import (
     linear_mode,
     records,
 )
-from tactile_resonance.identification.joint import JointPlan
-from tactile_resonance.identification.joint_records import identify_poles_from_records
-from tactile_resonance.identification.realisations import RealisationsPlan
-from tactile_resonance.identification.result import (
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.result import (
     Poles,
     PolesBatch,
     PolesStatus,
     natural_frequency_and_damping,
 )
-from tactile_resonance.identification.structure import ModelStructure
-from tactile_resonance.multisine import design_multisine
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.simulation.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
 from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
 from tactile_resonance.simulation.library import read_tissues
@@ -91,7 +91,7 @@ def measure(
     seed = [realisations, periods, -(distortion_db or 0), int(snr_db)]
     rng = np.random.default_rng(seed)
     options = (SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, periods, HARMONICS, BAND_HZ, STRUCTURE)
-    together, alone = RealisationsPlan(*options), JointPlan(*options)
+    together, alone = PoleEstimator(*options), JointPlan(*options)
     count, bins = groups * realisations, list[tuple[FloatArray, FloatArray]]()
     for first in range(0, count, CHUNK):
         u, y = records(rng, min(CHUNK, count - first), periods, CUBIC[distortion_db], snr_db)
@@ -185,7 +185,7 @@ def bench_table(count: int) -> list[str]:
         groups = count // realisations
         part = slice(0, groups * realisations)
         pairs = (v[part].reshape(groups, realisations, -1) for v in (u, y))
-        result = RealisationsPlan(*options).from_bins(*pairs)
+        result = PoleEstimator(*options).from_bins(*pairs)
         row = _judged(result, each[part].reshape(groups, realisations, 2), each.mean(axis=0))
         lines.append(
             f"| {realisations} | {groups} | {row.ok.mean():.3f} "

@@ -19,13 +19,13 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.identification.band import strongest_resonance_band
-from tactile_resonance.identification.estimator import POLES_METHODS, second_attempt
-from tactile_resonance.identification.identify import identify_poles
-from tactile_resonance.identification.joint_records import identify_poles_from_bins
-from tactile_resonance.identification.order_choice import choose_among
-from tactile_resonance.identification.result import Poles, PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.band import strongest_resonance_band
+from tactile_resonance.poles.estimator import POLES_METHODS, second_attempt
+from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.joint_records import identify_poles_from_bins
+from tactile_resonance.poles.order_choice import choose_among
+from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
 
 
@@ -77,8 +77,8 @@ def analyse(
     frf_method : str
         See `frf.estimate.estimate_frf`.
     poles_method : {"auto", "joint", "frf"}
-        Poles from all bins of the band together with the transients (`identification.joint`, of
-        several realisations `identification.realisations`), or from the FRF. ``auto`` takes the
+        Poles from all bins of the band together with the transients (`poles.joint`, of
+        several realisations `poles.realisations`), or from the FRF. ``auto`` takes the
         first unless there is a channel delay to be taken out.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.

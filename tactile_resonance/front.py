@@ -17,9 +17,9 @@ from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.identification import identify as poles_stage
-from tactile_resonance.identification.result import Poles
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles import identify as poles_stage
+from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store_recording import read_store_recording, recording_of

@@ -20,9 +20,9 @@ from tactile_resonance.analysis import (
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record
-from tactile_resonance.identification.order_choice import CANDIDATES
-from tactile_resonance.identification.result import PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
+from tactile_resonance.poles.order_choice import CANDIDATES
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.silent import silent_record
 
 MOST_HARMONICS = 10**7

@@ -23,8 +23,8 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.result import Poles
 from tactile_resonance.multisine import Excitation
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
     array_of,

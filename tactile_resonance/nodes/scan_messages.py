@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 from tactile_resonance.action import CalibrateTable, Scan
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
 from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import SensorHealth

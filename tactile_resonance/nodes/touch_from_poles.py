@@ -11,7 +11,7 @@ import numpy.typing as npt
 from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.resonance_touch import PolesTouch
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import poles_from_message
 
 FloatArray = npt.NDArray[np.float64]

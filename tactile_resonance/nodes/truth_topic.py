@@ -12,10 +12,10 @@ from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
 from tactile_resonance.contact.force_spread import ForceSpread
-from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.running import TRUTHS
+from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import (
     contact_from_message,

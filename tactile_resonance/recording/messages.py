@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.contact.force_spread import ForceSpread
-from tactile_resonance.identification.result import Poles, PolesStatus
-from tactile_resonance.identification.structure import ModelStructure
 from tactile_resonance.multisine import Excitation, Grid
+from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 

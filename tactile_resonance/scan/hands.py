@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording

@@ -13,7 +13,7 @@ from scipy.interpolate import griddata
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.identification.result import Poles, PolesStatus
+from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult

@@ -7,7 +7,7 @@ import threading
 from dataclasses import dataclass
 from enum import Enum
 
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.hands import Interrupted
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.scan_point import ScanPoint

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (

@@ -13,9 +13,9 @@ msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not 
 from tactile_resonance.contact.force_spread import ForceSpread  # noqa: E402
 from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
 from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
-from tactile_resonance.identification.result import Poles, PolesStatus  # noqa: E402
 from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
 from tactile_resonance.nodes import messages  # noqa: E402
+from tactile_resonance.poles.result import Poles, PolesStatus  # noqa: E402
 from tactile_resonance.record import (  # noqa: E402
     BetweenSamples,
     Channel,

@@ -19,11 +19,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from tactile_resonance import msg
 from tactile_resonance.configuration import share_path
-from tactile_resonance.identification.result import Poles, PolesStatus
 from tactile_resonance.nodes import pole_map_node
 from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.pole_map_node import PoleMapNode
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, initialised
+from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.point_result import PointKind, PointOutcome

@@ -14,7 +14,6 @@ import rclpy
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.frf_node import FrfNode
 from tactile_resonance.nodes.messages import (
@@ -24,6 +23,7 @@ from tactile_resonance.nodes.messages import (
 )
 from tactile_resonance.nodes.poles_node import PolesNode
 from tactile_resonance.nodes.running import initialised
+from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from tactile_resonance.identification.joint_records import identify_poles_from_records
 from tactile_resonance.multisine import design_multisine
+from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide
 from tactile_resonance.scan.hands import Measured

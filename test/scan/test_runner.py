@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.identification.result import Poles
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.point_table import point_table
 from tactile_resonance.report.run_report import pole_map_of
 from tactile_resonance.report.run_report import summary as sentences

@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A mode that changes over the periods of a record: a test, and its mean poles with their drift.
+
+A mode ``x' = (p + d(t)) x + r u`` answers with ``x0 + x1 + x2 ...``: x0 is what the constant pole p makes of
+u, and each next term what it makes of d times the one before. The change d is a sum of Legendre polynomials
+over the record, as many as the record asks for, since creep slows down. Their transforms, spherical Bessel
+functions, spread each line over the bins around it, where a constant mode has nothing. They have no mean: p,
+the mean pole over the record, is as well known as a constant one, where the pole of an instant is known the
+less, the more polynomials there are. What decays from the start of the record has the pole of that instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+from numpy.polynomial import legendre
+from scipy import special
+
+from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.covariance import f0_damping_covariance, real_covariance
+from tactile_resonance.poles.fit import Linearised
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_fit import ROUNDED
+from tactile_resonance.poles.joint_noise import rough_noise
+from tactile_resonance.poles.joint_weights import noise_of, weighted
+from tactile_resonance.poles.likelihood import moments
+from tactile_resonance.poles.result import (
+    Poles,
+    PolesBatch,
+    PolesStatus,
+    natural_frequency_and_damping_jacobian,
+)
+from tactile_resonance.poles.single_point import single
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+# How often a constant mode is found to change.
+FALSE_ALARM = 2e-5
+# Of one that changes: how often one polynomial more is found than there are, and how many at most.
+ONE_MORE = 1e-3
+MOST_DEGREES = 6
+# Terms x1, x2 ...
+TERMS = 4
+# Refits of the other coefficients, and the change of the drift, in deviations, that is the last one.
+MOST_RETURNS = 12
+SAME_DRIFT = 0.02
+# Share of the drift itself that is as good as none, for records next to without noise.
+SAME_SHARE = 1e-4
+# Of the drift, what the changes of all else in the response move it by: .8 to 1.3 % on the simulated bench.
+SHARE_OF_OTHERS = 0.01
+# A contact, or a spring under a constant force, changes the residue by as much of itself as the pole; chance
+# would pass a limit of 1.
+MOST_OF_GAIN = 2.0
+GAIN_TOO = (
+    "the gain changes over the record as well, as where contact is lost: the drift is no property of "
+    "the mode"
+)
+# Of the record, from -1 to 1, among which that is found where the change is nearest to its mean.
+TIMES = np.linspace(-1, 1, 2001)
+USABLE = (PolesStatus.OK, PolesStatus.MODEL_ERROR)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """Drift beside the other coefficients, linearised at a fit.
+
+    Attributes
+    ----------
+    step : (c,) float
+        To the drift that fits best.
+    inverse : (c, c) float
+        Of the normal matrix of the drift, without what the coefficients can do.
+    coefficients : (n, c) float
+        What the coefficients change by with the drift, with a minus.
+    level, dof : float
+        Of the noise, in units of the variances weighted with, and its complex degrees of freedom.
+    """
+
+    step: FloatArray
+    inverse: FloatArray
+    coefficients: FloatArray
+    level: float
+    dof: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(c, c) of the drift."""
+        return np.asarray(self.inverse * self.level * self.dof / (self.dof - 1) / 2)
+
+    def chance(self, drift: FloatArray, of: slice = slice(None)) -> float:
+        """Probability that chance makes these values of the drift as large, beside all others: an F test."""
+        values = drift.ravel()[of]
+        fall = float(values @ np.linalg.solve(self.inverse[of, of], values))
+        rest = self.level * self.dof
+        return float(special.betainc(self.dof, values.size / 2, rest / (rest + fall)))
+
+
+@dataclass(frozen=True, eq=False)
+class DriftingModes:
+    """What modes whose poles change add to Y on the bins of the band.
+
+    A drift has rows of a complex number for each mode: what the residue grows by of itself, steadily, then
+    what the pole changes by [rad/s], with the polynomials of first, second ... degree. Each goes from -1 to 1
+    over the record.
+
+    Parameters
+    ----------
+    plan : JointPlan
+    fit : PolesBatch
+        Of one point, shape (), with m modes.
+    u : (K,) complex
+        Input on the bins; lines outside of the band are left out.
+    """
+
+    plan: JointPlan
+    fit: PolesBatch
+    u: ComplexArray
+
+    @property
+    def there(self) -> npt.NDArray[np.int64]:
+        """(m,) places of modes."""
+        return np.flatnonzero(np.isfinite(self.fit.poles_rad_s))
+
+    @cached_property
+    def theta(self) -> FloatArray:
+        """(n,) coefficients."""
+        model = self.fit.fit
+        return np.concatenate([model.denominator[:-1], model.numerator, model.transient])
+
+    def directions(self, row: int) -> ComplexArray:
+        """(2 m, K) of 1 in the real and in the imaginary part of one row of the drift of each mode."""
+        columns = []
+        times, start = self._times(max(row, 1)), (-1) ** row * self._decay
+        for pole, residue in self._modes:
+            both = []
+            for p, r in ((pole, residue), (np.conj(pole), np.conj(residue))):
+                driven = r * self._lines
+                moved = self._spread(times, driven / (self._s - p) if row else driven)
+                both.append((moved + start * (row > 0)) / (self._s - p))
+            columns += [both[0] + both[1], 1j * (both[0] - both[1])]
+        return np.array(columns)
+
+    def added(self, drift: FloatArray) -> ComplexArray:
+        """(K,) by a drift (rows, m, 2), real and imaginary parts last."""
+        changes = drift.view(complex)[..., 0]  # (rows, m)
+        degrees = range(1, len(changes))
+        times = np.array([self._times(degree) for degree in degrees])
+        start = np.array([(-1) ** degree for degree in degrees])
+        y = np.zeros(self._s.size, complex)
+        for (pole, residue), change in zip(self._modes, changes.T, strict=True):
+            for p, r, d in (
+                (pole, residue, change),
+                (np.conj(pole), np.conj(residue), np.conj(change)),
+            ):
+                more = self._spread(d[0] * times[0], r * self._lines) / (self._s - p)
+                x = r * self._lines / (self._s - p) + more
+                y += more + d[1:] @ start * self._decay / (self._s - p)
+                for _ in range(TERMS):
+                    x = self._spread(d[1:] @ times, x) / (self._s - p)
+                    y += x
+        return y
+
+    @property
+    def _modes(self) -> list[tuple[complex, complex]]:
+        both = (self.fit.poles_rad_s[self.there], self.fit.residues[self.there])
+        return list(zip(*(values.tolist() for values in both), strict=True))
+
+    @cached_property
+    def _s(self) -> ComplexArray:
+        return np.asarray(2j * np.pi * self.plan.frequency_hz(self.plan.bins))
+
+    @cached_property
+    def _lines(self) -> ComplexArray:
+        """(K,) the input without what is between its lines."""
+        line = self.plan.excited_at
+        lines = np.zeros(self._s.size, complex)
+        lines[line] = self.u[line]
+        return lines
+
+    @cached_property
+    def _decay(self) -> ComplexArray:
+        """(K,) the free decay from the start of the record."""
+        plan, theta = self.plan, self.theta
+        a, b, _ = plan.problem.sizes
+        alpha = np.append(theta[:a], 1.0)
+        decay = np.zeros(self._s.size, complex)
+        problem = plan.problem
+        decay[plan.order] = problem.transient @ theta[a + b :] / (problem.denominator @ alpha)
+        return decay
+
+    def _times(self, degree: int) -> ComplexArray:
+        return _transform_of(degree, self.plan.samples_per_period * self.plan.periods, self.u.size)
+
+    @staticmethod
+    def _spread(times: ComplexArray, x: ComplexArray) -> ComplexArray:
+        """(K,) bins of a signal with bins x (K,) times a function of time."""
+        return np.asarray(scipy.fft.ifft(times * scipy.fft.fft(x, times.size))[: x.size])
+
+
+@lru_cache(maxsize=64)
+def _transform_of(degree: int, samples: int, bins: int) -> ComplexArray:
+    """(L,) what `DriftingModes._spread` takes to multiply by a polynomial in time."""
+    apart = np.arange(1 - bins, bins)
+    # the sum over the samples is the integral to the square of apart / samples
+    turn = (-1.0) ** apart * np.exp(1j * np.pi * apart / samples)
+    transform = np.zeros(scipy.fft.next_fast_len(apart.size), complex)
+    transform[apart] = turn * (-1j) ** degree * special.spherical_jn(degree, np.pi * apart)
+    return np.asarray(scipy.fft.fft(transform))
+
+
+def _linearised(
+    modes: DriftingModes, y: ComplexArray, rows: Iterable[int], flat: bool = False
+) -> _Step | None:
+    """The drift that bins y (K,) show beside a fit to them, or to y without some drift.
+
+    With weights of flat noise, or of what noise a test finds: this takes a drift for noise. None where the
+    rows asked for cannot be distinguished.
+    """
+    plan, u, theta = modes.plan, modes.u, modes.theta
+    directions = np.concatenate([modes.directions(row) for row in rows])
+    others, one = plan.other_bins.size, np.ones((1, 1, 1))
+    data = BinData.of(y[None, None], u[None, None], others, one, None, None, one, order=plan.order)
+    if flat:
+        error = Linearised.of(plan.problem, data, theta).error[:, :others]
+        variance_y, variance_u = (v[:, None] for v in rough_noise(error, data.u[0, :, :others]))
+        data = replace(data, rest=variance_y, variance_y=variance_y, variance_u=variance_u)
+    else:
+        noise = noise_of(plan, data, theta[None, None], plan.noise_bands)
+        data = weighted(data, noise, plan.noise_bands)
+    costs, gradients, normals = moments(plan.problem.tables, data.arrays, theta[None, None])
+    cost, gradient = float(costs.sum()), gradients[0, 0]
+    at = Linearised.of(plan.problem, data, theta)
+    root = 1 / np.sqrt(at.variance[0])
+    own = np.ascontiguousarray(-(at.slope[0] * root[:, None]).T).view(float)  # (n, 2 K)
+    residual = np.ascontiguousarray(at.residual[0]).view(float)
+    more = np.ascontiguousarray(-directions[:, plan.order] * root).view(float)
+    crossed = own @ more.T  # (n, c)
+    try:
+        coefficients = np.linalg.inv(normals[0, 0].sum(axis=0)) @ crossed
+        left = np.linalg.inv(more @ more.T - crossed.T @ coefficients)
+    except np.linalg.LinAlgError:
+        return None
+    score = more @ residual - coefficients.T @ gradient
+    step = -left @ score
+    count = len(step)
+    dof = plan.bins.size - (theta.size + count) / 2
+    fall = min(float(-score @ step) / cost, 1.0)
+    level = cost * (1 - fall) / dof
+    return _Step(step, left, coefficients, level, dof)
+
+
+def _converged(
+    modes: DriftingModes, y: ComplexArray, drift: FloatArray
+) -> tuple[DriftingModes, FloatArray, _Step] | None:
+    """Modes fitted to a record without its drift (rows, m, 2), the drift, its last step; None: no end.
+
+    Gauss-Newton steps of the drift, each followed by a fit of all else.
+    """
+    plan, u = modes.plan, modes.u
+    for _ in range(MOST_RETURNS):
+        at = _linearised(modes, y - modes.added(drift), range(len(drift)), flat=not drift.any())
+        if at is None or not np.isfinite(at.step).all():
+            return None
+        drift = drift + at.step.reshape(drift.shape)
+        least = np.maximum(
+            SAME_DRIFT * np.sqrt(np.diagonal(at.covariance)), SAME_SHARE * np.abs(drift.ravel())
+        )
+        if np.all(np.abs(at.step) < least):
+            return modes, drift, at
+        modes = DriftingModes(plan, plan.from_bins(u, y - modes.added(drift)), u)
+        if modes.fit.status() not in USABLE or modes.there.size != drift.shape[1]:
+            return None
+    return None
+
+
+def poles_with_drift(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, fit: PolesBatch
+) -> tuple[Poles, float] | None:
+    """Mean poles over a record and their drift, where it shows that they change.
+
+    Parameters
+    ----------
+    plan : JointPlan
+        Of several periods.
+    u, y : (K,) complex
+        Bins of the record.
+    fit : PolesBatch
+        What the plan makes of them, shape ().
+
+    Returns
+    -------
+    tuple of Poles and float, or None
+        With the variance of the noise that is left on a bin of Y. None where nothing changes beyond chance.
+        Status MODEL_ERROR where something changes that is no drift of the poles: the gain too, as where
+        contact is lost, or no fit with drift is found.
+    """
+    modes, found = DriftingModes(plan, fit, u), None
+    with np.errstate(all="ignore"):
+        if not fit.noise_variance[0] > ROUNDED * np.mean(np.abs(y) ** 2):
+            return None  # what rounding leaves of exact data says nothing
+        if fit.status() not in USABLE or not modes.there.size:
+            return None
+        at = _linearised(modes, y, [1], flat=True)
+        if at is None or not at.chance(at.step) < FALSE_ALARM:
+            return None
+        none = np.zeros((1, modes.there.size, 2))
+        drift = none
+        while len(drift) <= MOST_DEGREES:
+            more = _converged(modes, y, np.concatenate([drift, none]))
+            if more is None:
+                break
+            found = modes, drift, _ = more
+            rest = y - modes.added(drift)
+            at = _linearised(modes, rest, range(len(drift) + 1))
+            if at is None or not at.chance(at.step, slice(drift.size, None)) < ONE_MORE:
+                break
+    if found is not None:
+        pole_rad_s = modes.fit.poles_rad_s[modes.there]
+        gain, change = np.abs(drift.view(complex)[:2, :, 0])
+        alone = np.any(gain > MOST_OF_GAIN * change / np.abs(pole_rad_s))
+        alone &= found[2].chance(drift, slice(none.size)) < FALSE_ALARM
+        if alone or found[2].chance(drift) < ONE_MORE:
+            poles = _result(*found)
+            left = float(modes.fit.noise_variance[0])
+            return (_changed(poles, GAIN_TOO) if alone else poles), left
+    reason = "the mode changes over the record, and no fit with its drift is found"
+    return _changed(single(fit), reason), float(fit.noise_variance[0])
+
+
+def _changed(poles: Poles, reason: str) -> Poles:
+    """Poles of a record that changes as no model here does."""
+    total = poles.covariance if poles.total_covariance is None else poles.total_covariance
+    message = "; ".join(filter(None, [poles.message, reason]))
+    return replace(poles, status=PolesStatus.MODEL_ERROR, total_covariance=total, message=message)
+
+
+def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
+    """`Poles` of a fit to a record without its drift (rows, m, 2), which is not known better than it is."""
+    plan, fit, there = modes.plan, modes.fit, modes.there
+    covariance = at.covariance
+    added = at.coefficients @ covariance @ at.coefficients.T
+    pole = fit.poles_rad_s
+    sensitivity = fit.fit.residues_and_sensitivity(pole)[1]
+    more = real_covariance(sensitivity, added)
+    in_f0 = f0_damping_covariance(pole, more)
+    fit = replace(
+        fit,
+        coefficient_covariance=fit.coefficient_covariance + added,
+        pole_covariance=fit.pole_covariance + more,
+        covariance=fit.covariance + in_f0,
+        total_covariance=fit.total_covariance + in_f0,
+    )
+    samples = plan.samples_per_period * plan.periods
+    # the first polynomial is the straight line nearest to the change
+    per_s = 2 * plan.sample_rate_hz / samples
+    jacobian = per_s * natural_frequency_and_damping_jacobian(pole[there])
+    rates = (jacobian @ drift[1, :, :, None])[..., 0]
+    first = 2 * (there.size + np.arange(there.size))
+    blocks = np.stack([covariance[k : k + 2, k : k + 2] for k in first])
+    blocks += SHARE_OF_OTHERS**2 * np.sum(drift[1] ** 2, axis=-1)[:, None, None] * np.eye(2)
+    of_rates = jacobian @ blocks @ np.swapaxes(jacobian, -1, -2)
+    real = fit.significant[there]
+    change = legendre.legval(TIMES, np.concatenate([0 * drift[:1], drift[1:]]))  # (m, 2, times)
+    nearest = TIMES[np.argmin(np.sum(change**2, axis=(0, 1)))]
+    instant_s = float(((1 + nearest) * samples - 1) / plan.sample_rate_hz / 2)
+    poles = single(fit)
+    deviations = np.sqrt(np.diagonal(of_rates, axis1=-2, axis2=-1))
+    told = [
+        f"the mode at {f0:.4g} Hz changes: f0 by {rate[0]:.3g} +- {std[0]:.2g} Hz/s, damping ratio by "
+        f"{rate[1]:.2g} +- {std[1]:.2g} 1/s; poles are means over the record, as about {instant_s:.3g} s "
+        "after its start"
+        for f0, rate, std in zip(poles.f0_hz, rates[real], deviations[real], strict=True)
+        if np.any(np.abs(rate) > 3 * std)
+    ]
+    return replace(
+        poles,
+        f0_drift_hz_per_s=rates[real, 0],
+        damping_drift_per_s=rates[real, 1],
+        drift_covariance=of_rates[real],
+        instant_s=instant_s,
+        message="; ".join(filter(None, [poles.message, *told])),
+    )

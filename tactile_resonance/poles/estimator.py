@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which estimator of the poles the data at hand allow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.joint_records import identify_poles_from_bins
+from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
+
+POLES_METHODS = ("auto", "joint", "frf")
+
+
+def poles_of_frf(
+    frf: FRF,
+    band_hz: tuple[float, float],
+    structure: ModelStructure | None = None,
+    method: str = "auto",
+) -> Poles:
+    """Poles from the bins that come with an FRF, else from the FRF itself.
+
+    Parameters
+    ----------
+    frf : FRF
+        With (F,) arrays.
+    band_hz : (low, high)
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+    method : {"auto", "joint", "frf"}
+        ``auto`` is ``joint`` where the FRF brings bins that cover the band and hold lines enough.
+
+    Returns
+    -------
+    Poles
+        Always with a status; its ``method`` says which was taken.
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown, or ``joint`` is not possible.
+    """
+    if method not in POLES_METHODS:
+        raise ValueError(f"method: {method!r}, accepted are {', '.join(POLES_METHODS)}")
+    structure = structure or ModelStructure()
+    if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
+        return Poles(status=PolesStatus.FAILED, message=frf.message)
+    reason = _joint_impossible(frf, band_hz, structure)
+    if method == "joint" and reason:
+        raise ValueError(f"method: joint, but {reason}")
+    if method == "frf" or frf.bins is None or reason:
+        poles = identify_poles(frf, band_hz, structure)
+        if method == "auto" and frf.bins is not None:
+            message = "; ".join(filter(None, [poles.message, f"from the FRF: {reason}"]))
+            poles = replace(poles, message=message)
+        return poles
+    notes = [frf.message] if frf.status is not FrfStatus.OK else []
+    poles = identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
+    return second_attempt(poles, frf, band_hz, structure)
+
+
+def second_attempt(
+    poles: Poles, frf: FRF, band_hz: tuple[float, float], structure: ModelStructure
+) -> Poles:
+    """Poles from the FRF where the joint fit of the same record did not converge, and says so.
+
+    Parameters
+    ----------
+    poles : Poles
+        From a joint fit; returned as they are unless it did not converge.
+    frf : FRF
+        With (F,) arrays.
+    band_hz : (low, high)
+    structure : ModelStructure
+    """
+    if poles.status is not PolesStatus.NOT_CONVERGED:
+        return poles
+    again = identify_poles(frf, band_hz, structure)
+    if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
+        also = f"from the FRF: {again.status.value}"
+        return replace(poles, message="; ".join(filter(None, [poles.message, also])))
+    note = "from the FRF: the joint fit did not converge"
+    return replace(again, message="; ".join(filter(None, [again.message, note])))
+
+
+def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:
+    """Why there can be no joint estimate; empty where there can."""
+    bins = frf.bins
+    if bins is None:
+        return (
+            "the FRF brings no bins: they were not asked for, or its realisations differ in periods"
+        )
+    low_hz, high_hz = bins.band_hz
+    margin = bins.resolution_hz * (1 + 1e-9)  # the band's ends need not lie on bins
+    if band_hz[0] <= low_hz - margin or band_hz[1] >= high_hz + margin:
+        return f"the bins cover {low_hz:g} to {high_hz:g} Hz of {band_hz[0]:g} to {band_hz[1]:g} Hz"
+    line_hz = bins.sample_rate_hz / bins.samples_per_period
+    lines = bins.harmonics * line_hz
+    count = int(((lines >= band_hz[0]) & (lines <= band_hz[1])).sum())
+    if count <= structure.fewest_lines:
+        return (
+            f"the band holds {count} excited lines, more than {structure.fewest_lines} are needed"
+        )
+    if structure.delay:
+        return "it estimates no delay"
+    return ""

@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maximum likelihood fits of points: start values, steps, and what is left to full precision.
+
+Start values by Sanathanan-Koerner iterations (IEEE Trans. Autom. Control 8 (1963) 56-58), then
+Levenberg-Marquardt steps on the normal equations of `likelihood`. These square the condition number: what
+does not converge, has many poles or a pure delay is fitted by scipy's least squares on the Jacobian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize
+
+from tactile_resonance.poles import likelihood
+from tactile_resonance.poles.bins import BinData, Problem
+from tactile_resonance.poles.likelihood import LINEAR, LINEAR_UNWEIGHTED
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+BoolArray = npt.NDArray[np.bool_]
+
+MAX_ITERATIONS = 60
+# A step below this many standard deviations, as the residuals show them, is the last one taken.
+STEP_TOLERANCE = 1e-2
+# Rounding of a residual relative to the data it is the residual of.
+ROUNDING = 1e-14
+# Of a fit at full precision.
+LEAST_SQUARES_STARTS = 20
+LEAST_SQUARES_EVALUATIONS = 200
+LEAST_SQUARES_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Coefficients of points.
+
+    Attributes
+    ----------
+    theta : (points, M, n) float
+        Coefficients [A without its last, B, C] of each record; A and B are alike in all.
+    normal : (points, M, 2, n, n) float
+        ``Re J^H J`` of undriven and of driven bins at the solution.
+    cost : (points,) float
+    part_cost : (points, 2) float
+        Of undriven and driven bins.
+    residual : (points, M, K_driven) complex
+        Weighted, turned by the phase of the input.
+    converged : (points,) bool
+    """
+
+    theta: FloatArray
+    normal: FloatArray
+    cost: FloatArray
+    part_cost: FloatArray
+    residual: ComplexArray
+    converged: BoolArray
+
+    def rows(self, which: npt.NDArray) -> Solution:
+        """Some of the points."""
+        return Solution(*(getattr(self, f.name)[which] for f in fields(Solution)))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordsInverse:
+    """Inverses of the normal matrices of points of several records.
+
+    Attributes
+    ----------
+    shared : (points, s, s) float
+        Block of the coefficients that records share, those of A and B.
+    marginal : (points, M, n, n) float
+        Block of these and those of one record.
+    condition : (points,) float
+        See `likelihood.invert`.
+    """
+
+    shared: FloatArray
+    marginal: FloatArray
+    condition: FloatArray
+
+    @classmethod
+    def of(cls, normal: FloatArray, shared: int) -> RecordsInverse:
+        """Of normal matrices (points, M, n, n) of each record; NaN where one is singular or not finite."""
+        points, records, n, _ = normal.shape
+        own = n - shared
+        size = shared + records * own
+        whole = np.zeros((points, size, size))
+        columns = [
+            np.r_[:shared, shared + m * own : shared + (m + 1) * own] for m in range(records)
+        ]
+        for m, here in enumerate(columns):
+            whole[:, here[:, None], here] += normal[:, m]
+        inverse, condition = likelihood.invert(whole)
+        marginal = np.stack([inverse[:, here[:, None], here] for here in columns], axis=1)
+        return cls(inverse[:, :shared, :shared], marginal, condition)
+
+    def leverage(self, normal: FloatArray) -> FloatArray:
+        """(points,) real coefficients that go to the bins of normal matrices (points, M, n, n)."""
+        return np.einsum("bmij,bmji->b", self.marginal, normal)
+
+    def sandwich(self, normal: FloatArray) -> FloatArray:
+        """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
+        rows = self.marginal[:, :, : self.shared.shape[-1]]
+        return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
+
+
+def start_values(problem: Problem, data: BinData) -> FloatArray:
+    """(points, M, n) coefficients; NaN where there are none.
+
+    By two Sanathanan-Koerner iterations.
+    """
+    theta = np.zeros((*data.y_planes.shape[:2], sum(problem.sizes)))
+    for kind in (LINEAR_UNWEIGHTED, LINEAR):
+        theta = likelihood.linear_fit(problem.tables, data.arrays, theta, kind)
+    return theta
+
+
+def minimise(
+    problem: Problem,
+    data: BinData,
+    start: FloatArray | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Solution:
+    """Minimise the cost of each point.
+
+    Parameters
+    ----------
+    problem : Problem
+    data : BinData
+    start : (points, M, n) float, optional
+        `start_values` when absent.
+    max_iterations : int
+    """
+    begin = start_values(problem, data) if start is None else np.ascontiguousarray(start)
+    return Solution(
+        *likelihood.minimise(
+            problem.tables, data.arrays, begin, max_iterations, STEP_TOLERANCE, ROUNDING
+        )
+    )
+
+
+def refit_failed(problem: Problem, solution: Solution, data: BinData) -> Solution:
+    """The points that did not converge again, at full precision."""
+    failed = np.flatnonzero(~solution.converged)
+    if not failed.size:
+        return solution
+    whole = Solution(*(getattr(solution, f.name).copy() for f in fields(Solution)))
+    for k in failed:
+        found = least_squares(problem, data.rows(slice(k, k + 1)))
+        if found.converged:
+            _place(problem, found, whole, int(k))
+    return whole
+
+
+def _place(problem: Problem, found: DenseSolution, whole: Solution, k: int) -> None:
+    records, undriven = whole.theta.shape[1], problem.undriven
+    whole.converged[k] = True
+    whole.theta[k] = found.theta_of(problem, records)
+    a, b, own = problem.sizes
+    shared = a + b
+    for m in range(records):
+        columns = np.r_[:shared, shared + m * own : shared + (m + 1) * own]
+        jacobian = found.jacobian[m][..., columns]  # (K, 2, n)
+        for part, here in enumerate((slice(0, undriven), slice(undriven, None))):
+            rows = jacobian[here].reshape(-1, columns.size)
+            whole.normal[k, m, part] = rows.T @ rows
+    power = np.sum(found.residual.real**2 + found.residual.imag**2, axis=0)
+    whole.part_cost[k] = power[:undriven].sum(), power[undriven:].sum()
+    whole.cost[k] = whole.part_cost[k].sum()
+    whole.residual[k] = found.turned
+
+
+@dataclass(frozen=True, eq=False)
+class DenseSolution:
+    """Coefficients of one point at full precision.
+
+    Attributes
+    ----------
+    theta : (s + M c,) float
+        [A without its last, B, C of each record], and the delay over its unit if asked for.
+    jacobian : (M, K, 2, n) float
+        Of real and imaginary parts of the weighted residuals.
+    residual : (M, K) complex
+        Weighted.
+    turned : (M, K_driven) complex
+        Those of driven bins, turned by the phase of the input.
+    converged : bool
+    """
+
+    theta: FloatArray
+    jacobian: FloatArray
+    residual: ComplexArray
+    turned: ComplexArray
+    converged: bool
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals."""
+        return float(np.sum(self.residual.real**2 + self.residual.imag**2))
+
+    def theta_of(self, problem: Problem, records: int) -> FloatArray:
+        """(M, n) coefficients of each record."""
+        a, b, own = problem.sizes
+        out = np.empty((records, a + b + own))
+        out[:, : a + b] = self.theta[: a + b]
+        out[:, a + b :] = self.theta[a + b : a + b + records * own].reshape(records, own)
+        return out
+
+    def covariance(self) -> tuple[FloatArray, float]:
+        """``(J^T J)^-1`` through singular values, and the condition number with unit columns."""
+        jacobian = self.jacobian.reshape(-1, self.theta.size)
+        column = np.linalg.norm(jacobian, axis=0)
+        n = column.size
+        if not (np.isfinite(column).all() and (column > 0).all()):
+            return np.full((n, n), np.nan), float("inf")
+        _, singular, vh = np.linalg.svd(jacobian / column, full_matrices=False)
+        if singular[-1] <= 0 or singular.size < n:
+            return np.full((n, n), np.nan), float("inf")
+        half = vh.T / singular
+        return half @ half.T / np.outer(column, column), float(singular[0] / singular[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Errors of one point and their derivatives.
+
+    Attributes
+    ----------
+    error : (M, K) complex
+        Of Y.
+    variance : (M, K) float
+    slope : (M, K, n) complex
+        Of the model by each coefficient.
+    variance_slope : (M, K, n) float
+    """
+
+    error: ComplexArray
+    variance: FloatArray
+    slope: ComplexArray
+    variance_slope: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        data: BinData,
+        theta: FloatArray,
+        delay_phase: FloatArray | None = None,
+    ) -> Linearised:
+        """At theta (s + M c,), with the delay last if its phase (K_driven,) is given; of data of one point."""
+        a, b, own = problem.sizes
+        shared, records, undriven = a + b, data.records, problem.undriven
+        gamma = theta[shared : shared + records * own].reshape(records, own)
+        inverse = 1 / (problem.denominator[:, :a] @ theta[:a] + problem.denominator[:, a])  # (K,)
+        driven = slice(undriven, None)
+        g = (problem.numerator @ theta[a:shared]) * inverse[driven]
+        by_g = np.zeros((g.size, theta.size), complex)
+        by_g[:, :a] = -(g * inverse[driven])[:, None] * problem.denominator[driven, :a]
+        by_g[:, a:shared] = inverse[driven, None] * problem.numerator
+        if delay_phase is not None:
+            turn = np.exp(-1j * delay_phase * theta[-1])
+            g, by_g = g * turn, by_g * turn[:, None]
+            by_g[:, -1] = -1j * delay_phase * g
+        transient = gamma @ problem.transient.T * inverse  # (M, K)
+        model = transient.copy()
+        model[:, driven] += g * data.u_driven[0]
+        slope = np.zeros((*model.shape, theta.size), complex)
+        slope[:, driven] = by_g * data.u_driven[0][..., None]
+        slope[..., :a] -= (transient * inverse)[..., None] * problem.denominator[:, :a]
+        for m in range(records):
+            slope[m, :, shared + m * own : shared + (m + 1) * own] = (
+                inverse[:, None] * problem.transient
+            )
+        variance = np.empty(model.shape)
+        if undriven:
+            assert data.rest is not None
+            variance[:, :undriven] = data.rest[0]
+        variance[:, driven] = data.residual_variance(g[None])[0]
+        variance_slope = np.zeros(slope.shape)
+        if data.variance_u is not None:
+            half = data.variance_u[0] * np.conj(g)
+            if data.covariance_yu is not None:
+                half = half - np.conj(data.covariance_yu[0])
+            variance_slope[:, driven] = 2 * np.real(half[..., None] * by_g)
+        return cls(data.y[0] - model, variance, slope, variance_slope)
+
+    @property
+    def residual(self) -> ComplexArray:
+        """(M, K) weighted errors."""
+        return np.asarray(self.error / np.sqrt(self.variance))
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """(M, K, 2, n) derivatives of the real and imaginary parts of the weighted errors."""
+        root = 1 / np.sqrt(self.variance)[..., None]
+        of_variance = 0.5 * (self.error[..., None] * root) * self.variance_slope * root**2
+        both = -self.slope * root - of_variance
+        return np.stack([both.real, both.imag], axis=-2)
+
+
+def least_squares(
+    problem: Problem,
+    data: BinData,
+    start: FloatArray | None = None,
+    delay_phase: FloatArray | None = None,
+    first_size: FloatArray | None = None,
+) -> DenseSolution:
+    """Minimise the cost of one point at full precision, by orthogonal factorisations of the Jacobian.
+
+    Parameters
+    ----------
+    problem : Problem
+    data : BinData
+        Of one point.
+    start : (s + M c,) float, optional
+        Sanathanan-Koerner iterations when absent.
+    delay_phase : (K,) float, optional
+        Phase [rad] per unit of delay; the delay is then the last entry of theta.
+    first_size : (K,) float, optional
+        ``|A|`` that start values begin from; 1 when absent.
+    """
+    used = np.isfinite(_variances(problem, data)).ravel()
+
+    def at(theta: FloatArray) -> Linearised:
+        return Linearised.of(problem, data, theta, delay_phase)
+
+    def flat(values: npt.NDArray) -> npt.NDArray:
+        """Real and imaginary parts of bins that are not left out."""
+        columns = values.size // (2 * used.size)
+        return values.reshape(used.size, 2, columns)[used].reshape(-1, max(columns, 1))
+
+    with np.errstate(all="ignore"):
+        if start is None:
+            start = _best_start(problem, data, first_size)
+            if delay_phase is not None:
+                start = np.append(start, 0.0)
+        converged, theta = False, start
+        begin = flat(at(start).residual.copy().view(float))
+        if np.isfinite(begin).all() and begin.size >= start.size:
+            try:
+                found = optimize.least_squares(
+                    lambda theta: np.nan_to_num(
+                        flat(at(theta).residual.copy().view(float))[:, 0], nan=1e150
+                    ),
+                    start,
+                    lambda theta: np.nan_to_num(flat(at(theta).jacobian)),
+                    method="lm",
+                    x_scale="jac",
+                    ftol=LEAST_SQUARES_TOLERANCE,
+                    xtol=LEAST_SQUARES_TOLERANCE,
+                    gtol=LEAST_SQUARES_TOLERANCE,
+                    max_nfev=LEAST_SQUARES_EVALUATIONS,
+                )
+                converged, theta = bool(found.status > 0), found.x
+            except (ValueError, np.linalg.LinAlgError):  # nothing finite on the way
+                pass
+        last = at(theta)
+        size = np.abs(data.u_driven[0])
+        turn = np.where(size > 0, data.u_driven[0].conj() / size, 1.0)
+        residual = np.nan_to_num(last.residual)
+        turned = residual[:, problem.undriven :] * turn
+        jacobian = np.where(np.isfinite(last.variance)[..., None, None], last.jacobian, 0.0)
+        if converged:
+            rows = jacobian.reshape(-1, theta.size)
+            power = float(np.sum(np.abs(data.y[0]) ** 2 / _variances(problem, data)))
+            converged = _at_minimum(rows, residual.view(float).ravel(), ROUNDING**2 * power)
+    return DenseSolution(theta, jacobian, last.residual, turned, converged)
+
+
+def _at_minimum(jacobian: FloatArray, residual: FloatArray, rounding: float) -> bool:
+    """Whether a step (n,) from here would lower the cost by as little as the last one of `minimise`."""
+    if not np.isfinite(jacobian).all():
+        return False
+    column = np.linalg.norm(jacobian, axis=0)
+    scaled = jacobian / np.where(column > 0, column, 1.0)
+    fall = float(np.sum((scaled @ np.linalg.lstsq(scaled, residual, rcond=None)[0]) ** 2))
+    cost = float(residual @ residual)
+    free = max(residual.size - column.size, 1)
+    return fall <= max(STEP_TOLERANCE**2 * cost / free, rounding)
+
+
+def _variances(problem: Problem, data: BinData) -> FloatArray:
+    """(M, K) of Y, of data of one point."""
+    out = np.empty((data.records, data.undriven + data.driven))
+    if data.rest is not None:
+        out[:, : problem.undriven] = data.rest[0]
+    out[:, problem.undriven :] = data.variance_y[0]
+    return out
+
+
+def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray:
+    """(s + M c,) least squares of ``(A Y - B U - C) / |A|`` for sizes ``|A|`` (K,): of data of one point."""
+    a, b, own = problem.sizes
+    records, bins = data.records, data.undriven + data.driven
+    shared, undriven = a + b, problem.undriven
+    design = np.zeros((records, bins, shared + records * own), complex)
+    design[..., :a] = data.y[0][..., None] * problem.denominator[:, :a]
+    design[:, undriven:, a:shared] = -data.u_driven[0][..., None] * problem.numerator
+    for m in range(records):
+        design[m, :, shared + m * own : shared + (m + 1) * own] = -problem.transient
+    scale = 1 / (np.sqrt(_variances(problem, data)) * size)
+    design *= scale[..., None]
+    target = -data.y[0] * problem.denominator[:, a] * scale
+    rows = np.stack([design.real, design.imag]).reshape(-1, design.shape[-1])
+    right = np.stack([target.real, target.imag]).ravel()
+    column = np.linalg.norm(rows, axis=0)
+    column[~(column > 0)] = 1.0
+    if not np.isfinite(rows).all() or not np.isfinite(right).all():
+        return np.full(column.size, np.nan)
+    return np.linalg.lstsq(rows / column, right, rcond=None)[0] / column
+
+
+def _best_start(problem: Problem, data: BinData, size: FloatArray | None) -> FloatArray:
+    """The best of Sanathanan-Koerner iterations by orthogonal factorisation."""
+    a, b, own = problem.sizes
+    size = np.ones(problem.denominator.shape[0]) if size is None else size
+    best, best_cost = np.zeros(a + b + data.records * own), np.inf
+    for _ in range(LEAST_SQUARES_STARTS):
+        theta = linear_step(problem, data, size)
+        residual = Linearised.of(problem, data, theta).residual
+        cost = float(np.sum(residual.real**2 + residual.imag**2))
+        size = np.abs(problem.denominator @ np.append(theta[:a], 1.0))
+        better = cost < best_cost * (1 - 1e-3)
+        if cost < best_cost:
+            best, best_cost = theta, cost
+        if not better:
+            break
+    return best

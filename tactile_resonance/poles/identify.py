@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an FRF, or spectra, with covariance to poles with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.covariance import modes_in_band
+from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
+from tactile_resonance.poles.judgement import Evidence, assemble
+from tactile_resonance.poles.line_tones import poles_without_tones
+from tactile_resonance.poles.line_weights import lines_of_frf, lines_of_spectra
+from tactile_resonance.poles.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.poles.model_error import (
+    MODEL_ERROR_PROBABILITY,
+    difference_of_halves,
+    difference_of_models,
+    richer,
+)
+from tactile_resonance.poles.noise_level import KINDS, VarianceModel
+from tactile_resonance.poles.result import (
+    ComplexArray,
+    FloatArray,
+    Poles,
+    PolesBatch,
+)
+from tactile_resonance.poles.single_point import single
+from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.transient_left import with_transient_judged
+from tactile_resonance.poles.whiteness import are_smooth
+
+# Mean square of the residuals over that of the data, below which they are rounding.
+ROUNDED = 1e-22
+
+
+def identify_poles(
+    frf: FRF, band_hz: tuple[float, float] | None = None, structure: ModelStructure | None = None
+) -> Poles:
+    """Poles of a rational model fitted to the lines of a band.
+
+    Parameters
+    ----------
+    frf : FRF
+        With (F,) arrays. Lines whose response or variance is not finite, or that hold a tone, are left
+        out, and said so.
+    band_hz : (low, high), optional
+        All lines when absent.
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+
+    Returns
+    -------
+    Poles
+        Always; the status says what it is worth, also where the FRF still holds a transient, see
+        `transient_left.with_transient_judged`.
+
+    Notes
+    -----
+    Lines are weighted with the largest variance known (total, else noise), pooled over the band
+    where a test allows it. Where both are known, ``covariance`` propagates the noise through these
+    weights and ``total_covariance`` the total; where only realisations are at hand, noise cannot be
+    told from distortion and both fields hold both. Where the cost exceeds what the variance
+    explains, ``total_covariance`` holds the model error too; see `model_error.model_error_factor`.
+    """
+    if np.ndim(frf.g) != 1:
+        raise ValueError(
+            f"frf.g: shape {np.shape(frf.g)}, expected (F,); identify_batch takes batches"
+        )
+    frf = checked_frf(frf)
+    selected = frf.band(*checked_band(frf.frequency_hz, band_hz))
+    batch, tones = poles_without_tones(
+        lambda lines: identify_batch(lines, band_hz, structure), selected
+    )
+    notes = [tone.text("left out") for tone in tones]
+    left_out = selected.g.size - int(batch.lines) - len(tones)
+    if left_out:
+        notes.append(f"{left_out} lines without a finite response, or a variance above 0, left out")
+    if frf.status is not FrfStatus.OK or frf.variance_noise is None:
+        notes.append(frf.message)
+    return with_transient_judged(frf, single(batch, notes=notes))
+
+
+@np.errstate(all="ignore")  # what exceeds double precision shows in the status
+def identify_batch(
+    frf: FRF,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+) -> PolesBatch:
+    """As `identify_poles` for FRFs of many points on the same lines.
+
+    Parameters
+    ----------
+    frf : FRF
+        With (..., F) arrays; a variance (F,) is that of all points. Lines whose variance is not
+        above 0 are left out; a point without any variance above 0 is fitted as one without
+        variance.
+
+    Returns
+    -------
+    PolesBatch
+        With the leading axes of `frf`.
+
+    Raises
+    ------
+    ValueError
+        If shapes, lines or band are none: names the field, its value, and what is accepted.
+    """
+    structure = structure or ModelStructure()
+    frf = checked_frf(frf)
+    band_hz = checked_band(frf.frequency_hz, band_hz)
+    selected = frf.band(*band_hz)
+    lines = lines_of_frf(selected)
+    return _identify(
+        selected.frequency_hz,
+        lines.data,
+        lines.known,
+        lines.usable,
+        structure,
+        band_hz,
+        shape=frf.g.shape[:-1],
+        method="weighted least squares",
+        level_known=lines.level_known,
+        noise=lines.noise,
+        total_known=selected.variance_total is not None,
+    )
+
+
+@np.errstate(all="ignore")
+def identify_spectra(
+    frequency_hz: FloatArray,
+    spectra: ComplexArray,
+    covariance: ComplexArray,
+    dof: int,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+    *,
+    pooled: bool = True,
+) -> PolesBatch:
+    """Poles from input and output spectra with their noise covariance: errors in variables.
+
+    Parameters
+    ----------
+    frequency_hz : (F,) float
+    spectra : (..., 2, F) complex
+        Mean spectra, row order [Y; U].
+    covariance : (..., 2, 2, F) complex
+        Noise covariance of these means.
+    dof : int
+        Complex degrees of freedom of the covariance; 0 where it is exact.
+    band_hz, structure
+        As for `identify_poles`.
+    pooled : bool
+        Take both variances, and the correlation, from the whole band where a test finds each flat
+        or sloped. A line on which one channel has no variance, where others have one, is left out.
+
+    Returns
+    -------
+    PolesBatch
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+
+    References
+    ----------
+    Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+    section 12.3: sample maximum likelihood.
+    """
+    structure = structure or ModelStructure()
+    frequency_hz, spectra, covariance = checked_spectra(frequency_hz, spectra, covariance, dof)
+    band_hz = checked_band(frequency_hz, band_hz)
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    lines = lines_of_spectra(spectra[..., inside], covariance[..., inside], dof, pooled)
+    return _identify(
+        frequency_hz[inside],
+        lines.data,
+        lines.known,
+        lines.usable,
+        structure,
+        band_hz,
+        shape=spectra.shape[:-2],
+        method="sample maximum likelihood, errors in variables",
+        level_known=lines.level_known,
+    )
+
+
+def _identify(
+    frequency_hz: FloatArray,
+    data: BinData,
+    known: VarianceModel,
+    usable: npt.NDArray[np.bool_],
+    structure: ModelStructure,
+    band_hz: tuple[float, float],
+    *,
+    shape: tuple[int, ...],
+    method: str,
+    level_known: npt.NDArray[np.bool_],
+    noise: FloatArray | None = None,
+    total_known: bool = False,
+) -> PolesBatch:
+    lines = usable.sum(axis=-1)
+    batch = lines.size
+    parameters = structure.parameters
+    enough = lines >= structure.fewest_lines
+    if frequency_hz.size < structure.fewest_lines or batch == 0:
+        # bases need points: any will do, nothing is fitted
+        places = max(structure.order, structure.numerator_order) + 1
+        nothing = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure)
+        return assemble(Evidence.empty(nothing, lines), structure, band_hz, shape, method)
+    plan = LinesPlan.on_lines(frequency_hz, structure)
+    fit = plan.fit(data)
+    weighted = fit.covariance * known.information_correction[:, None, None]
+    covariance = weighted if noise is None else _propagated(plan, fit, data, noise)
+    cost, expected = fit.cost, known.expected_cost(parameters)
+    suspect = level_known & (cost > known.cost_quantile(parameters, 1 - MODEL_ERROR_PROBABILITY))
+    suspect |= are_smooth(fit.residual, parameters)
+    unknown_total = np.full_like(weighted, np.nan)
+    total = weighted if total_known else unknown_total
+    kind = np.array(KINDS)[known.kind]
+    if not level_known.all():
+        # the residuals are all there is: they hold noise, distortion and model error together
+        level = fit.cost / np.maximum(lines - parameters / 2, 0.5)
+        weighted = _where(level_known, weighted, fit.covariance * level[:, None, None])
+        covariance = _where(level_known, covariance, unknown_total)
+        total = _where(level_known, total, weighted)
+        # what rounding leaves of exact data says nothing
+        suspect &= level_known | (level > ROUNDED)
+        cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
+        kind = np.where(level_known, kind, "unknown")
+    evidence = Evidence(
+        fit, lines, enough, cost, expected, suspect, covariance, total, kind, level_known
+    )
+    if suspect.any():
+        evidence = evidence.with_model_error(weighted)
+    result = assemble(evidence, structure, band_hz, shape, method)
+    if suspect.any():
+        systematic = _systematic(plan, fit, data, usable, np.flatnonzero(suspect), band_hz)
+        total = result.total_covariance.reshape((batch, *systematic.shape[1:]))
+        total[suspect] += systematic
+    return result
+
+
+def _where(rows: npt.NDArray[np.bool_], those: FloatArray, others: FloatArray) -> FloatArray:
+    """(batch, n, n) matrices of some points, and of the others."""
+    return np.where(rows[:, None, None], those, others)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _systematic(
+    plan: LinesPlan,
+    fit: LinesFit,
+    data: BinData,
+    usable: npt.NDArray[np.bool_],
+    rows: npt.NDArray[np.int64],
+    band_hz: tuple[float, float],
+) -> FloatArray:
+    """(rows, places, 2, 2) what halves of the lines, and one mode more, make of the poles."""
+    poles = []
+    part = data.rows(rows)
+    for parity in (0, 1):
+        left_out = np.arange(usable.shape[1]) % 2 == parity
+        half = replace(part, variance_y=np.where(left_out, np.inf, part.variance_y))
+        poles.append(modes_in_band(plan.compared(half), band_hz))
+    systematic = difference_of_halves(*poles)
+    structure = richer(plan.structure)
+    if usable[rows].sum(axis=-1).min() > structure.fewest_lines:
+        found = LinesPlan.on_lines(plan.frequency_hz, structure).compared(part)
+        systematic = systematic + difference_of_models(
+            modes_in_band(fit.model.poles_rad_s()[rows], band_hz), modes_in_band(found, band_hz)
+        )
+    return systematic
+
+
+def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
+    """Covariance (batch, n, n) from a variance (batch, F) other than the one weighted with."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        finite, weighted = np.isfinite(data.variance_y), data.variance_y**2 / noise[:, None]
+        changed = replace(data, variance_y=np.where(finite, weighted, np.inf))
+    inner = plan.weighted_normal(changed, plan.theta(fit.model))
+    n = inner.shape[-1]
+    inverse = 2 * fit.covariance[:, :n, :n]
+    return 0.5 * inverse @ inner @ inverse

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit of a rational model to lines: of an FRF (input 1), or of input and output spectra.
+
+Sample maximum likelihood: the cost weighs with sample variances (Pintelon & Schoukens, *System
+Identification: A Frequency Domain Approach*, 2nd ed. (2012), chapter 12).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.poles import likelihood
+from tactile_resonance.poles.basis import PolynomialBasis
+from tactile_resonance.poles.bins import BinData, Problem
+from tactile_resonance.poles.fit import (
+    DenseSolution,
+    Linearised,
+    least_squares,
+    linear_step,
+    minimise,
+    start_values,
+)
+from tactile_resonance.poles.model import RationalModel, Variable
+from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS
+from tactile_resonance.poles.structure import ModelStructure
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+# Beyond this condition number normal equations are not trusted and the Jacobian itself is
+# factorised.
+NORMAL_EQUATIONS_LIMIT = 1e5
+# Models of more poles than this go to the dense solver at once.
+LARGEST_BATCHED_ORDER = 6
+REBASE_ITERATIONS = 40
+# Bases follow the denominator until it changes by less than this from one iteration to the next.
+REBASE_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class LinesFit:
+    """Fits of a batch of points on the same lines.
+
+    Attributes
+    ----------
+    model : RationalModel
+    cost : (batch,) float
+    covariance : (batch, n, n) float
+        Of the coefficients, where the variance of each line is the one it was weighted with.
+    condition_number : (batch,) float
+    converged : (batch,) bool
+    residual : (batch, F) complex
+        Weighted residuals; 0 on lines that were left out.
+    """
+
+    model: RationalModel
+    cost: FloatArray
+    covariance: FloatArray
+    condition_number: FloatArray
+    converged: npt.NDArray[np.bool_]
+    residual: ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinesPlan:
+    """What a fit on given lines needs whatever the data.
+
+    Attributes
+    ----------
+    frequency_hz : (F,) float
+    structure : ModelStructure
+    start_size : (F,) float or None
+        ``|A|`` that start values begin from, in a rebased plan.
+    """
+
+    frequency_hz: FloatArray
+    structure: ModelStructure
+    problem: Problem
+    variable: Variable
+    denominator_basis: PolynomialBasis
+    numerator_basis: PolynomialBasis
+    start_size: FloatArray | None = None
+
+    @classmethod
+    def on_lines(cls, frequency_hz: FloatArray, structure: ModelStructure) -> LinesPlan:
+        """Plan with bases orthonormal on the lines; the latest ones are kept."""
+        return _plan(np.ascontiguousarray(frequency_hz, float).tobytes(), structure)
+
+    def fit(self, data: BinData) -> LinesFit:
+        """Fit of all points of a batch."""
+        batch = data.y.shape[0]
+        if self.structure.order > LARGEST_BATCHED_ORDER:
+            return self.rebased(data)._fit_dense(data)
+        if self.structure.delay:
+            return self._fit_dense(data)
+        solution = minimise(self.problem, data)
+        inverse, condition = likelihood.invert(solution.normal[:, 0, 1])
+        theta, cost, converged = solution.theta[:, 0], solution.cost, solution.converged
+        residual, parameters = solution.residual[:, 0], 0.5 * inverse
+        doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
+        if batch == 1 and doubtful.size:
+            return self.rebased(data)._fit_dense(data)
+        for k in doubtful:
+            dense = least_squares(self.problem, data.rows(slice(k, k + 1)))
+            if dense.cost <= cost[k] * (1 + 1e-9) or not converged[k]:
+                theta[k], cost[k], converged[k] = dense.theta, dense.cost, dense.converged
+                residual[k] = dense.turned[0]
+                half, condition[k] = dense.covariance()
+                parameters[k] = 0.5 * half
+        return LinesFit(self.model_of(theta), cost, parameters, condition, converged, residual)
+
+    def compared(self, data: BinData) -> ComplexArray:
+        """(batch, order) poles [rad/s] of a fit that others are compared with.
+
+        Of the batched solver alone where it is that of `fit`, and of few iterations.
+        """
+        if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
+            return self.fit(data).model.poles_rad_s()
+        theta = minimise(self.problem, data, None, COMPARISON_ITERATIONS).theta
+        return self.model_of(theta[:, 0]).poles_rad_s()
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def rebased(self, data: BinData) -> LinesPlan:
+        """Plan with bases orthonormal in the weights of the fit itself.
+
+        Polynomials orthonormal on the lines still make ill-conditioned rational functions where |A|
+        spans many decades: many poles, wide bands. Sanathanan-Koerner iterations that
+        orthonormalise anew in ``1 / |A|^2`` bring the condition number to a few units (Bultheel,
+        Van Barel, Rolain, Pintelon, *Numerically robust transfer function modeling from noisy
+        frequency domain data*, IEEE Trans. Autom. Control 50 (2005) 1835-1839). The first point
+        with finite weights stands for all.
+        """
+        usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
+        row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
+        y, u = row.y[0, 0], row.u[0, 0]
+        variance = np.broadcast_to(row.variance_y[0, 0], y.shape)
+        x = self.variable.of_frequency(self.frequency_hz)
+        order = self.structure.order
+        plan = self
+        size = np.ones(y.size)
+        for _ in range(REBASE_ITERATIONS):
+            weight = 1 / (variance * size)
+            weight_y, weight_u = weight * np.abs(y) ** 2, weight * np.abs(u) ** 2
+            mean_y, mean_u = weight_y.mean(), weight_u.mean()
+            if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
+                break
+            denominator = PolynomialBasis.on_lines(x, order, weight_y / mean_y)
+            numerator = PolynomialBasis.on_lines(
+                x, self.structure.numerator_order, weight_u / mean_u
+            )
+            if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
+                break
+            problem = Problem.of_lines(denominator.values, numerator.values)
+            plan = LinesPlan(
+                self.frequency_hz, self.structure, problem, self.variable, denominator, numerator
+            )
+            theta = linear_step(problem, row, np.sqrt(size))
+            last, size = size, np.abs(denominator.values @ np.append(theta[:order], 1.0)) ** 2
+            if not (np.isfinite(size).all() and (size > 0).all()):
+                break
+            plan = replace(plan, start_size=np.sqrt(size))
+            if np.ptp(np.log(size / last)) < REBASE_TOLERANCE:
+                break
+        return plan
+
+    def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
+        """(batch, n, n) ``Re J^H J`` for the weights of `data`."""
+        return likelihood.moments(self.problem.tables, data.arrays, theta[:, None])[2][:, 0, 1]
+
+    def theta(self, model: RationalModel) -> FloatArray:
+        """(batch, n) free coefficients of a model of this plan."""
+        return np.concatenate([model.denominator[:, :-1], model.numerator], axis=1)
+
+    def model_of(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
+        """The model with coefficients (batch, n), those of A first."""
+        a, b, _ = self.problem.sizes
+        return RationalModel(
+            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
+            numerator=np.ascontiguousarray(theta[:, a : a + b]),
+            variable=self.variable,
+            denominator_basis=self.denominator_basis,
+            numerator_basis=self.numerator_basis,
+            delay_s=delay_s,
+        )
+
+    def _fit_dense(self, data: BinData) -> LinesFit:
+        """Point by point, for structures beyond the batched solver."""
+        phase = None
+        unit_s = 1.0
+        if self.structure.delay:
+            unit_s = 1 / (2 * np.pi * float(self.frequency_hz.max()))
+            phase = 2 * np.pi * self.frequency_hz * unit_s
+        solutions = []
+        for k in range(data.y.shape[0]):
+            row = data.rows(slice(k, k + 1))
+            solutions.append(self._best_of_starts(row, phase))
+        theta = np.stack([s.theta for s in solutions])
+        covariances, conditions = zip(*(s.covariance() for s in solutions), strict=True)
+        delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
+        return LinesFit(
+            self.model_of(theta, delay_s),
+            np.array([s.cost for s in solutions]),
+            0.5 * np.stack(covariances),
+            np.array(conditions),
+            np.array([s.converged for s in solutions]),
+            np.stack([s.turned[0] for s in solutions]),
+        )
+
+    def _best_of_starts(self, row: BinData, phase: FloatArray | None) -> DenseSolution:
+        """Of several starts the one with the least cost."""
+        solutions = []
+        for start in self._starts(row, phase):
+            solutions.append(least_squares(self.problem, row, start, phase, self.start_size))
+        finite = [s for s in solutions if np.isfinite(s.cost)]
+        return min(finite or solutions, key=lambda s: s.cost)
+
+    def _starts(self, row: BinData, phase: FloatArray | None) -> list[FloatArray | None]:
+        if phase is None:
+            return [None]
+        return delay_starts(self.problem, row, phase)
+
+
+@lru_cache(maxsize=16)
+def _plan(frequency_hz: bytes, structure: ModelStructure) -> LinesPlan:
+    lines_hz = np.frombuffer(frequency_hz)
+    variable = Variable.for_lines(lines_hz, structure)
+    x = variable.of_frequency(lines_hz)
+    denominator = PolynomialBasis.on_lines(x, structure.order)
+    numerator = PolynomialBasis.on_lines(x, structure.numerator_order)
+    problem = Problem.of_lines(denominator.values, numerator.values)
+    return LinesPlan(lines_hz, structure, problem, variable, denominator, numerator)
+
+
+def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[FloatArray | None]:
+    """Starts with the delay removed beforehand, on a grid of a radian over the band.
+
+    The cost has many minima in the delay, about half a turn of phase over the band apart.
+    """
+    step = 1.0 / max(float(np.ptp(phase)), 1e-12)
+    candidates = []
+    for delay in step * np.arange(-2, 13):
+        turned = BinData.of(
+            row.y * np.exp(1j * phase * delay), row.u, 0, row.variance_y, row.variance_u
+        )
+        theta = start_values(problem, turned)[0, 0]
+        if not np.isfinite(theta).all():
+            continue
+        residual = Linearised.of(problem, turned, theta).residual
+        cost = float(np.sum(residual.real**2 + residual.imag**2))
+        candidates.append((cost, np.append(theta, delay)))
+    candidates.sort(key=lambda c: c[0])
+    return [theta for _, theta in candidates[:3]] or [None]

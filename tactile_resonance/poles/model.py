@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The identified transfer function: poles, zeros, residues, response, and their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.poles.basis import PolynomialBasis
+from tactile_resonance.poles.structure import ModelStructure
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """The variable x of the polynomials: ``s / scale`` or ``z``."""
+
+    domain: str
+    scale_rad_s: float
+    sample_rate_hz: float | None = None
+
+    @classmethod
+    def for_lines(cls, frequency_hz: FloatArray, structure: ModelStructure) -> Variable:
+        """Scaled to the highest line."""
+        scale = 2 * np.pi * float(np.max(frequency_hz))
+        return cls(structure.domain, scale if scale > 0 else 1.0, structure.sample_rate_hz)
+
+    def of_frequency(self, frequency_hz: FloatArray) -> ComplexArray:
+        """The x of lines [Hz]."""
+        return self.of_s(np.asarray(2j * np.pi * np.asarray(frequency_hz), complex))
+
+    def of_s(self, s_rad_s: ComplexArray) -> ComplexArray:
+        """The x of points of the s-plane."""
+        if self.sample_rate_hz is not None and self.domain == "z":
+            return np.asarray(np.exp(s_rad_s / self.sample_rate_hz))
+        return s_rad_s / self.scale_rad_s
+
+    def to_s(self, x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """The s [rad/s] of x, and the derivative ds/dx."""
+        if self.sample_rate_hz is not None and self.domain == "z":
+            with np.errstate(divide="ignore", invalid="ignore"):
+                s = np.asarray(self.sample_rate_hz * np.log(x), complex)
+                return s, self.sample_rate_hz / x
+        return np.asarray(x * self.scale_rad_s, complex), np.full(
+            np.shape(x), self.scale_rad_s, complex
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RationalModel:
+    """``B / A exp(-s delay)`` with coefficients over fixed bases; leading axes are batch axes.
+
+    Attributes
+    ----------
+    denominator : (..., n + 1) float
+        Over `denominator_basis`; the last one is 1.
+    numerator : (..., m + 1) float
+        Over `numerator_basis`.
+    variable : Variable
+    denominator_basis, numerator_basis : PolynomialBasis
+    transient : (..., t) float
+        Coefficients of the transient's numerator, empty where there is none; of several records
+        one after the other.
+    delay_s : (...) float
+    """
+
+    denominator: FloatArray
+    numerator: FloatArray
+    variable: Variable
+    denominator_basis: PolynomialBasis
+    numerator_basis: PolynomialBasis
+    transient: FloatArray = field(default_factory=lambda: np.empty(0))
+    delay_s: FloatArray | float = 0.0
+
+    def at(self, index: tuple[int, ...] | tuple[npt.NDArray[np.intp]]) -> RationalModel:
+        """The model of one point of a batch, or of some of them."""
+        delay = self.delay_s if np.ndim(self.delay_s) == 0 else np.asarray(self.delay_s)[index]
+        transient = self.transient[index] if self.transient.ndim > 1 else self.transient
+        return replace(
+            self,
+            denominator=self.denominator[index],
+            numerator=self.numerator[index],
+            transient=transient,
+            delay_s=delay,
+        )
+
+    def poles_rad_s(self) -> ComplexArray:
+        """(..., n) all poles [rad/s]."""
+        return self.variable.to_s(self.denominator_basis.roots(self.denominator))[0]
+
+    def zeros_rad_s(self) -> ComplexArray:
+        """(..., m) all zeros [rad/s]."""
+        if self.numerator.shape[-1] < 2:
+            return np.empty((*self.numerator.shape[:-1], 0), complex)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.variable.to_s(self.numerator_basis.roots(self.numerator))[0]
+
+    def response(self, frequency_hz: FloatArray) -> ComplexArray:
+        """(..., F) the model at any frequencies (F,)."""
+        x = self.variable.of_frequency(frequency_hz)
+        a = self.denominator @ self.denominator_basis.values_at(x).T
+        b = self.numerator @ self.numerator_basis.values_at(x).T
+        phase = 2 * np.pi * np.asarray(frequency_hz) * np.asarray(self.delay_s)[..., None]
+        return b / a * np.exp(-1j * phase)
+
+    def residues(self, poles_rad_s: ComplexArray) -> ComplexArray:
+        """(..., k) residues of ``B / A`` at simple poles (..., k) [rad/s].
+
+        In the z-domain of the s-plane function with the same behaviour close to the pole.
+        """
+        return self.residues_and_sensitivity(poles_rad_s)[0]
+
+    def residues_and_sensitivity(
+        self, poles_rad_s: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Residues (..., k) at simple poles (..., k), and the poles' derivatives (..., k, n).
+
+        The derivatives are those by the free coefficients of A.
+        """
+        x = self.variable.of_s(poles_rad_s)
+        values, slopes = self.denominator_basis.at(x)
+        # A(x; a) = 0 along the root: dx = - dA / A'
+        factor = self.variable.to_s(x)[1] / _dot(slopes, self.denominator)
+        residues = _dot(self.numerator_basis.values_at(x), self.numerator) * factor
+        return residues, values[..., :-1] * -factor[..., None]
+
+    def zero_sensitivity(self, zeros_rad_s: ComplexArray) -> ComplexArray:
+        """(..., k, m + 1) derivative of simple zeros (..., k) by the coefficients of B."""
+        x = self.variable.of_s(zeros_rad_s)
+        values, slopes = self.numerator_basis.at(x)
+        factor = -self.variable.to_s(x)[1] / _dot(slopes, self.numerator)
+        return values * factor[..., None]
+
+    def residue_sensitivity(self, poles_rad_s: ComplexArray) -> ComplexArray:
+        """(..., k, n + m + 1) derivative of the residues by the free coefficients of A, then B."""
+        x = self.variable.of_s(poles_rad_s)
+        values, slopes = self.denominator_basis.at(x)
+        a1 = _dot(slopes, self.denominator)
+        a2 = _dot(self.denominator_basis.second_derivative(x), self.denominator)
+        b_values, b_slopes = self.numerator_basis.at(x)
+        b, b1 = _dot(b_values, self.numerator), _dot(b_slopes, self.numerator)
+        map_1 = self.variable.to_s(x)[1]
+        map_2 = -map_1 / x if self.variable.domain == "z" else np.zeros_like(map_1)
+        dx = -values[..., :-1] / a1[..., None]
+        residue = b / a1
+        by_x = (b1 - residue * a2) / a1 * map_1 + residue * map_2
+        by_alpha = by_x[..., None] * dx - (residue / a1 * map_1)[..., None] * slopes[..., :-1]
+        by_beta = b_values * (map_1 / a1)[..., None]
+        return np.concatenate([by_alpha, by_beta], axis=-1)
+
+
+def _dot(basis: ComplexArray, coefficients: FloatArray) -> ComplexArray:
+    """(..., k) of basis (..., k, terms) and coefficients (..., terms)."""
+    return (basis @ coefficients[..., None])[..., 0]

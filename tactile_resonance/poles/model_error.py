@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a model that leaves something out adds to the uncertainty of its poles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_resonance.poles.result import (
+    ComplexArray,
+    FloatArray,
+    natural_frequency_and_damping,
+)
+from tactile_resonance.poles.structure import ModelStructure
+
+# A cost that noise alone exceeds once in a thousand fits counts as model error.
+MODEL_ERROR_PROBABILITY = 1e-3
+# Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
+# in particular.
+COMPARISON_ITERATIONS = 8
+
+
+def model_error_factor(
+    residual: ComplexArray, cost: FloatArray, expected_cost: FloatArray
+) -> FloatArray:
+    """(batch,) factor from the covariance of noise to that of noise and model error.
+
+    The excess of the cost tells how large the errors are; their correlation from line to line, how
+    many of them act together: errors that keep their sign over L lines disturb a coefficient as L
+    times fewer lines of independent errors would.
+
+    Parameters
+    ----------
+    residual : (batch, F) complex
+        Weighted.
+    cost, expected_cost : (batch,) float
+    """
+    ratio = np.fmax(cost / expected_cost, 1.0)  # 1 where the level itself is from the residuals
+    return ratio * correlation_length(residual)
+
+
+def correlation_length(residual: ComplexArray) -> FloatArray:
+    """(batch,) ``1 + 2 sum rho`` over the correlations of residuals (batch, F).
+
+    Sokal's automatic window: the sum ends at the lag that exceeds five times itself.
+    """
+    lines = residual.shape[-1]
+    padded = np.fft.fft(residual, 2 * lines, axis=-1)
+    correlation = np.fft.ifft(np.abs(padded) ** 2, axis=-1).real[:, :lines]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rho = correlation / correlation[:, :1]
+    length = 2 * np.cumsum(np.nan_to_num(rho), axis=-1) - 1  # (batch, F)
+    enough = np.arange(lines) >= 5 * length
+    window = np.where(enough.any(axis=-1), np.argmax(enough, axis=-1), lines - 1)
+    return np.maximum(np.take_along_axis(length, window[:, None], axis=-1)[:, 0], 1.0)
+
+
+def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> FloatArray:
+    """Outer product of what even and odd lines differ by in (f0_hz, damping_ratio).
+
+    What one wild line does shows in no residual of its neighbours; it does between halves of the
+    lines.
+
+    Parameters
+    ----------
+    even_rad_s, odd_rad_s : (..., places) complex
+        Poles found from either half; NaN where a half does not have the mode.
+
+    Returns
+    -------
+    (..., places, 2, 2) float
+    """
+    even, odd = (
+        np.stack(natural_frequency_and_damping(p), axis=-1) for p in (even_rad_s, odd_rad_s)
+    )
+    difference = even - odd  # (..., places, 2)
+    return np.asarray(difference[..., :, None] * difference[..., None, :])
+
+
+def difference_of_models(
+    poles_rad_s: ComplexArray, richer_rad_s: ComplexArray, covariance: FloatArray | None = None
+) -> FloatArray:
+    """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
+
+    Two modes nearer to each other than their widths are fitted by one between them so well that
+    residuals tell little of how far it is from either.
+
+    Parameters
+    ----------
+    poles_rad_s : (..., places) complex
+    richer_rad_s : (..., more places) complex
+        NaN where there is no mode; the nearest one counts.
+    covariance : (..., more places, 2, 2) float, optional
+        Of (f0_hz, damping_ratio) of the latter.
+
+    Returns
+    -------
+    (..., places, 2, 2) float
+        With the covariance of the nearest one, where given; 0 where the richer model has no mode.
+    """
+    distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
+    nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
+    other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
+    moved = difference_of_halves(poles_rad_s, other)
+    if covariance is not None:
+        moved = moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3)
+    return np.nan_to_num(moved)
+
+
+def richer(structure: ModelStructure) -> ModelStructure:
+    """One mode more, as many residual terms."""
+    return replace(
+        structure, order=structure.order + 2, numerator_order=structure.numerator_order + 2
+    )

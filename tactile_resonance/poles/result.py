@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an identification holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.whiteness import whiteness
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+
+class PolesStatus(Enum):
+    """Whether poles can be relied on."""
+
+    OK = "ok"
+    MODEL_ERROR = "model error"
+    NOT_CONVERGED = "not converged"
+    TOO_FEW_LINES = "too few lines"
+    ILL_CONDITIONED = "ill conditioned"
+    UNSTABLE_POLE = "unstable pole"
+    NO_COVARIANCE = "no covariance"
+    NO_RESONANCE = "no resonance"
+    FAILED = "failed"
+    TRUTH = "truth"
+
+
+@dataclass(frozen=True, eq=False)
+class MainMode:
+    """The mode that is meant where one is asked for: see `Poles.main`.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio; NaN where no pole was found.
+    covariance, noise : (2, 2) float
+        Of the estimate: of `Poles.best_covariance`, and from noise alone; NaN where unknown.
+    pole_rad_s : complex
+        With positive imaginary part.
+    drift, drift_std : (2,) float
+        What f0 [Hz/s] and damping ratio [1/s] change by, and its deviation; NaN where no change shows.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+    noise: FloatArray
+    pole_rad_s: complex
+    drift: FloatArray
+    drift_std: FloatArray
+
+    @property
+    def f0_hz(self) -> float:
+        """Undamped natural frequency."""
+        return float(self.estimate[0])
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio."""
+        return float(self.estimate[1])
+
+    @property
+    def std(self) -> FloatArray:
+        """(2,) standard deviations of f0 [Hz] and damping ratio; NaN where unknown."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pole."""
+        return bool(np.isfinite(self.estimate[0]))
+
+
+@dataclass(frozen=True)
+class Poles:
+    """Poles of the identified model, one entry per complex pair inside the band.
+
+    Attributes
+    ----------
+    poles_rad_s : (n,) complex
+        Pole of each pair with positive imaginary part [rad/s].
+    f0_hz : (n,) float
+        Undamped natural frequency ``|pole| / 2 pi``.
+    damping_ratio : (n,) float
+        ``-Re(pole) / |pole|``.
+    residues : (n,) complex
+        Residue of G at each pole [rad/s].
+    covariance : (n, 2, 2) float or None
+        Of (f0_hz, damping_ratio), from noise.
+    total_covariance : (n, 2, 2) float or None
+        From noise, distortion and model error, where they can be told.
+    pole_covariance : (n, 2, 2) float or None
+        Of (Re, Im) of each pole [rad^2/s^2], from noise.
+    residue_covariance : (n, 2, 2) float or None
+        Of (Re, Im) of each residue [rad^2/s^2], from noise.
+    zeros_rad_s : (k,) complex
+        All zeros of the model [rad/s]; those far outside the band mean nothing.
+    zero_covariance : (k, 2, 2) float or None
+        Of (Re, Im) of each zero, from noise.
+    f0_drift_hz_per_s, damping_drift_per_s : (n,) float or None
+        What f0 and damping ratio change by over a record, of which poles are then the means: the slope
+        of the straight line nearest to the change. None where nothing shows that they do.
+    drift_covariance : (n, 2, 2) float or None
+        Of these two.
+    instant_s : float or None
+        When, from the start of the record, poles that change are about those given; None of others.
+    structure : ModelStructure
+    band_hz : (float, float)
+    lines : int
+        Lines used.
+    cost, expected_cost : float
+        Weighted squared residuals, and their expectation if there were nothing but noise; NaN where
+        the variance is unknown.
+    whiteness : float
+        How much smoother the residuals are than those of noise, as a normal score: see
+        `whiteness.whiteness`. NaN where it was not computed.
+    condition_number : float
+        Of the column-scaled Jacobian, to within a factor of the number of parameters; NaN where
+        there is none.
+    variance_model : str
+        What was assumed of the variance over the lines: flat, sloped, or per line.
+    fit : RationalModel or None
+        The model itself; ``fit.response(frequency_hz)`` is its frequency response.
+    method : str
+    status : PolesStatus
+    message : str
+        A sentence for people.
+    """
+
+    poles_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
+    f0_hz: FloatArray = field(default_factory=lambda: np.empty(0))
+    damping_ratio: FloatArray = field(default_factory=lambda: np.empty(0))
+    residues: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
+    covariance: FloatArray | None = None
+    total_covariance: FloatArray | None = None
+    pole_covariance: FloatArray | None = None
+    residue_covariance: FloatArray | None = None
+    zeros_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
+    zero_covariance: FloatArray | None = None
+    f0_drift_hz_per_s: FloatArray | None = None
+    damping_drift_per_s: FloatArray | None = None
+    drift_covariance: FloatArray | None = None
+    instant_s: float | None = None
+    structure: ModelStructure = field(default_factory=ModelStructure)
+    band_hz: tuple[float, float] = (float("nan"), float("nan"))
+    lines: int = 0
+    cost: float = float("nan")
+    expected_cost: float = float("nan")
+    whiteness: float = float("nan")
+    condition_number: float = float("nan")
+    variance_model: str = ""
+    fit: RationalModel | None = None
+    method: str = ""
+    status: PolesStatus = PolesStatus.FAILED
+    message: str = ""
+
+    @property
+    def best_covariance(self) -> FloatArray:
+        """(n, 2, 2) of (f0_hz, damping_ratio): in total where known, else from noise; NaN where neither is."""
+        best = np.full((self.f0_hz.size, 2, 2), np.nan)
+        for known in (self.covariance, self.total_covariance):
+            if known is not None:
+                finite = np.all(np.isfinite(known), axis=(1, 2))
+                best[finite] = known[finite]
+        return best
+
+    @property
+    def main(self) -> MainMode:
+        """The mode with the highest peak, ``|residue| / |Re pole|``; all NaN where no pole was found."""
+        nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
+        if not self.f0_hz.size:
+            return MainMode(nothing, unknown, unknown, complex("nan+nanj"), nothing, nothing)
+        k = int(np.argmax(np.abs(self.residues) / np.abs(self.poles_rad_s.real)))
+        drift, drift_std = nothing, nothing
+        f0_drift, damping_drift = self.f0_drift_hz_per_s, self.damping_drift_per_s
+        if f0_drift is not None and damping_drift is not None and self.drift_covariance is not None:
+            drift = np.array([f0_drift[k], damping_drift[k]])
+            drift_std = np.sqrt(np.diag(self.drift_covariance[k]))
+        return MainMode(
+            estimate=np.array([self.f0_hz[k], self.damping_ratio[k]]),
+            covariance=self.best_covariance[k],
+            noise=unknown if self.covariance is None else self.covariance[k],
+            pole_rad_s=complex(self.poles_rad_s[k]),
+            drift=drift,
+            drift_std=drift_std,
+        )
+
+
+STATUSES = tuple(PolesStatus)
+STATUS_CODE = {status: code for code, status in enumerate(STATUSES)}
+
+
+@dataclass(frozen=True, eq=False)
+class PolesBatch:
+    """Poles of many points, as arrays with the points' axes (...) leading.
+
+    Every point has ``structure.order // 2`` places for modes inside the band, by natural frequency;
+    places without a mode hold NaN. NaN in a covariance means that it could not be estimated.
+
+    Attributes
+    ----------
+    poles_rad_s, residues : (..., n) complex
+    f0_hz, damping_ratio : (..., n) float
+    covariance, total_covariance, pole_covariance : (..., n, 2, 2) float
+        As in `Poles`; the total one is NaN where nothing but noise is known.
+    coefficient_covariance : (..., p, p) float
+        Of the free coefficients of ``fit``: denominator, numerator, transient (from noise); without
+        the transients where these are of several records.
+    cost, expected_cost, condition_number : (...) float
+    residual : (..., F) complex
+        Weighted residuals on the (excited) lines; 0 on those left out. Those of spectra are turned
+        by the phase of the input, to be as smooth as an error of the response.
+    lines : (...) int
+    significant : (..., n) bool
+        Modes that noise alone would not make (one in ten thousand); the status speaks of these. Those
+        whose covariance is not known count.
+    status_code : (...) uint8
+        Index into `STATUSES`.
+    noise_variance : (..., 2) float
+        Estimated variance of a bin of Y and of U [V^2]; NaN where the data brought their own.
+    lacking : (..., 3) float
+        Chi-square of what the model lacks, how many parameters that has, and f0 [Hz] of the mode it is,
+        NaN for residual terms; all NaN where a test finds nothing, or was not made.
+    fit : RationalModel
+        Its coefficients have the same leading axes.
+    structure : ModelStructure
+    band_hz : (float, float)
+    variance_model : (...) str array
+    method : str
+    remark : (...) object array of str, optional
+        What else is to be told to people of a point; empty: nothing.
+    """
+
+    poles_rad_s: ComplexArray
+    f0_hz: FloatArray
+    damping_ratio: FloatArray
+    residues: ComplexArray
+    covariance: FloatArray
+    total_covariance: FloatArray
+    pole_covariance: FloatArray
+    coefficient_covariance: FloatArray
+    cost: FloatArray
+    expected_cost: FloatArray
+    condition_number: FloatArray
+    residual: ComplexArray
+    lines: npt.NDArray[np.int64]
+    significant: npt.NDArray[np.bool_]
+    status_code: npt.NDArray[np.uint8]
+    noise_variance: FloatArray
+    lacking: FloatArray
+    fit: RationalModel
+    structure: ModelStructure
+    band_hz: tuple[float, float]
+    variance_model: npt.NDArray[np.str_]
+    method: str
+    remark: npt.NDArray[np.object_] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the batch."""
+        return self.cost.shape
+
+    @property
+    def whiteness(self) -> FloatArray:
+        """(...) how much smoother the residuals are than white ones; see `whiteness.whiteness`."""
+        return whiteness(self.residual, self.structure.parameters)
+
+    def has_status(self, status: PolesStatus) -> npt.NDArray[np.bool_]:
+        """(...) which points have a status."""
+        return self.status_code == STATUS_CODE[status]
+
+    def status(self, index: tuple[int, ...] | int = ()) -> PolesStatus:
+        """Status of one point."""
+        return STATUSES[int(self.status_code[index])]
+
+
+def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """f0 [Hz] and damping ratio of poles [rad/s], elementwise."""
+    magnitude = np.abs(pole)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return magnitude / (2 * np.pi), -pole.real / magnitude
+
+
+def natural_frequency_and_damping_jacobian(pole: ComplexArray) -> FloatArray:
+    """(..., 2, 2) derivative of (f0_hz, damping_ratio) by (Re, Im) of the pole [rad/s]."""
+    re, im, mag = pole.real, pole.imag, np.abs(pole)
+    out = np.empty((*np.shape(pole), 2, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out[..., 0, 0] = re / (2 * np.pi * mag)
+        out[..., 0, 1] = im / (2 * np.pi * mag)
+        out[..., 1, 0] = -(im**2) / mag**3
+        out[..., 1, 1] = re * im / mag**3
+    return out

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which modes of a fit are more than noise makes."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from tactile_resonance.poles.covariance import real_covariance
+from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.result import ComplexArray, FloatArray
+
+BoolArray = npt.NDArray[np.bool_]
+
+# A mode that noise makes is taken for one this often.
+NOISE_PASSES_FOR_A_MODE = 1e-4
+# A single mode whose damping ratio is known to this part is none of noise's making: its residue is known
+# about as well, ten times better than the test below asks for.
+CERTAIN = 0.02
+
+
+def significant_modes(
+    model: RationalModel,
+    quantities: dict[str, npt.NDArray],
+    coefficients: FloatArray,
+    lines: npt.NDArray[np.int64],
+) -> BoolArray:
+    """(batch, k) modes that noise alone would not make; those whose covariance is not known are kept.
+
+    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
+    zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
+    (Bonferroni).
+
+    Parameters
+    ----------
+    model : RationalModel
+    quantities : dict
+        Of `covariance.pole_quantities`.
+    coefficients : (batch, n, n) float
+        Covariance of the free coefficients; NaN where it is not known.
+    lines : (batch,) int
+    """
+    poles, residues = quantities["poles_rad_s"], quantities["residues"]
+    there = np.isfinite(poles)
+    found = there.copy()
+    modes = poles.shape[-1]
+    tested = there & np.isfinite(coefficients[:, :1, 0])
+    if modes == 1:
+        variance = quantities["covariance"][..., 1, 1]
+        tested &= ~(variance < (CERTAIN * quantities["damping_ratio"]) ** 2)
+    rows = np.flatnonzero(tested.any(axis=-1))
+    if rows.size == 0:
+        return found
+    with np.errstate(all="ignore"):
+        sensitivity = model.at((rows,)).residue_sensitivity(poles[rows])  # (rows, k, p)
+        distance = squared_distance(
+            residues[rows], real_covariance(sensitivity, coefficients[rows])
+        )
+    limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / np.maximum(lines[rows], 1))
+    found[rows] &= ~(distance < limit[:, None])
+    if modes > 1:
+        for k, row in enumerate(rows):
+            here = there[row]
+            if not found[row].any() and here.sum() > 1:
+                # neighbours nearer than their widths: neither is certain alone, both together are
+                found[row] = here & _significant_together(
+                    residues[row, here], sensitivity[k, here], coefficients[row], int(lines[row])
+                )
+    return found
+
+
+def squared_distance(values: ComplexArray, covariance: FloatArray) -> FloatArray:
+    """(...) squared Mahalanobis distance from zero; covariance (..., 2, 2) of (Re, Im)."""
+    std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))  # (..., 2)
+    re, im = values.real / std[..., 0], values.imag / std[..., 1]
+    correlation = covariance[..., 0, 1] / (std[..., 0] * std[..., 1])
+    return np.asarray((re**2 - 2 * correlation * re * im + im**2) / (1 - correlation**2))
+
+
+def _significant_together(
+    residues: ComplexArray, sensitivity: ComplexArray, coefficients: FloatArray, lines: int
+) -> bool:
+    """Whether noise alone would not make all of them: as above, over the choices of lines."""
+    stacked = np.concatenate([sensitivity.real, sensitivity.imag])  # (2 n, p)
+    p = stacked.shape[-1]
+    covariance = stacked @ coefficients[:p, :p] @ stacked.T
+    vector = np.concatenate([residues.real, residues.imag])
+    try:
+        distance = vector @ np.linalg.solve(covariance, vector)
+    except np.linalg.LinAlgError:
+        return True
+    chance = NOISE_PASSES_FOR_A_MODE / comb(max(lines, residues.size), residues.size)
+    return not distance < special.chdtri(vector.size, chance)

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hum and other tones in the bins of the joint estimator: found, named, taken out.
+
+A tone is a sinusoid that the excitation did not make. On an excited line it looks like response and
+bends the poles, between lines it looks like noise. One at a time, the bin that departs most from the
+fit is tested (`outliers`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+from scipy.ndimage import median_filter
+from scipy.optimize import minimize_scalar
+
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_transient import transient_basis
+from tactile_resonance.poles.outliers import (
+    FALSE_ALARM,
+    MOST_TONES,
+    chances_of,
+    falls_without_each,
+)
+from tactile_resonance.poles.result import PolesBatch, PolesStatus
+from tactile_resonance.tones import ROUNDING, Tone
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+PlanOf = Callable[[tuple[int, ...]], JointPlan]
+
+NEAR_BINS = 0.75
+"""So near a tone bins are left out; further away what leaks is taken off."""
+BINS_OF_A_TONE = 3
+"""On either side of its peak, from which it is estimated."""
+PEAK_PASSES = 1e-4
+"""Probability that a narrow peak of noise or distortion passes for a tone, where it is the largest."""
+LINES_AROUND = 3
+MOST_RETURNS = 8
+"""How often a tone is estimated anew from a fit without it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """A tone and what is done about it.
+
+    Attributes
+    ----------
+    channel : str
+    at : float
+        Where it lies, in bins.
+    phasor : (M,) complex
+        In each record [V]; half its amplitude.
+    bins : frozenset of int
+        Left out.
+    """
+
+    channel: str
+    at: float
+    phasor: ComplexArray
+    bins: frozenset[int]
+
+    def leak(self, plan: JointPlan) -> ComplexArray:
+        """(M, K) what it adds to the bins of a band."""
+        return self.phasor[:, None] * _spectrum_of(self.at, plan)
+
+    def on_line_of(self, plan: JointPlan) -> bool:
+        """Whether a harmonic of the period is left out for it, excited or not."""
+        return any(n % plan.periods == 0 for n in self.bins)
+
+    def named(self, plan: JointPlan) -> Tone:
+        """For people."""
+        rms_v = float(np.sqrt(2 * np.mean(np.abs(self.phasor) ** 2)))
+        return Tone(self.at * plan.resolution_hz, rms_v, self.channel, plan.resolution_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A fit without the tones taken, and the data that it saw, (M, K) without what leaks out of these."""
+
+    plan: JointPlan
+    batch: PolesBatch
+    u: ComplexArray
+    y: ComplexArray
+
+    @classmethod
+    def without(
+        cls, plan_of: PlanOf, u: ComplexArray, y: ComplexArray, taken: list[_Taken]
+    ) -> _Fitted:
+        plan = plan_of(tuple(sorted(frozenset().union(*(tone.bins for tone in taken)))))
+        shape = np.shape(y)
+        rest = {"actuator": np.atleast_2d(u), "sensor": np.atleast_2d(y)}
+        for tone in taken:
+            rest[tone.channel] = rest[tone.channel] - tone.leak(plan)
+        u, y = rest["actuator"], rest["sensor"]
+        return cls(plan, plan.from_bins(u.reshape(shape), y.reshape(shape)), u, y)
+
+
+def poles_without_tones(
+    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, batch: PolesBatch
+) -> tuple[PolesBatch, tuple[Tone, ...]]:
+    """Poles of one point, bins with a tone left out and what leaks out of them taken off.
+
+    A tone on the only line that tells a narrow mode cannot be distinguished from response.
+
+    Parameters
+    ----------
+    plan_of : callable
+        The plan that leaves out some bins.
+    u, y : (K,) or (M, K) complex
+        At the bins of its band.
+    batch : PolesBatch
+        Of the plan that leaves out none, shape ().
+
+    Returns
+    -------
+    PolesBatch
+        Of shape ().
+    tuple of Tone
+        By frequency; none where so many bins, or neighbouring excited lines, stand out that something
+        other than tones is wrong, or where the fit without them finds no minimum.
+    """
+    taken: list[_Taken] = []
+    whole = fitted = _Fitted(plan_of(()), batch, np.atleast_2d(u), np.atleast_2d(y))
+    try:
+        while (found := _most_striking(fitted)) is not None:
+            taken, fitted = _taken_too(plan_of, u, y, taken, *found)
+            if len(taken) > MOST_TONES:
+                return whole.batch, ()
+        # a large tone bends the fit, and then others that are none stand out too
+        for tone in sorted(taken, key=lambda tone: np.sum(np.abs(tone.phasor) ** 2)):
+            fewer = [other for other in taken if other is not tone]
+            if fewer and _most_striking(again := _Fitted.without(plan_of, u, y, fewer)) is None:
+                taken, fitted = fewer, again
+        sure = [tone for tone in taken if _stands_alone(fitted, tone)]
+        if fitted.batch.has_status(PolesStatus.MODEL_ERROR):
+            # what the model leaves out, or distortion, may be that large on a single line
+            sure = [tone for tone in sure if not tone.on_line_of(fitted.plan)]
+        if len(sure) < len(taken):
+            taken, fitted = sure, _Fitted.without(plan_of, u, y, sure)
+    except ValueError:  # too few lines are left
+        return whole.batch, ()
+    lost = fitted.batch.has_status(PolesStatus.NOT_CONVERGED) and not whole.batch.has_status(
+        PolesStatus.NOT_CONVERGED
+    )
+    if lost or _lines_in_a_row(fitted.plan):
+        return whole.batch, ()
+    named = (tone.named(fitted.plan) for tone in sorted(taken, key=lambda tone: tone.at))
+    return fitted.batch, tuple(named)
+
+
+def _taken_too(
+    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, taken: list[_Taken], k: int, channel: str
+) -> tuple[list[_Taken], _Fitted]:
+    """With the tone at bin k, estimated from fits that leave it out."""
+    for tone in taken:
+        if any(abs(k - n) == 1 for n in tone.bins):  # it is not steady
+            wider = replace(tone, bins=tone.bins | {k})
+            now = [wider if other is tone else other for other in taken]
+            return now, _Fitted.without(plan_of, u, y, now)
+    tone = _Taken(channel, float(k), np.zeros(len(np.atleast_2d(y)), complex), frozenset({k}))
+    fitted = _Fitted.without(plan_of, u, y, [*taken, tone])
+    for _ in range(MOST_RETURNS):
+        plan = fitted.plan
+        rest = fitted.u if channel == "actuator" else _Model(fitted).errors()
+        unknown = _excited(plan) if channel == "actuator" else plan.excited_bins
+        at, phasor = _tone_near(plan, rest + tone.leak(plan), k, unknown)
+        near = plan.bins[np.abs(plan.bins - at) <= NEAR_BINS]
+        moved = abs(at - tone.at)
+        tone = _Taken(channel, at, phasor, tone.bins | {int(n) for n in near})
+        fitted = _Fitted.without(plan_of, u, y, [*taken, tone])
+        if moved < 0.01:
+            break
+    return [*taken, tone], fitted
+
+
+def _lines_in_a_row(plan: JointPlan) -> bool:
+    """Whether neighbouring excited lines are left out, and not what lies between them: no tone does that."""
+    gone = np.flatnonzero(np.isin(_excited(plan), plan.left_out))
+    if plan.periods == 1:  # two are one tone between them
+        return bool(np.any(gone[2:] - gone[:-2] == 2))
+    return bool(np.any(np.diff(gone) == 1))
+
+
+def _excited(plan: JointPlan) -> IntArray:
+    """Bins of the band that are excited, left out or not."""
+    if plan.harmonics is None:
+        return plan.bins
+    return plan.bins[np.isin(plan.bins, np.asarray(plan.harmonics) * plan.periods)]
+
+
+class _Model:
+    """What a fit makes of all bins of the band, those left out too.
+
+    Attributes
+    ----------
+    excited, others : (K,) bool
+        Bins that the fit has used.
+    """
+
+    def __init__(self, fitted: _Fitted) -> None:
+        plan, fit = fitted.plan, fitted.batch.fit
+        self._u, self._y, self.bins = fitted.u, fitted.y, plan.bins
+        frequency_hz = plan.frequency_hz(plan.bins)
+        x = plan.variable.of_frequency(frequency_hz)
+        self._p = fit.denominator_basis.values_at(x)  # (K, a + 1)
+        self._q = fit.numerator_basis.values_at(x)  # (K, b)
+        self._t = transient_basis(
+            frequency_hz,
+            plan.transient_terms or 0,
+            plan.sample_rate_hz,
+            plan.band_hz,
+            plan.structure,
+        )  # (K, c)
+        self._a = self._p @ fit.denominator  # (K,)
+        self.g = (self._q @ fit.numerator) / self._a
+        decay = fit.transient.reshape(-1, self._t.shape[1])  # (M, c)
+        self._transient = decay @ self._t.T / self._a  # (M, K)
+        self.driven = np.isin(plan.bins, _excited(plan))
+        self.excited = np.isin(plan.bins, plan.excited_bins)
+        self.others = np.isin(plan.bins, plan.other_bins)
+        # between harmonics the input is noise of the voltmeter, unless the output follows it
+        error, through = self._y - self._transient, self.g * self._u
+        less = np.linalg.norm((error - through)[:, self.others])
+        follows = self.driven | bool(less < np.linalg.norm(error[:, self.others]))
+        self._output = np.where(follows, through, 0) + self._transient  # (M, K)
+        variance_y, variance_u = fitted.batch.noise_variance
+        of_input = np.where(self.driven, variance_u * np.abs(self.g) ** 2, 0)
+        self.variance = np.asarray(variance_y + of_input)  # (K,)
+
+    def errors(self) -> ComplexArray:
+        """(M, K) output less that of the model."""
+        return np.asarray(self._y - self._output)
+
+    def without_each(self) -> FloatArray:
+        """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
+
+        0 where a bin is not used.
+        """
+        records = self._y.shape[0]
+        used = self.excited | self.others
+        of_ab = np.concatenate(
+            [
+                -self._output[..., None] * self._p[:, :-1],
+                np.where(self.driven, self._u, 0)[..., None] * self._q,
+            ],
+            axis=-1,
+        )  # (M, K, a + b)
+        c = self._t.shape[1]
+        shared = of_ab.shape[-1]
+        jacobian = np.zeros((records, self.bins.size, shared + records * c), complex)
+        jacobian[..., :shared] = of_ab
+        for m in range(records):
+            jacobian[m, :, shared + m * c : shared + (m + 1) * c] = self._t
+        weight = used / np.sqrt(self.variance)
+        falls = falls_without_each(jacobian * (weight / self._a)[:, None], self.errors() * weight)
+        return np.asarray(falls.mean(axis=0))
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
+    """Bin and channel of what stands out most, if noise would not make it."""
+    plan, model = fitted.plan, _Model(fitted)
+    if not (np.isfinite(model.variance).all() and np.isfinite(model.g).all()):
+        return None
+    rounding_y, rounding_u = (
+        ROUNDING * np.mean(np.abs(x[:, model.driven]) ** 2) for x in (fitted.y, fitted.u)
+    )
+    on_line = plan.bins % plan.periods == 0
+    silent, odd = model.others & on_line, plan.bins // plan.periods % 2 == 1
+    kinds = [model.excited, silent & ~odd, silent & odd, model.others & ~on_line]
+    input_power = np.mean(np.abs(fitted.u) ** 2, axis=0)
+    falls, least = model.without_each(), rounding_y / model.variance
+    if not plan.level_known:  # noise of the input may make more at a resonance
+        least = np.maximum(least, 1.4 * median_filter(falls, 5))
+    other = [np.zeros_like(on_line), *kinds[1:]]
+    chances = {
+        "sensor": chances_of(falls, kinds, len(fitted.y), least),
+        "actuator": chances_of(input_power, other, len(fitted.u), rounding_u),
+    }
+    tests = np.count_nonzero(model.excited) + 2 * np.count_nonzero(model.others)
+    channel = min(chances, key=lambda name: chances[name].min())
+    k = int(np.argmin(chances[channel]))
+    striking = chances[channel][k] * tests < FALSE_ALARM
+    return (int(plan.bins[k]), channel) if striking else None
+
+
+def _spectrum_of(at: float, plan: JointPlan) -> ComplexArray:
+    """(K,) what a phasor of 1 at a bin that need not be whole adds to the bins of a band."""
+    samples = plan.samples_per_period * plan.periods
+    away = at - plan.bins
+    on = np.abs(away) < 1e-9
+    safe = np.where(on, 0.5, away)
+    ratio = np.expm1(2j * np.pi * safe) / (samples * np.expm1(2j * np.pi * safe / samples))
+    return np.where(on, 1.0, ratio)
+
+
+def _tone_near(
+    plan: JointPlan, errors: ComplexArray, k: int, unknown: IntArray
+) -> tuple[float, ComplexArray]:
+    """Where a tone near bin k lies, in bins, and its phasors (M,) in errors (M, K), by least squares.
+
+    From bins other than the `unknown` ones, unless there are none.
+    """
+    near = np.abs(plan.bins - k) <= BINS_OF_A_TONE
+    near &= ~np.isin(plan.bins, unknown) | (plan.periods == 1)
+    values = errors[:, near]
+
+    def fit(at: float) -> tuple[float, ComplexArray]:
+        shape = _spectrum_of(at, plan)[near]
+        phasor = values @ shape.conj() / np.sum(np.abs(shape) ** 2)
+        return float(np.sum(np.abs(values - phasor[:, None] * shape) ** 2)), phasor
+
+    found = minimize_scalar(
+        lambda at: fit(at)[0], bounds=(k - 0.7, k + 0.7), method="bounded", options={"xatol": 1e-4}
+    )
+    return float(found.x), fit(float(found.x))[1]
+
+
+def _stands_alone(fitted: _Fitted, tone: _Taken) -> bool:
+    """Whether little is left around a tone once it is taken off: of a peak of noise or distortion much is.
+
+    Around are bins between lines, and lines where the tone is on one.
+    """
+    plan, model = fitted.plan, _Model(fitted)
+    power = np.sum(np.abs(tone.phasor) ** 2)
+    rest = fitted.u if tone.channel == "actuator" else model.errors()
+    away = np.abs(plan.bins - tone.at)
+    kinds = [(model.others, 4 * BINS_OF_A_TONE)]
+    if tone.channel == "sensor" and tone.on_line_of(plan):
+        kinds.append((model.excited, 2 * LINES_AROUND))
+    for kind, count in kinds:
+        at = np.flatnonzero(kind)
+        near = at[np.argsort(away[at])[:count]]
+        if near.size < 2:
+            continue
+        left = np.abs(rest[:, near]) ** 2
+        # as large as at the tone, were they noise of the model's variance
+        left = left / model.variance[near] * np.interp(tone.at, plan.bins, model.variance)
+        ratio = power / np.sum(np.mean(left, axis=1))
+        if special.fdtrc(2 * len(left), 2 * left.size, ratio) > PEAK_PASSES:
+            return False
+    return True

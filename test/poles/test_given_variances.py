@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is made of the variances that come with an FRF or spectra: ellipses, alarms, lines left out."""
+
+import numpy as np
+import pytest
+from poles.mode_at_250_hz import BARE, LINES_HZ, G, S, circular, frf, spectra
+from scipy import stats
+
+from benchmarks.poles_plant import (
+    BAND_HZ,
+    HARMONICS,
+    SAMPLE_RATE_HZ,
+    SAMPLES_PER_PERIOD,
+    Plant,
+    judge,
+)
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.identify import identify_batch, identify_spectra
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.result import PolesStatus
+
+RUNS = 2000
+FEW = slice(12, 29, 2)  # nine lines, 230 to 270 Hz
+
+
+def errors_of(result):
+    return np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.02], -1)
+
+
+def variances(covariance):
+    return np.diagonal(covariance[:, 0], axis1=-2, axis2=-1)
+
+
+def test_covariance_from_noise_beside_a_larger_total_one():
+    """Distortion is the same in every run: what differs from run to run is noise, and not where that is."""
+    rng = np.random.default_rng(1)
+    noise = np.where(LINES_HZ < 250, 1e-6, 1e-7)
+    distortion = 1e-5
+    g = G + circular(rng, (41,), distortion) + circular(rng, (RUNS, 41), noise)
+    result = identify_batch(
+        frf(
+            g=g,
+            variance_noise=noise,
+            noise_dof=100,
+            variance_total=noise + distortion,
+            total_dof=100,
+        ),
+        structure=BARE,
+    )
+    found = np.var(errors_of(result), axis=0, ddof=1) / variances(result.covariance).mean(axis=0)
+    assert np.all(found * RUNS < stats.chi2.ppf(0.9995, RUNS))
+    assert np.all(found * RUNS > stats.chi2.ppf(0.0005, RUNS))
+    assert np.all(variances(result.total_covariance) > 5 * variances(result.covariance))
+
+
+@pytest.mark.parametrize("turn", [1, 1j, -1j])
+def test_correlated_noise_of_both_channels(turn):
+    """Nine tenths of it are one; what of it is the response's own makes no error."""
+    rng = np.random.default_rng(2)
+    u = np.exp(2j * np.pi * rng.random(41))
+    both, own = circular(rng, (RUNS, 41), 1e-6), circular(rng, (RUNS, 41), 1e-6)
+    z = np.stack([G * u + turn * (0.9 * both + np.sqrt(0.19) * own), u + both], axis=1)
+    covariance = np.zeros((2, 2, 41), complex)
+    covariance[0, 0] = covariance[1, 1] = 1e-6
+    covariance[0, 1], covariance[1, 0] = 0.9e-6 * turn, 0.9e-6 * np.conj(turn)
+    result = identify_spectra(LINES_HZ, z, covariance, 100, structure=BARE)
+    inside = RUNS * judge(errors_of(result), result.covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside, RUNS, 0.94) > 0.0005
+    assert stats.binom.sf(inside - 1, RUNS, 0.96) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.98
+
+
+def test_level_from_the_residuals_of_few_lines_is_not_too_small():
+    """Five parameters take 2.5 of nine complex residuals: ignored, the level is 28 % low."""
+    g = G[FEW] + circular(np.random.default_rng(3), (RUNS, 9), 1e-6)
+    unknown = identify_batch(FRF(LINES_HZ[FEW], g), structure=BARE)
+    known = identify_batch(
+        FRF(LINES_HZ[FEW], g, variance_noise=np.full(9, 1e-6), noise_dof=10**6), structure=BARE
+    )
+    ratio = variances(unknown.total_covariance) / variances(known.covariance)
+    assert ratio.mean(axis=0) == pytest.approx(1, abs=4 / np.sqrt(6.5 * RUNS))
+
+
+def test_a_pooled_level_of_few_degrees_of_freedom_widens_the_ellipse():
+    """Nine lines of one degree each: errors are Student distributed, of variance 9/8 if that were ignored."""
+    rng, runs = np.random.default_rng(4), 6000
+    g = G[FEW] + circular(rng, (runs, 9), 1e-6)
+    sample = 1e-6 * rng.gamma(1, 1, (runs, 9))
+    result = identify_batch(
+        FRF(LINES_HZ[FEW], g, variance_noise=sample, noise_dof=1), structure=BARE
+    )
+    flat = result.variance_model == "flat"
+    assert flat.mean() > 0.999
+    squared = (errors_of(result) ** 2 / variances(result.covariance))[flat]
+    assert squared.mean() == pytest.approx(1, abs=4 * np.sqrt(2.6 / squared.size))
+
+
+def assert_rate(alarms, rate):
+    """Smooth residuals are another alarm of one in a thousand."""
+    runs = alarms.size
+    assert stats.binom.cdf(alarms.sum(), runs, 0.97 * rate) > 0.0005
+    assert stats.binom.sf(alarms.sum() - 1, runs, min(1.03 * rate + 1e-3, 1)) > 0.0005
+
+
+@pytest.mark.parametrize("larger", [1.0, 1.4, 1.8])
+def test_errors_larger_than_their_variance_raise_the_alarm_as_often_as_they_must(larger):
+    """The cost is gamma distributed with one degree of freedom a line less half the parameters."""
+    g = G + circular(np.random.default_rng(5), (RUNS, 41), larger * 1e-6)
+    result = identify_batch(
+        frf(g=g, variance_noise=np.full(41, 1e-6), noise_dof=10**5), structure=BARE
+    )
+    cost = stats.gamma(41 - 2.5)
+    assert_rate(result.has_status(PolesStatus.MODEL_ERROR), cost.sf(cost.isf(1e-3) / larger))
+
+
+@pytest.mark.parametrize("larger", [1.4, 1.8])
+def test_errors_larger_than_between_harmonics_raise_the_alarm_as_often_as_they_must(larger):
+    """Over the level of the bins between, of which the transient takes some: F distributed."""
+    plant = Plant(0.02, 60.0, 2)
+    bins, rng = plant.bins(), np.random.default_rng(6)
+    u, y = plant.noisy(rng, RUNS, bins)
+    _, variance = plant.derivatives()
+    y = y + circular(rng, y.shape, (larger - 1) * variance * (bins % 2 == 0))
+    plan = JointPlan(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 2, HARMONICS, BAND_HZ, BARE)
+    result = plan.from_bins(u, y)
+    # seven parameters, two of them of the transient: half of each goes to either kind of bins
+    cost = stats.f(2 * 41 - 6, 2 * 40 - 1)
+    assert_rate(result.has_status(PolesStatus.MODEL_ERROR), cost.sf(cost.isf(1e-3) / larger))
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_a_line_on_which_one_channel_has_no_variance_is_left_out(channel):
+    covariance = spectra()["covariance"].copy()
+    covariance[channel, channel, 20] = 0.0
+    given = spectra(covariance=covariance)
+    given["spectra"][:, 20] += 0.1
+    result = identify_spectra(**given)
+    assert result.lines == 40
+    assert result.status() is PolesStatus.OK
+    assert result.residual[20] == 0
+
+
+@pytest.mark.parametrize("distance_hz", [2.0, 5.0])
+def test_two_modes_taken_for_one_are_within_the_total_covariance(distance_hz):
+    """One between them fits so well that residuals and halves of the lines tell little; two tell."""
+    w = 2 * np.pi * (250 + distance_hz)
+    second = 0.04 * w**2 / (S**2 + 0.04 * w * S + w**2)
+    g = G + second + circular(np.random.default_rng(7), (40, 41), 1e-7)
+    result = identify_batch(frf(g=g, variance_noise=np.full(41, 1e-7), noise_dof=50))
+    told = result.has_status(PolesStatus.MODEL_ERROR)
+    assert told.mean() > 0.9
+    std = np.sqrt(result.total_covariance[told, 0, 0, 0])
+    off = np.abs(result.f0_hz[told] - [250, 250 + distance_hz]).min(axis=-1)
+    assert np.mean(off < 3 * std) > 0.8

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several realisations of the phases: bound, ellipses, distortion and model error told apart."""
+
+import numpy as np
+import pytest
+from poles.mode_at_250_hz import circular
+from scipy import stats
+
+from benchmarks.cubic_resonator import HARMONICS as LINES
+from benchmarks.cubic_resonator import SAMPLE_RATE_HZ as RATE_HZ
+from benchmarks.cubic_resonator import SAMPLES_PER_PERIOD as SAMPLES
+from benchmarks.cubic_resonator import records
+from benchmarks.poles_plant import (
+    BAND_HZ,
+    HARMONICS,
+    SAMPLE_RATE_HZ,
+    SAMPLES_PER_PERIOD,
+    Plant,
+    bound_of_realisations,
+    judge,
+)
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.single_point import single
+from tactile_resonance.poles.structure import ModelStructure
+
+BARE = ModelStructure(2, 2)
+RUNS = 600
+
+
+def plants(damping_ratio, snr_db, periods, realisations):
+    return [Plant(damping_ratio, snr_db, periods, seed=10 + m) for m in range(realisations)]
+
+
+def spectra(plants, rng, runs, distortion=0.0):
+    """(runs, M, K) both; distortion is the variance of another error on excited bins."""
+    bins = plants[0].bins()
+    pairs = [plant.noisy(rng, runs, bins) for plant in plants]
+    u, y = (np.stack(channel, axis=1) for channel in zip(*pairs, strict=True))
+    if distortion:
+        y += circular(rng, y.shape, distortion) * (bins % plants[0].periods == 0)
+    return u, y
+
+
+def plan_of(periods, structure=BARE, kind=PoleEstimator, **options):
+    return kind(
+        SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, periods, HARMONICS, BAND_HZ, structure, **options
+    )
+
+
+def errors_of(result, damping_ratio):
+    return np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - damping_ratio], -1)
+
+
+def assert_honest(errors, covariance, bound):
+    """Goals fail where the 99.9 % interval of the Monte Carlo excludes them."""
+    runs = errors.shape[0]
+    ratio, coverage = judge(errors, covariance, bound)
+    assert np.all(ratio * runs / stats.chi2.ppf(0.9995, runs) <= 1.05)
+    assert np.all(ratio * runs / stats.chi2.ppf(0.0005, runs) >= 0.95)
+    assert stats.binom.cdf(coverage * runs, runs, 0.94) > 0.0005
+    assert stats.binom.sf(coverage * runs - 1, runs, 0.96) > 0.0005
+
+
+@pytest.mark.parametrize("damping_ratio", [0.01, 0.05])
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (2, 2), (4, 8), (7, 1)])
+def test_reaches_the_bound_with_honest_ellipses(realisations, periods, damping_ratio):
+    all_plants = plants(damping_ratio, 30.0, periods, realisations)
+    u, y = spectra(all_plants, np.random.default_rng(1), RUNS)
+    result = plan_of(periods).from_bins(u, y)
+    errors = errors_of(result, damping_ratio)
+    for covariance in (result.covariance, result.total_covariance):
+        assert_honest(errors, covariance[:, 0], bound_of_realisations(all_plants))
+    # three tests of one in a thousand each
+    alarms = np.sum(result.has_status(PolesStatus.MODEL_ERROR))
+    assert stats.binom.sf(alarms - 1, RUNS, 3e-3) > 0.001
+    assert np.all(result.has_status(PolesStatus.OK) | result.has_status(PolesStatus.MODEL_ERROR))
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (2, 2), (4, 2), (4, 8)])
+def test_distortion_is_told_from_noise_and_from_model_error(realisations, periods):
+    """Poles are those of the excited lines: what rings between them may be of another system."""
+    all_plants = plants(0.01, 40.0, periods, realisations)
+    level = 100 * all_plants[0].noise[0]
+    u, y = spectra(all_plants, np.random.default_rng(2), RUNS, level)
+    result = plan_of(periods).from_bins(u, y)
+    errors, total = errors_of(result, 0.01), result.total_covariance[:, 0]
+    alarms = np.sum(result.has_status(PolesStatus.MODEL_ERROR))
+    assert stats.binom.sf(alarms - 1, RUNS, 3e-3) > 0.001
+    if periods == 1:  # noise or distortion: lines are taken to be independent
+        assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants, level))
+    else:
+        alone = JointPlan(*plan_of(periods)._arguments).from_bins(u, y)
+        mean = np.stack([alone.f0_hz[..., 0] - 250, alone.damping_ratio[..., 0] - 0.01], -1)
+        assert np.all(np.mean(errors**2, axis=0) < 1.1 * np.mean(mean.mean(axis=1) ** 2, axis=0))
+        assert np.median(result.noise_variance[:, 0]) == pytest.approx(level / 100, rel=0.05)
+    coverage = judge(errors, total, np.eye(2))[1]
+    assert stats.binom.cdf(coverage * RUNS, RUNS, 0.94) > 0.0005
+
+
+@pytest.mark.parametrize(("cubic", "snr_db"), [(2.8e-5, 40.0), (2.5e-4, 60.0)])
+@pytest.mark.parametrize("realisations", [2, 4, 8])
+def test_ellipse_holds_the_linear_approximation_of_a_resonator_that_is_not_linear(
+    realisations, cubic, snr_db
+):
+    """Each realisation is another system: 3 to 40 % of ellipses from the scatter on lines would hold it."""
+    groups = 120
+    u, y = records(np.random.default_rng(14), groups * realisations, 2, cubic, snr_db)
+    u, y = (v.reshape(groups, realisations, *v.shape[1:]) for v in (u, y))
+    options = (RATE_HZ, SAMPLES, 2, LINES, (200.0, 300.0), BARE)
+    result, alone = PoleEstimator(*options)(u, y), JointPlan(*options)(u, y)
+    each = np.stack([alone.f0_hz[..., 0], alone.damping_ratio[..., 0]], axis=-1)
+    truth = each.mean(axis=(0, 1))
+    errors = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], axis=-1) - truth
+    coverage = judge(errors, result.total_covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(coverage * groups, groups, 0.94) > 0.0005
+    of_singles = np.mean((each.mean(axis=1) - truth) ** 2, axis=0)
+    assert np.all(np.mean(errors**2, axis=0) < 1.2 * of_singles)
+    # usable: not all is flagged, and ellipses are no wider than so few realisations need
+    assert result.has_status(PolesStatus.OK).mean() > 0.75
+    if realisations == 8:
+        stated = np.sqrt(np.median(result.total_covariance[:, 0, 0, 0]))
+        assert stated < 1.6 * np.std(errors[:, 0])
+
+
+@pytest.mark.parametrize("odd", [0, 2])
+def test_one_realisation_that_departs_from_all_others_is_named(odd):
+    """A contact that was lost in one of four, or a tip that slid."""
+    rng = np.random.default_rng(15)
+    all_plants = plants(0.02, 40.0, 2, 4)
+    all_plants[odd] = Plant(0.0205, 40.0, 2, seed=10 + odd)
+    result = plan_of(2).from_bins(*spectra(all_plants, rng, 50))
+    assert result.has_status(PolesStatus.MODEL_ERROR).all()
+    named = [
+        f"realisation {odd + 1} departs from the other 3, which agree" in r for r in result.remark
+    ]
+    assert np.mean(named) > 0.7  # the others differ as much by chance in half of the cases at most
+    agreeing = plan_of(2).from_bins(*spectra(plants(0.02, 40.0, 2, 4), rng, RUNS))
+    wrongly = sum("departs" in remark for remark in agreeing.remark)
+    assert stats.binom.sf(wrongly - 1, RUNS, 1e-3) > 0.001
+
+
+def test_covariance_from_noise_is_what_repeated_noise_makes():
+    """Distortion stays the same from run to run: it is the system's, only noise is another."""
+    all_plants = plants(0.02, 40.0, 2, 3)
+    rng = np.random.default_rng(3)
+    u, y = spectra(all_plants, rng, RUNS)
+    fixed = circular(rng, y.shape[1:], 100 * all_plants[0].noise[0])
+    result = plan_of(2).from_bins(u, y + fixed * (all_plants[0].bins() % 2 == 0))
+    found = np.var(errors_of(result, 0.02), axis=0, ddof=1)
+    stated = np.mean(np.diagonal(result.covariance[:, 0], axis1=-2, axis2=-1), axis=0)
+    assert np.all(found / stated * RUNS < stats.chi2.ppf(0.9995, RUNS))
+    assert np.all(found / stated * RUNS > stats.chi2.ppf(0.0005, RUNS))
+    total = np.mean(result.total_covariance[:, 0, 0, 0])
+    assert total > 1.5 * stated[0]
+
+
+def test_input_noise_that_nobody_knows_is_weighted_by_what_realisations_differ_by():
+    all_plants = plants(0.01, 40.0, 1, 4)
+    u, y = spectra(all_plants, np.random.default_rng(4), RUNS)
+    result = plan_of(1).from_bins(u, y)
+    errors = errors_of(result, 0.01)
+    assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants))
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (3, 4)])
+@pytest.mark.parametrize("distorted", [False, True])
+def test_a_neighbouring_mode_is_a_model_error(realisations, periods, distorted):
+    all_plants = plants(0.02, 60.0, periods, realisations)
+    bins = all_plants[0].bins()
+    level = 100 * all_plants[0].noise[0] if distorted else 0.0
+    u, y = spectra(all_plants, np.random.default_rng(5), 20, level)
+    s, w0 = 2j * np.pi * bins * 2.5 / periods, 2 * np.pi * 280
+    size = 0.005 if distorted else 0.002
+    second = size * w0**2 / (s**2 + 2 * 0.01 * w0 * s + w0**2)
+    steady = np.stack([plant.input(bins) for plant in all_plants])
+    result = plan_of(periods).from_bins(u, y + second * steady)
+    assert result.has_status(PolesStatus.MODEL_ERROR).all()
+    total = np.sqrt(np.diagonal(result.total_covariance[:, 0], axis1=-2, axis2=-1))
+    noise = np.sqrt(np.diagonal(result.covariance[:, 0], axis1=-2, axis2=-1))
+    assert np.all(np.abs(errors_of(result, 0.02)) < 3 * total)
+    assert np.all(total > 2 * noise)
+
+
+@pytest.mark.parametrize("periods", [1, 4])
+def test_one_realisation_is_what_it_always_was(periods):
+    plant = Plant(0.02, 40.0, periods)
+    u, y = plant.noisy(np.random.default_rng(7), 4, plant.bins())
+    options = {"input_noise_ratio": 0.3} if periods == 1 else {}
+    alone = plan_of(periods, kind=JointPlan, **options).from_bins(u, y)
+    plan = plan_of(periods, **options)
+    result = plan.from_bins(u[:, None], y[:, None])
+    for name in ("f0_hz", "damping_ratio", "covariance", "cost", "residual", "status_code"):
+        assert getattr(result, name) == pytest.approx(getattr(alone, name), rel=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize("periods", [1, 2])
+def test_exact_records_from_rest_give_the_exact_pole(periods):
+    all_plants = plants(0.02, 40.0, periods, 3)
+    bins = all_plants[0].bins()
+    u, y = (
+        np.stack([getattr(plant, name)(bins) for plant in all_plants])
+        for name in ("input", "output")
+    )
+    result = plan_of(periods).from_bins(u, y)
+    assert result.status() is PolesStatus.OK
+    assert result.f0_hz[0] == pytest.approx(250, rel=1e-7)
+    assert result.damping_ratio[0] == pytest.approx(0.02, rel=1e-5)
+
+
+def test_even_distortion_of_an_odd_grid_is_no_noise():
+    """What even harmonics carry would be taken for noise of the bins between excited lines."""
+    rng = np.random.default_rng(8)
+    plant = Plant(0.02, 40.0, 2)
+    bins = plant.bins()
+    odd = HARMONICS[HARMONICS % 2 == 1]
+    excited = np.isin(bins, odd * 2)
+    even = (bins % 2 == 0) & ~excited
+    u, y = spectra(plants(0.02, 40.0, 2, 3), rng, 200)
+    keep = np.where(excited | (bins % 2 == 1), 1.0, 0.0)
+    y = y * keep + circular(rng, y.shape, 1e4 * plant.noise[0]) * even
+    plan = PoleEstimator(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, 2, odd, BAND_HZ, BARE)
+    result = plan.from_bins(u * excited, y)
+    # of half the lines the input is gone, their share of the transient stays
+    assert np.median(result.noise_variance[:, 0]) == pytest.approx(plant.noise[0], rel=0.1)
+    assert np.mean(result.variance_model == "flat") > 0.98
+
+
+def test_leading_axes_samples_and_nan():
+    rng = np.random.default_rng(9)
+    u, y = spectra(plants(0.02, 40.0, 2, 2), rng, 6)
+    plan = plan_of(2)
+    batch = plan.from_bins(u.reshape(2, 3, 2, -1), y.reshape(2, 3, 2, -1))
+    assert batch.shape == (2, 3)
+    assert plan.from_bins(u[4], y[4]).f0_hz == pytest.approx(batch.f0_hz[1, 1], rel=1e-9)
+    y[1, 1, 7] = np.nan
+    result = plan.from_bins(u, y)
+    assert [result.status(k) is PolesStatus.OK for k in range(6)] == [True, False] + 4 * [True]
+    with pytest.raises(ValueError, match="expected"):
+        plan.from_bins(u[0, 0], y[0, 0])
+    samples = np.cumsum(rng.standard_normal((2, 2, 2, SAMPLES_PER_PERIOD)), axis=-1)
+    one = identify_poles_from_records(
+        *samples, sample_rate_hz=SAMPLE_RATE_HZ, harmonics=HARMONICS, band_hz=BAND_HZ
+    )
+    assert one.method == "joint maximum likelihood of poles and transients, 2 realisations"
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_scaled_data_scale_nothing(scale):
+    u, y = spectra(plants(0.02, 40.0, 2, 2), np.random.default_rng(10), 3)
+    first, other = (plan_of(2).from_bins(u, factor * y) for factor in (1.0, scale))
+    assert other.f0_hz == pytest.approx(first.f0_hz, rel=1e-9)
+    assert other.total_covariance == pytest.approx(first.total_covariance, rel=1e-3)
+
+
+def test_a_system_that_changes_between_realisations_is_told():
+    """Noise and distortion would differ from line to line; a mode that moves does not."""
+    rng = np.random.default_rng(11)
+    moved = [Plant(0.02 + 0.0002 * m, 40.0, 2, seed=10 + m) for m in range(3)]
+    u, y = spectra(moved, rng, 20)
+    result = plan_of(2).from_bins(u, y)
+    assert all("each is another system" in remark for remark in result.remark)
+    total = np.sqrt(result.total_covariance[:, 0, 1, 1])
+    assert np.all(np.abs(result.damping_ratio[:, 0] - 0.0202) < 2 * total)
+    assert np.all(total > 1e-4)
+    assert result.remark[0] in single(plan_of(2).from_bins(u[0], y[0])).message
+
+
+@pytest.mark.parametrize(
+    ("kind", "realisations", "periods"),
+    [("generator", 3, 8), ("common", 3, 8), ("sloped", 3, 8), ("steps", 3, 8), ("sloped", 6, 1)],
+)
+def test_ellipse_is_honest_whatever_the_noise(kind, realisations, periods):
+    """Noise of the generator, which the plant answers; noise on both channels; coloured noise."""
+    all_plants = plants(0.02, 40.0, periods, realisations)
+    rng = np.random.default_rng(12)
+    bins = all_plants[0].bins()
+    variance_y, variance_u = all_plants[0].noise
+    s, w0 = 2j * np.pi * bins * 2.5 / periods, 2 * np.pi * 250
+    g = 0.1 + 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
+    u, y = (
+        np.stack([getattr(plant, name)(bins) for plant in all_plants]) + np.zeros((400, 1, 1))
+        for name in ("input", "output")
+    )
+    position = np.linspace(-1, 1, bins.size)
+    factor = 1.0
+    if kind == "generator":
+        disturbance = circular(rng, u.shape, 100 * variance_u)
+        u, y = u + disturbance, y + g * disturbance
+    elif kind == "common":
+        disturbance = circular(rng, u.shape, variance_y)
+        u, y = u + disturbance, y - 2 * disturbance
+    else:
+        u += circular(rng, u.shape, variance_u)
+        factor = np.exp(2 * position) if kind == "sloped" else np.where(position > 0.05, 16.0, 1.0)
+    result = plan_of(periods).from_bins(u, y + circular(rng, y.shape, variance_y * factor))
+    inside = 400 * judge(errors_of(result, 0.02), result.total_covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside, 400, 0.94) > 0.0005
+    assert stats.binom.sf(inside - 1, 400, 0.96) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.98

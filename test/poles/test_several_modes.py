@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several modes at once, from records that begin anywhere, sampled at twenty times their frequency or less."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
+
+RATE_HZ, SAMPLES, PERIODS, HARMONICS = 5000.0, 2000, 4, np.arange(4, 601)
+
+
+def record(f0_hz, damping_ratio):
+    """U and Y without noise: each mode settled, and a free decay of its own."""
+    rng = np.random.default_rng(5)
+    spectrum = np.zeros(SAMPLES // 2 + 1, complex)
+    spectrum[HARMONICS] = np.exp(2j * np.pi * rng.random(HARMONICS.size))
+    spectrum *= SAMPLES / np.sqrt(2 * HARMONICS.size)
+    s = 2j * np.pi * np.arange(spectrum.size) * RATE_HZ / SAMPLES
+    time_s = np.arange(SAMPLES * PERIODS) / RATE_HZ
+    g, decay = np.full(s.shape, 0.1, complex), np.zeros(time_s.size)
+    for k, f0 in enumerate(f0_hz):
+        w = 2 * np.pi * f0
+        g += 2 * damping_ratio * w**2 / (s**2 + 2 * damping_ratio * w * s + w**2)
+        pole = w * (-damping_ratio + 1j * np.sqrt(1 - damping_ratio**2))
+        decay += 0.3 * np.real(np.exp(1j * k + pole * time_s))
+    shape = (PERIODS, SAMPLES)
+    u, y = (np.tile(np.fft.irfft(x, SAMPLES), PERIODS) for x in (spectrum, g * spectrum))
+    return u.reshape(shape), (y + decay).reshape(shape)
+
+
+@pytest.mark.parametrize(
+    ("f0_hz", "band_hz"),
+    [
+        ([230, 262], (200, 300)),
+        ([210, 250, 290], (180, 320)),
+        ([210, 250, 290, 330, 370], (180, 400)),
+        ([100, 200, 400], (50, 500)),
+        (range(100, 1001, 100), (50, 1100)),
+    ],
+)
+def test_ellipses_hold_every_mode(f0_hz, band_hz):
+    order = 2 * len(f0_hz)
+    plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, band_hz, ModelStructure(order, order))
+    u, y = (plan.transform(x) for x in record(f0_hz, 0.02))
+    rng = np.random.default_rng(1)
+    runs = 200 if order < 20 else 50
+    variance = 1e-8 / (SAMPLES * PERIODS)
+    noise = rng.standard_normal((2, runs, u.size, 2)).view(complex)[..., 0] * np.sqrt(variance / 2)
+    result = plan.from_bins(u + 0.1 * noise[0], y + noise[1])
+    errors = np.stack([result.f0_hz - f0_hz, result.damping_ratio - 0.02], axis=-1)
+    solved = np.linalg.solve(result.covariance, errors[..., None])[..., 0]
+    inside = np.sum(errors * solved, axis=-1) < -2 * np.log(0.05)  # (runs, modes)
+    for count in inside.sum(axis=0):
+        assert stats.binom.cdf(count, runs, 0.93) > 0.0005
+    assert stats.binom.sf(inside.sum() - 1, inside.size, 0.97) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.97
+    # and what is not noise does not pass for it
+    assert np.mean(result.noise_variance[:, 0]) == pytest.approx(variance, rel=0.1)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An FRF in which a transient is left does not give poles of status ok."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
+
+RATE_HZ, SAMPLES, LINES = 5000.0, 2000, np.arange(4, 401)
+
+
+def record(seed, periods, damping_ratio, snr_db, *, settled):
+    """u, y (P, N) of a mode at 250 Hz, from rest or long after."""
+    rng = np.random.default_rng(seed)
+    spectrum = np.zeros(SAMPLES // 2 + 1, complex)
+    spectrum[LINES] = np.exp(2j * np.pi * rng.random(LINES.size))
+    played = periods + 12
+    u = np.tile(np.fft.irfft(spectrum, SAMPLES), played)
+    s = 2j * np.pi * np.fft.rfftfreq(2 * u.size, 1 / RATE_HZ)
+    w0 = 2 * np.pi * 250
+    g = 0.1 + 2 * damping_ratio * w0**2 / (s**2 + 2 * damping_ratio * w0 * s + w0**2)
+    y = np.fft.irfft(np.fft.rfft(u, 2 * u.size) * g)[: u.size]
+    noise = 10 ** (-snr_db / 20)
+    y = y + noise * y.std() * rng.standard_normal(y.size)
+    u = u + 0.1 * noise * u.std() * rng.standard_normal(u.size)
+    kept = slice(-periods, None) if settled else slice(periods)
+    return u.reshape(played, SAMPLES)[kept], y.reshape(played, SAMPLES)[kept]
+
+
+def poles_of(*arguments, settled):
+    u, y = record(*arguments, settled=settled)
+    frf = estimate_frf(u[None], y[None], sample_rate_hz=RATE_HZ, harmonics=LINES)
+    return identify_poles(frf, (200.0, 300.0), ModelStructure(2, 2))
+
+
+@pytest.mark.parametrize(
+    ("periods", "damping_ratio", "snr_db"),
+    [(2, 0.005, 20), (2, 0.005, 80), (2, 0.02, 40), (2, 0.1, 80), (4, 0.02, 60), (8, 0.005, 40)],
+)
+def test_a_transient_that_the_polynomials_do_not_follow_is_told(periods, damping_ratio, snr_db):
+    for seed in range(10):
+        case = (seed, periods, damping_ratio, snr_db)
+        poles = poles_of(*case, settled=False)
+        assert poles.status is PolesStatus.MODEL_ERROR
+        assert "do not follow its transient" in poles.message
+        assert poles.total_covariance is not None
+        settled = poles_of(*case, settled=True)
+        assert settled.status is PolesStatus.OK
+        assert "beside the mode" not in settled.message
+
+
+def test_a_transient_that_they_follow_is_none_of_their_faults():
+    for seed in range(10):
+        assert poles_of(seed, 8, 0.05, 40, settled=False).status is PolesStatus.OK
