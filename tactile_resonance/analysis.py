@@ -128,7 +128,7 @@ def analyse(
     bins = None
     if poles_method == "joint":
         bins = band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
-    # what is to be said about the FRF is said once, below
+    # faults of the FRF are reported once, below
     silent = replace(faults.marked(frf), message="")
 
     def fit(structure: ModelStructure) -> Poles:
@@ -164,7 +164,7 @@ def analyse(
 
 
 def analysis_as_json(analysis: Analysis) -> str:
-    """JSON text of an analysis, as the README describes it; NaN becomes null."""
+    """JSON text of an analysis, as docs/analysis.md describes it; NaN becomes null."""
     frf, poles = analysis.frf, analysis.poles
     content = {
         "frf": {

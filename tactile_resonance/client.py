@@ -229,7 +229,7 @@ class TactileClient:
         return self._conduct.begin(AskedGoal(client, kind, _CALIBRATION, goal, wait_s, on_feedback))
 
     def cancel(self) -> None:
-        """End the scan or calibration after drawing the tip back; its future tells when that is done."""
+        """End the scan or calibration after drawing the tip back; its future is done when that is."""
         self._conduct.cancel()
 
     def pause(self) -> Future:

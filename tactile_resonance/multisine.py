@@ -240,7 +240,7 @@ def design_multisine(
     mains_hz : sequence of float
         The lines of the grid at harmonics of these, and `lines_beside` on either side, are not excited
         (`mains_lines`): hum is then seen between the lines, and bends no response. None by default,
-        for near a pole such lines are those that tell most (docs/poles.md).
+        for near a pole such lines hold most information (docs/poles.md).
     lines_beside : int
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.

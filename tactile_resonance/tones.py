@@ -17,7 +17,7 @@ MAINS_TOLERANCE_HZ = 0.2
 MOST_HARMONICS = 25
 """Beyond them the tolerances of all fill the axis."""
 FEWEST_AROUND = 8
-"""Fewer powers tell no level."""
+"""Fewer powers give no level."""
 ROUNDING = 1e-14
 """Of the power of a signal: what is smaller is no tone."""
 

@@ -212,7 +212,7 @@ class CanDescription:
 class Assembler:
     """Joins the frames of one wrench.
 
-    Order alone does not tell wrenches apart: where the last frame of one and the first of the next are lost,
+    Order alone does not separate wrenches: where the last frame of one and the first of the next are lost,
     what is left looks whole. So frames must also be close in time.
 
     Parameters

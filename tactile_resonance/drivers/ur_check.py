@@ -18,7 +18,7 @@ POLL_S = 0.0005
 
 @dataclass(frozen=True)
 class RobotIdentity:
-    """What the dashboard server tells: texts of the robot."""
+    """Answers of the dashboard server: texts of the robot."""
 
     model: str
     version: str

@@ -4,7 +4,7 @@
 A velocity is not acknowledged: it stands in the command register until the robot's program looks, once a
 cycle. The library's ``kickWatchdog`` writes zero into that register, and where both arrive within one cycle
 (the robot's own, or a network that held packets back) the velocity is lost, be it the zero of a stop. So
-once a velocity was told the watchdog is fed by saying the newest velocity again. A stop is a velocity of
+once a velocity was sent the watchdog is fed by sending the newest velocity again. A stop is a velocity of
 zero: the library's own ``speedStop`` waits for longer than the watchdog allows.
 """
 

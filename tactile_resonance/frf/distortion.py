@@ -108,7 +108,7 @@ class DetectionLines:
     def above_noise(self) -> npt.NDArray[np.bool_] | None:
         """(...) True where the in-band lines hold more than noise, at `FALSE_ALARM`.
 
-        None where it cannot be told: single periods, or no line of this parity.
+        None where it cannot be estimated: single periods, or no line of this parity.
         """
         noise = self.noise_power
         inside = self.in_band

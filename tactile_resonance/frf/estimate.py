@@ -61,7 +61,7 @@ def estimate_frf(
     -------
     FRF
         ``variance_noise`` needs two periods used, ``variance_total`` two realisations; what is
-        missing is None and said in the status.
+        missing is None and reported by the status.
 
     Raises
     ------
@@ -152,8 +152,8 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
 def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     """Best linear approximation from the mean spectra of M realisations.
 
-    Each gives its own FRF, ``G_m = Y_m / U_m``; G is their mean. Several phase realisations tell
-    stochastic nonlinear distortion from noise: `FRF.variance_distortion`.
+    Each gives its own FRF, ``G_m = Y_m / U_m``; G is their mean. Several phase realisations
+    distinguish stochastic nonlinear distortion from noise: `FRF.variance_distortion`.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     if each.ndim < 3 or each.shape[-3] < 2:
         raise ValueError(
             f"spectra: shape {each.shape}, expected (..., M, 2, F) with M >= 2 realisations; "
-            "one realisation cannot tell distortion from the system"
+            "one realisation cannot distinguish distortion from the system"
         )
     realisations = each.shape[-3]
     g_each = ratio(each)  # (..., M, F)
@@ -255,7 +255,7 @@ def _robust_status(
         )
     return (
         FrfStatus.OK,
-        "one period per realisation: noise cannot be told from distortion, the variance over "
+        "one period per realisation: noise and distortion are not distinguished, the variance over "
         "realisations holds both",
     )
 

@@ -117,7 +117,7 @@ def _cut_level(
     """Middle of the first step of `GAP_DB` from the top [dB], among some of the lines.
 
     Without such a step every candidate is excited (minus infinity), or, where the noise level is
-    only guessed (`needs_step`), nothing can be told (None).
+    only guessed (`needs_step`), no line can be detected (None).
     """
     sorted_db = -np.sort(-level_db[candidate & among])
     if sorted_db.size == 0:

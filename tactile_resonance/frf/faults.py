@@ -21,7 +21,7 @@ from tactile_resonance.tones import MAINS_HZ, ROUNDING
 SHARE_AT_TOP = 1 / np.sqrt(2)
 """Largest share of a quantised peak's two topmost values that is at the top: a parabola's, cut at both."""
 GRID_SAMPLES, FEW_ALIKE = 2000, 0.98
-"""Samples of a converter that counts repeat each other; these many tell."""
+"""Equal samples of a converter from which on its counts are taken to repeat."""
 LARGE_OFFSET = 0.1
 """Mean against the rms of the rest."""
 LARGE_DRIFT = 0.05
@@ -58,7 +58,7 @@ class Fault:
     spoils : bool
         The FRF cannot be trusted because of it; otherwise it is worth knowing only.
     text : str
-        What to tell people; no full stop.
+        For people to read; no full stop.
     seen_in : str
         In how many of several records; empty where there was one.
     """
@@ -169,7 +169,7 @@ def find_faults(
             missing = missing_samples(channel)
             if missing is not None:
                 faults.append(missing)
-            if channel.complete:  # else nothing more can be told
+            if channel.complete:  # else nothing more can be detected
                 found = (check(channel) for check in CHECKS)
                 faults += [fault for fault in found if fault is not None]
         reports.append(faults)
@@ -270,7 +270,7 @@ def offset(x: _Channel) -> Fault | None:
 
 
 def drift(x: _Channel) -> Fault | None:
-    """Period means that wander. A single period cannot tell drift from its slowest lines."""
+    """Period means that wander. In a single period drift is not distinguished from its slowest lines."""
     means = x.samples.mean(axis=-1)
     rms = float(np.std(x.samples - means[:, None]))
     spread = float(np.ptp(means))

@@ -87,7 +87,7 @@ class LocalPolynomialPlan:
         if periods < 2:
             raise ValueError(
                 f"periods: {periods}, expected at least 2: a single period has no bins "
-                "between harmonics to tell noise and transient from"
+                "between harmonics from which to estimate noise and transient"
             )
         if order < 0:
             raise ValueError(f"order: {order}, expected at least 0")
@@ -131,7 +131,7 @@ class LocalPolynomialPlan:
             cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
             covariance[..., 0, 1, lines] = cross
             covariance[..., 1, 0, lines] = cross.conj()
-        if not np.isfinite(spectra.sum()):  # one number tells, at half the cost of looking at all
+        if not np.isfinite(spectra.sum()):  # the sum shows it, at half the cost of testing all
             raise ValueError(NOT_FINITE)
         return PeriodicSpectra(
             harmonics=self.harmonics,

@@ -76,7 +76,7 @@ class FRF:
 
     @property
     def variance(self) -> FloatArray | None:
-        """(..., F) the largest known: total where it can be told, else noise, else None."""
+        """(..., F) the largest known: total where it can be estimated, else noise, else None."""
         return self.variance_noise if self.variance_total is None else self.variance_total
 
     @property

@@ -99,7 +99,7 @@ def suspected_skew(frf: FRF) -> Fault | None:
 
     A sensor whose response is flat above its mode, as a piezoelectric bimorph with feed-through
     is, has no phase there; a straight phase through zero (or pi) then hints at a skew. A real
-    delay in the system looks the same: only a loop-back can tell.
+    delay in the system looks the same: only a loop-back distinguishes them.
     """
     upper = frf.frequency_hz >= frf.frequency_hz[-1] / 2
     f, g = frf.frequency_hz[upper], frf.g[upper]

@@ -170,7 +170,7 @@ class ContactThread:
         now_s = time.monotonic()
         if self.controller.state is State.IDLE and now_s - self._source_tried_s > SOURCE_AGAIN_S:
             self._source_tried_s = now_s
-            with contextlib.suppress(ForceError):  # told by its next `read`
+            with contextlib.suppress(ForceError):  # its next `read` reports it
                 self._force.start()
 
     def _run(self) -> None:

@@ -23,7 +23,7 @@ from tactile_resonance.nodes.running import STEADY
 
 TICK_S = 0.1
 SILENT_S = 5.0
-"""A scan that has told nothing for so long may have lost its node: its result is asked for again."""
+"""A scan that has sent no feedback for so long may have lost its node: its result is requested again."""
 GONE_S = 10.0
 """A node that nobody has seen for so long has gone."""
 

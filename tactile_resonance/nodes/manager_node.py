@@ -31,11 +31,11 @@ PARAMETERS = (
 )
 
 TICK_S = 0.1
-# While all are up: nodes tell by themselves when they change, only one that was killed has to be found.
+# While all are up: nodes report changes by themselves, only one that was killed has to be found.
 QUIET_S = 1.0
 # A node that was killed stays in the graph and never answers; the one started in its place waits meanwhile.
 STATE_WITHIN_S = 3.0
-# An answer may overtake the event that tells why a node is not active any more.
+# An answer may overtake the event that states why a node is not active any more.
 EVENT_WITHIN_S = 0.2
 LONGEST_RETRY_S = 16.0
 

@@ -19,7 +19,7 @@ RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 
 class OneGoal:
-    """Accepts, works at and ends goals; tells why the newest one was rejected.
+    """Accepts, works at and ends goals; reports why the newest one was rejected.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ class ScanClient(NodeClient):
     ----------
     tactile : TactileClient
     states : dict
-        What each node's diagnostics told last, by its name.
+        The latest diagnostics of each node, by its name.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ PARAMETERS = (
     Parameter(
         "run_directory",
         "",
-        "New or empty folder of the run, or the run that is gone on with; empty: made by scan_node.",
+        "New or empty folder of the run, or the run to continue; empty: made by scan_node.",
         read_only=True,
     ),
     Parameter("resume", False, "Go on with the run in run_directory.", read_only=True),

@@ -213,7 +213,7 @@ class ScanNode(ManagedNode):
         result.outcome = Scan.Result.ENDED
         self.get_logger().info(f"run goes to {run.path}")
         with run:
-            for cdr in recorded_results(run.content):  # of a run that is gone on with
+            for cdr in recorded_results(run.content):  # of a run that is continued
                 self._publish(cdr)
             runner = ScanRunner(
                 *(started.scene, plan, run, self._hands, controls),

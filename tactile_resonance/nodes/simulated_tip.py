@@ -30,7 +30,7 @@ CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its fi
 
 
 class SimulatedTip:
-    """The tip as it is now, told on `bench/truth` whenever it is put somewhere.
+    """The tip as it is now, published on `bench/truth` whenever it is moved.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How contact_node uses the sensor, as its parameters tell: a scan checks the way by the same figures."""
+"""How contact_node uses the sensor, from its parameters: a scan checks the way with the same figures."""
 
 from __future__ import annotations
 

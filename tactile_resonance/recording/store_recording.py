@@ -39,12 +39,12 @@ def read_store_recording(
     Returns
     -------
     Recording
-        Realisations of which every period is there; its notes tell what was left out.
+        Realisations of which every period is there; its notes name what was left out.
 
     Raises
     ------
     ValueError
-        If the measurement is not told, not there, or no realisation has the periods asked for, or any.
+        If the measurement is not named or not there, or no realisation has the periods wanted, or any.
     OSError
         If the folder cannot be listed.
     """

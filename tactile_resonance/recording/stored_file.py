@@ -23,7 +23,7 @@ T = TypeVar("T", Excitation, Record)
 Fields = dict[str, npt.NDArray[Any]]
 
 _FORMAT = "tactile_resonance {} 1"
-_DTYPE = ":dtype"  # suffix of the field that tells which integer type an array had
+_DTYPE = ":dtype"  # suffix of the field that names the integer type an array had
 _DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
            SyntaxError, MemoryError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 

@@ -100,7 +100,7 @@ def _write_map(
 
 
 def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
-    """Where the map's frame and the tip stood, as far as the run tells; returns the map's frame."""
+    """Where the map's frame and the tip stood, as far as the run states it; returns the map's frame."""
     frame_id = next((result.frame_id for result in run.results if result.frame_id), "table")
     node = run.facts.get("scan_node", {})
     place = run.facts.get("frames", {}).get(frame_id, node.get("table_in_base"))

@@ -39,7 +39,7 @@ class Entry:
     value : str
         As it is written there.
     mark : str
-        S, K, C, D; empty where the note before the entry tells.
+        S, K, C, D; empty where the note before the entry states it.
     note : str
         The rest of its comment.
     """

@@ -4,7 +4,7 @@
 Contact control knows the plane through the point that it touches, no more. A scan knows the surface, so
 points at which the housing would come down on it beside the tip, or on the way to them, are left out before
 anything moves. Looked at are the ball, a line of places along the beam, and the lower edge of its housing;
-where nothing is known of the surface, nothing is said.
+where the surface is unknown, nothing is checked.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
     scale = float(np.std(y))
     if scale == 0:
         return KrigedSurface(xy, y, noise, extent, 0.0, float(y[0]))
-    # starts over the lengths that the points can tell: a likelihood may have several maxima
+    # starts over the lengths that the points resolve: a likelihood may have several maxima
     picked = np.unique(np.linspace(0, len(y) - 1, min(len(y), FIT_POINTS)).astype(int))
     picked_distances = distances[np.ix_(picked, picked)]
     nearest = float(np.median(apart.min(axis=1)))

@@ -135,7 +135,7 @@ def design_measurement(scene: ScanScene, offered: SensorRange | None = None) -> 
     distortion = Output.DISTORTION in scene.outputs
     realisations = DISTORTION_REALISATIONS if distortion else 1
     if not distortion:
-        # a second realisation of random phases is what tells distortion from noise
+        # a second realisation of random phases distinguishes distortion from noise
         saved = (DISTORTION_REALISATIONS - 1) * scene.blocks.most * offered.period_s
         why = "distortion is not wanted"
         skipped.append(Skipped("a second realisation at every point", why, saved))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people know of a session and no instrument of the package tells."""
+"""What people know of a session and no instrument of the package measures."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def plan_points(
     measurement: MeasurementDesign | None = None,
     timing: Timing | None = None,
 ) -> Plan:
-    """Plan of points that are known: of poses given, of a run that is gone on with."""
+    """Plan of points that are known: of poses given, of a run that is continued."""
     timing = Timing() if timing is None else timing
     measurement = design_measurement(scene) if measurement is None else measurement
     shortest_s, longest_s = (

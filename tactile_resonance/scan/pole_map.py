@@ -105,7 +105,7 @@ class MapPoint:
 
     @property
     def place(self) -> FloatArray:
-        """(3,) by which it is told from other points [m]."""
+        """(3,) that distinguishes it from other points [m]."""
         return self.position_m if self.place_m is None else self.place_m
 
     @property
@@ -347,7 +347,7 @@ class PoleMap:
         return tuple(p for p in self.estimated if np.all(np.isfinite(p.covariance)))
 
     def krige(self) -> KrigedSurface | None:
-        """Natural frequency over x, y; None with too few points with a covariance to tell."""
+        """Natural frequency over x, y; None where too few points have a covariance."""
         points = self.with_ellipse
         if len(points) < LEAST_POINTS:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan tells, its summary at the end, and what it may be asked meanwhile."""
+"""Progress of a scan, its summary at the end, and the requests that it takes meanwhile."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class TimeLimits:
 class DriftLimits:
     """How far the poles in air may move during a scan; what is less is no warning, however significant.
 
-    Both are this project's choice: a fiftieth of what tells 10 from 12 % gelatine (arXiv 1805.00682).
+    Both are this project's choice: a fiftieth of what distinguishes 10 from 12 % gelatine (arXiv 1805.00682).
     """
 
     f0_hz: float = 0.05
@@ -190,7 +190,7 @@ class ScanScene:
     normals : NormalRequest or None
         How the normal of each point is found by touch; None: it is the surface's.
     notes : Notes
-        What people know of the session and no instrument tells.
+        What people know of the session and no instrument measures.
     """
 
     name: str

@@ -66,7 +66,7 @@ def find_surface(
 ) -> FoundSurface:
     """Touch all places of a request and fit its form.
 
-    The first place is expected at the height that the request tells, the others where those before tell: on
+    The first place is expected at the height that the request states, the others where those before suggest: on
     their plane as soon as it is known. Before, surfaces are searched for as far as the request says.
 
     Parameters

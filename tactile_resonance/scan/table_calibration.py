@@ -226,7 +226,7 @@ def _covariance(surface: TouchedSurface, height_m: float) -> FloatArray:
     covariance = jacobian @ surface.covariance_m2 @ jacobian.T
     worst = math.sqrt(float(np.linalg.eigvalsh(covariance[1:, 1:])[-1]))
     accepted = f"up to {MOST_TILT_STD_RAD:g}: points further apart, not on one line"
-    where = "points: standard deviation of the tilt they tell [rad]"
+    where = "points: standard deviation of the tilt from them [rad]"
     require(worst <= MOST_TILT_STD_RAD, where, round(worst, 5), accepted)
     return covariance
 
@@ -252,5 +252,5 @@ def _contradiction(found: FoundSurface, ball_radius_m: float) -> str:
         return f"{text}: touch {index + 1} lies {1e3 * off:+.3f} mm off the plane of the others"
     if alone:
         numbers = ", ".join(str(index + 1) for index, _ in alone)
-        return f"{text}: one of {numbers} is off, more touches tell which"
-    return f"{text}: more touches tell which is off, or the surface is not flat (flatness_m)"
+        return f"{text}: one of {numbers} is off, more touches would show which"
+    return f"{text}: more touches would show which is off, or the surface is not flat (flatness_m)"

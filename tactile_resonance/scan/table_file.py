@@ -20,7 +20,7 @@ ORDER = ("height_m", "tilt_x_rad", "tilt_y_rad")
 NOT_ESTIMATED = ("x", "y", "turn about the normal")
 _HEADER = """\
 # A table in the robot's base, found by touch: `ros2 launch ... table_in_base:=THIS_FILE` takes it.
-# Lengths in m, angles in rad. What is not estimated no touch along the normal can tell: it is as it was known.
+# Lengths in m, angles in rad. No touch along the normal determines what is not estimated: it is as given.
 """
 
 

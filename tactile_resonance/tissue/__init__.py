@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What poles tell of the tissue."""
+"""Tissue from poles: classes, calls and their uncertainty."""

@@ -195,7 +195,7 @@ def test_a_touch_that_is_none_is_named():
     with pytest.raises(ValueError, match=r"touch 3 lies \+0\.500 mm off the plane of the others"):
         table_from_touches(request(SIX), KNOWN, RADIUS_M, touches)
     # four cannot tell which: every three of them lie on a plane
-    with pytest.raises(ValueError, match="more touches tell which"):
+    with pytest.raises(ValueError, match="more touches would show which"):
         table_from_touches(request(SIX[:4]), KNOWN, RADIUS_M, touches[:4])
     # whoever states that the surface is so uneven gets the deviations that go with it
     made = table_from_touches(request(SIX, flatness_m=2e-4), KNOWN, RADIUS_M, touches)
