@@ -16,7 +16,7 @@ def write_whole(path: Path, content: bytes) -> None:
         If something other than a regular file stands there: a device would be replaced.
     """
     if path.exists() and not path.is_file():
-        raise ValueError(f"output: {path} is no regular file, expected a new one or one to replace")
+        raise ValueError(f"output: {path} is not a regular file, expected a new one or one to replace")
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:

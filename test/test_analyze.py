@@ -315,8 +315,8 @@ def test_outputs_never_replace_what_they_must_not(good, tmp_path, capsys):
     os.mkfifo(fifo)
     for options, message in (
         (["--json", good], "is the record itself"),
-        (["--json", fifo], "no regular file"),
-        (["--json", tmp_path], "no regular file"),
+        (["--json", fifo], "not a regular file"),
+        (["--json", tmp_path], "not a regular file"),
         (["--json", tmp_path / "a.png", "--plot", tmp_path / "a.png"], "expected two files"),
     ):
         assert cli.main(["analyze", str(good), *map(str, options)]) == 1

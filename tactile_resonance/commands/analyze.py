@@ -280,7 +280,7 @@ def _check_outputs(options: argparse.Namespace) -> None:
             raise ValueError(f"{name}: {path}, expected a file in a folder that can be written")
         if path.exists() and not path.is_file():
             raise ValueError(
-                f"{name}: {path} is no regular file, expected a new one or one to replace"
+                f"{name}: {path} is not a regular file, expected a new one or one to replace"
             )
         if path.exists() and options.record.exists() and path.samefile(options.record):
             raise ValueError(f"{name}: {path} is the record itself, expected another file")

@@ -15,8 +15,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "check-robot",
         help="whether a Universal Robots arm is ready and its link fit",
         description="Identify the robot, upload the control program, set TCP, payload and watchdog as the "
-        "configuration says, watch the states for some seconds, disconnect. Nothing moves. docs/robot.md "
-        "says what to set at the robot.",
+        "configuration states, watch the states for some seconds, disconnect. Nothing moves. docs/robot.md "
+        "states what to set at the robot.",
     )
     parser.add_argument(
         "--host", help="name or address of the robot (default: the configuration's)"

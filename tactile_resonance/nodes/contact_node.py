@@ -292,7 +292,7 @@ class ContactNode(ManagedNode):
             return
         if self._dead:
             self._finish(thread.controller.result)
-            self.fail(f"{self._fault}; connecting anew")
+            self.fail(f"{self._fault}; reconnecting")
             return
         goal, controller = self._goal, thread.controller
         if goal is None and controller.state is State.IDLE and not thread.clock.simulated:

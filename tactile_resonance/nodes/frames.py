@@ -42,7 +42,7 @@ from tactile_resonance.nodes.running import LATCHED, STREAM
 BROADCAST_TF = Parameter(
     "broadcast_tf",
     True,
-    "Broadcast where its frames stand, where tf2 is installed; false: somebody else does.",
+    "Broadcast where its frames stand, where tf2 is installed; false: another program does.",
     read_only=True,
 )
 

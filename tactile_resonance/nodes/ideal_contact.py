@@ -180,7 +180,7 @@ class IdealContact:
             self._say(State.APPROACH, "", "")
             began_ns = self._now_ns()
             if not self._wait(CONTACT_S):
-                self._say(State.IDLE, "cancelled", "drawn back as asked for")
+                self._say(State.IDLE, "cancelled", "drawn back on request")
                 result.cause, result.message = self._cause, self._message
                 return result
             place = request.pose.pose.position
@@ -250,7 +250,7 @@ class IdealContact:
             self._stays.add(Stay(now_ns, 0.0, self._stays.newest.pose))
             self._depth_m = math.nan
             self._placed()
-            self._say(State.IDLE, "cancelled", "drawn back as asked for")
+            self._say(State.IDLE, "cancelled", "drawn back on request")
 
     def _say(self, state: State, cause: str, message: str) -> None:
         self._state, self._cause, self._message = state, cause, message

@@ -111,7 +111,7 @@ class NodeWatch:
             with self._lock:
                 sign = self._signs.get(name)
             if sign is not None and sign.instance != instance:
-                return f"{name} was started anew"
+                return f"{name} was restarted"
             if problem := self._problem(name):
                 return problem
         return None

@@ -165,4 +165,4 @@ class SimulatedTip:
 
     def _check_plant(self) -> None:
         if self.plant is not None and not self.plant.alive:
-            self._node.fail("the simulated robot has ended; starting it anew")
+            self._node.fail("the simulated robot has ended; restarting it")

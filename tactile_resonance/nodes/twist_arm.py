@@ -205,7 +205,7 @@ class TwistArm:
         wanted = checked_twist(twist, self.config)
         check_acceleration(acceleration_m_s2, self.config)
         if not self._publisher.get_subscription_count():
-            self._fail(ArmFault.LINK_LOST, f"nobody listens to {self.config.command_topic}")
+            self._fail(ArmFault.LINK_LOST, f"no subscriber to {self.config.command_topic}")
         self._watch_commands()
         now_ns, period_s = self.clock.now_ns(), 1 / self.config.rate_hz
         with self._lock:

@@ -98,7 +98,7 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
     if not channels:
         raise ValueError(
             f"measurement {key}: no complete realisation ({'; '.join(notes)}), expected one, or "
-            "fewer periods asked for"
+            "fewer periods requested"
         )
     recording = make_recording(
         np.stack([u for u, _ in channels]),  # (M, P, N)

@@ -130,7 +130,7 @@ def decide(
         Duration of one block [s].
     """
     x, best = np.asarray(estimate, float), np.asarray(covariance, float)
-    verdict, reason, called = Verdict.CONTINUE, "fewer blocks than asked for at least", ""
+    verdict, reason, called = Verdict.CONTINUE, "fewer blocks than required at least", ""
     if blocks >= limits.least and wanted is not None:
         if not (np.all(np.isfinite(best)) and np.all(np.isfinite(x))):
             reason = "no pole with a covariance yet"
@@ -139,7 +139,7 @@ def decide(
         else:
             verdict, reason = _precise(best, np.asarray(noise, float), blocks, wanted, limits)
     elif wanted is None:
-        reason = "no precision asked for"
+        reason = "no precision requested"
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
         verdict, reason = Verdict.MOST_BLOCKS, f"{blocks} blocks; {reason}"
     saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)

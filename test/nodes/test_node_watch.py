@@ -107,7 +107,7 @@ def test_a_node_that_was_deactivated_is_said_to_be_so_and_not_to_hang(watch):
 def test_a_node_that_was_started_anew_is_another(watch):
     watch.graph.beat(SOURCE, instance=2)
     assert watch.nodes.missing() is None
-    assert watch.nodes.changed(watch.instances) == f"{SOURCE} was started anew"
+    assert watch.nodes.changed(watch.instances) == f"{SOURCE} was restarted"
     assert watch.nodes.changed(watch.nodes.instances(["poles"])) is None
 
 
@@ -251,7 +251,7 @@ def test_each_start_of_a_node_is_another_instance(nodes):
         source.trigger_configure()
         source.trigger_activate()
         assert wait(lambda: is_up(watch))
-        assert not seen or wait(lambda: watch.changed(seen[0]) == f"{SOURCE} was started anew")
+        assert not seen or wait(lambda: watch.changed(seen[0]) == f"{SOURCE} was restarted")
         seen.append(watch.instances(["poles"]))
         executor.remove_node(source)
         source.destroy_node()
