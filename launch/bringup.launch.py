@@ -148,7 +148,7 @@ def _nodes(context):
             remappings=[("/clock", "clock")],
             ros_arguments=["--enclave", f"{enclaves}/{name}"] if enclaves else None,
             output="screen",
-            respawn=True,  # the manager brings up again what was started anew
+            respawn=True,  # the manager brings up again what was restarted
             respawn_delay=1.0,
         )
         for name, parameters in plan.nodes.items()

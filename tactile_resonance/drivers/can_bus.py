@@ -94,7 +94,7 @@ class SocketcandBus:
     Raises
     ------
     OSError
-        Where nobody answers, or not in time.
+        Where no answer comes, or not in time.
     """
 
     def __init__(self, host: str, port: int, channel: str) -> None:

@@ -31,7 +31,7 @@ class CanWrench:
 
     `read` takes the frames that have come, joins them, stamps and checks each wrench. Silence is only
     declared where nothing waited. If the call itself comes late, the machine may have stood still, and the
-    process that brings the frames with it: then the time of silence begins anew, once.
+    process that brings the frames with it: then the time of silence starts again, once.
 
     Parameters
     ----------

@@ -113,7 +113,7 @@ class UrArm:
         """Connect, set TCP and payload, start the control program and its watchdog.
 
         After a stop that was released at the robot, the program is started again over the same
-        connection; after anything else everything is connected anew.
+        connection; after anything else everything is reconnected.
 
         Raises
         ------
@@ -277,7 +277,7 @@ class UrArm:
     # helpers
 
     def _connect_again(self) -> bool:
-        """Start the program again over a good connection; False where everything must be connected anew."""
+        """Start the program again over a good connection; False where everything must be reconnected."""
         assert self._client is not None
         try:
             self._fresh()

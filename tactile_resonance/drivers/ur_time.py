@@ -89,7 +89,7 @@ class ArmTime:
     # while a loop leads
 
     def name_ports(self, robot_port: int) -> None:
-        """Have the bench report what it has sent to robot and cell, either of which may be connected anew."""
+        """Have the bench report what it has sent to robot and cell, either of which may be reconnected."""
         assert self.led is not None
         ports = robot_port, self._bus_port()
         if ports != self._named_ports:

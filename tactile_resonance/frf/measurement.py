@@ -35,7 +35,7 @@ MOST_BINS = 20000
 class MeasurementFrf:
     """Takes in the records of one measurement; after each, the FRF so far.
 
-    The record of the realisation so far is kept, and transformed anew with every block: what comes of
+    The record of the realisation so far is kept, and transformed again with every block: what comes of
     it is what the whole record at once gives.
 
     Parameters

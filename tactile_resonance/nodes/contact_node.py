@@ -72,7 +72,7 @@ PARAMETERS = (
 )
 
 FEEDBACK_EVERY_S = 0.1
-# How long the devices may be dead before the node gives up and is brought up anew.
+# How long the devices may be dead before the node gives up and is brought up again.
 DEAD_NS = 1_000_000_000
 
 
@@ -158,7 +158,7 @@ class ContactNode(ManagedNode):
         self._teller.reset()
 
     def deactivate(self) -> None:
-        """Draw the tip back and end the loop; a node whose loop does not end is made anew."""
+        """Draw the tip back and end the loop; a node whose loop does not end is rebuilt."""
         thread = self._thread
         if thread is None:
             return

@@ -132,7 +132,7 @@ def broadcast_fixed(node: ManagedNode, parent: str, children: Mapping[str, Pose]
 
 
 class TipBroadcaster:
-    """Broadcasts where the tip is, from `tcp_pose`, while somebody listens to `/tf`."""
+    """Broadcasts where the tip is, from `tcp_pose`, while `/tf` has a subscriber."""
 
     def __init__(self, node: ManagedNode, tip_frame: str) -> None:
         self._node, self._tip_frame = node, tip_frame

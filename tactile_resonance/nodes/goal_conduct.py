@@ -25,7 +25,7 @@ TICK_S = 0.1
 SILENT_S = 5.0
 """A scan that has sent no feedback for so long may have lost its node: its result is requested again."""
 GONE_S = 10.0
-"""A node that nobody has seen for so long has gone."""
+"""A node that was not discovered for so long is gone."""
 
 
 class Ending(Enum):

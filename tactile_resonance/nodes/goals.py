@@ -59,7 +59,7 @@ class GoalClient(ActionClient):
 
 
 POLL_S = 0.005
-# A node that was started anew accepts goals again within this.
+# A node that was restarted accepts goals again within this.
 TAKEN_WITHIN_S = 60.0
 # An answer that has not come by then may be lost: the goal is sent again.
 ASK_AGAIN_S = 2.0
@@ -125,7 +125,7 @@ class Goals:
             if future.result().status == GoalStatus.STATUS_UNKNOWN:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
         except (PointFailed, Interrupted, ScanEnded):
-            # a node that was started anew, or is gone, does not know the goal: its end is not waited for
+            # a node that was restarted, or is gone, does not know the goal: its end is not waited for
             cancelled = handle.cancel_goal_async()
             if self._done(cancelled, ASK_AGAIN_S) and cancelled.result().goals_canceling:
                 self._done(future, GOAL_ENDS_WITHIN_S)

@@ -230,7 +230,7 @@ class ManagedNode(LifecycleNode):
         return float(values(self, HUNG_AFTER.name)[0])
 
     def fail(self, reason: str) -> None:
-        """Give up for a reason: back to unconfigured, from where the manager starts it anew.
+        """Give up for a reason: back to unconfigured, from where the manager restarts it.
 
         Also from within `deactivate`, where the node cannot go on as it is.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Brings the nodes up in order, and those back that failed or were started anew."""
+"""Brings the nodes up in order, and those back that failed or were restarted."""
 
 from __future__ import annotations
 
@@ -78,9 +78,9 @@ class _Managed:
 class ManagerNode(Node):
     """Asks each node for its state and moves it on; a node waits for those before it.
 
-    A node that fails goes back to unconfigured, one that is started anew is unconfigured: both are
+    A node that fails goes back to unconfigured, one that is restarted is unconfigured: both are
     brought up again. A node that somebody else deactivates is held: it stays down, also where it is cleaned up
-    or started anew, until somebody activates it or calls `~/start`. Services `~/shut_down` (all nodes
+    or restarted, until a client activates it or calls `~/start`. Services `~/shut_down` (all nodes
     unconfigured, in reverse order) and `~/start`.
     """
 

@@ -40,7 +40,7 @@ class NodeWatch:
     """Listens to the signs of life of the nodes that publish some topics.
 
     A publisher in the graph does not prove that its node is there: one that was killed stays in the graph for
-    as long as its lease lasts, one that was started anew publishes nothing before it is active. A node of
+    as long as its lease lasts, one that was restarted publishes nothing before it is active. A node of
     another package, which gives no signs of life, is taken to be at work while it publishes.
 
     Parameters
@@ -132,7 +132,7 @@ class NodeWatch:
 
     @contextmanager
     def doubted_after(self, error: type[Exception]) -> Iterator[None]:
-        """After such an error doubt all nodes until their next sign of life: one may have been started anew."""
+        """After such an error doubt all nodes until their next sign of life: one may have been restarted."""
         try:
             yield
         except error:

@@ -36,7 +36,7 @@ class ScanTime:
         self.simulated = bool(server)
         self.silent_s = hung_after_s if server else SILENT_S
         self._clock: SimulatedClock | None = None
-        self._offset_ns = self._last_ns = 0  # a bench that is started anew begins its time anew
+        self._offset_ns = self._last_ns = 0  # a bench that is restarted begins its time anew
 
     @contextlib.contextmanager
     def conducted(self) -> Iterator[None]:

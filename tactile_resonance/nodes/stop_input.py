@@ -16,8 +16,8 @@ STOP = "stop"
 class StopInput:
     """Service and topic `stop`, true: stop, false: release; served in every state of the node's life.
 
-    What counts is the newest request, whoever it came from. A node that is configured anew remembers it, one
-    that is started anew does not.
+    What counts is the newest request, whoever it came from. A node that is reconfigured remembers it, one
+    that is restarted does not.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ STATE_TOPIC = "contact_state"
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
-# Faults of the devices, and what somebody else asked for, say nothing of the point: it is repeated.
+# Faults of the devices, and requests of other clients, are no fault of the point: it is repeated.
 FOREIGN_CAUSES = frozenset(
     cause.value
     for cause in (
@@ -79,7 +79,7 @@ class TipContact:
             node.resources.callback(node.destroy_client, service)
 
     def listen(self) -> None:
-        """Hear of contacts, for one scan; where the tip is now nobody knows."""
+        """Subscribe to contacts, for one scan; where the tip is now is unknown."""
         self.touching = True  # a scan that was killed may have left it there
         self.stopped, self._instance = False, 0
         self.touched_ns: int | None = None
@@ -106,7 +106,7 @@ class TipContact:
     def touch(
         self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
     ) -> MakeContact.Result:
-        """Touch and draw back; a touch that is disturbed is repeated, once nobody stops the tip."""
+        """Touch and draw back; a touch that is disturbed is repeated, once the tip is not stopped."""
         disturbed = Disturbances()
         while True:
             while self.stopped:
@@ -123,7 +123,7 @@ class TipContact:
     def retract(self, within_s: float = RETRACT_WITHIN_S) -> float:
         """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N].
 
-        0 where it did not, or where nobody knows.
+        0 where it did not, or where that is unknown.
         """
         if not self.touching:
             return 0.0
@@ -199,7 +199,7 @@ class TipContact:
         if not self.stopped or message.stopped or message.instance == self._instance:
             self.stopped, self._instance = message.stopped, message.instance
         elif time.monotonic() - self._stop_asked_s > ASK_AGAIN_S:
-            # a node that was started anew does not know that it was stopped, and nobody has released it
+            # a node that was restarted does not know that it was stopped, and nobody has released it
             self._stop_asked_s = time.monotonic()
             self._stop.call_async(SetBool.Request(data=True))
 

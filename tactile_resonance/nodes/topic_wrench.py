@@ -58,7 +58,7 @@ class TopicWrench:
         return self._config.info
 
     def start(self) -> None:
-        """Listen anew; without a wrench in the next two seconds it counts as silent."""
+        """Subscribe again; without a wrench in the next two seconds it counts as silent."""
         self._listening = False
         self._samples.clear()
         self._checks.restart()

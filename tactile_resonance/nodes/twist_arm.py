@@ -156,7 +156,7 @@ class TwistArm:
         Raises
         ------
         ArmError
-            LINK_LOST where no pose has come yet, or nobody listens to the commands; STALE, LATE, INVALID,
+            LINK_LOST where no pose has come yet, or the commands have no subscriber; STALE, LATE, INVALID,
             NOT_FOLLOWED, which stay until `connect`.
         """
         if self._fault is not None:

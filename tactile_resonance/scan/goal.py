@@ -168,7 +168,7 @@ def resumed_run(goal: ScanGoal) -> Path:
 
 
 def expanded(given: str, name: str) -> Path:
-    """Path with ``~`` in place; ``ValueError`` where nobody has that home."""
+    """Path with ``~`` in place; ``ValueError`` where there is no such home."""
     try:
         return Path(given).expanduser()
     except RuntimeError as error:

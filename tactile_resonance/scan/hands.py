@@ -56,7 +56,7 @@ class PointDisturbed(PointFailed):
 
 
 class NodeAway(PointDisturbed):
-    """A node that the point needs went away, or was started anew and knows nothing of what was asked."""
+    """A node that the point needs went away, or was restarted and knows nothing of what was asked."""
 
     attempts = ATTEMPTS_WITHOUT_NODE
 
@@ -75,7 +75,7 @@ class ScanEnded(Exception):
 
 
 class Interrupted(Exception):
-    """The point was left because somebody asked for it."""
+    """The point was left on request."""
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def clear_plan(scene: ScanScene, plan: Plan, surface: Surface, use: TipUse | Non
 def plan_with(
     scene: ScanScene, plan: Plan, points: Sequence[ScanPoint], left: Sequence[LeftOut]
 ) -> Plan:
-    """The plan with these points, numbered anew, and what is left out of it noted.
+    """The plan with these points, renumbered, and what is left out of it noted.
 
     Raises
     ------

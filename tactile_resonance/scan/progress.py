@@ -93,7 +93,7 @@ class Summary:
 
 
 class Request(Enum):
-    """What somebody may ask of a running scan."""
+    """Requests to a running scan."""
 
     SKIP = "skip"
     REPEAT = "repeat"

@@ -11,7 +11,7 @@
     RUN/results.csv                     one row per finished point, its latest attempt
 
 A point is finished when its file is there. Files get their names when they are complete and on disk;
-``metadata.yaml`` and ``results.csv`` follow from the files and are made anew when a run is opened.
+``metadata.yaml`` and ``results.csv`` follow from the files and are rebuilt when a run is opened.
 """
 
 from __future__ import annotations
