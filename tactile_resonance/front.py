@@ -157,7 +157,7 @@ def identify_poles(
     data : Recording or FRF
         From a recording: all bins of the band, the transient of each realisation estimated along; from a
         frequency response: its lines, weighted with their variance. Spectra with a noise covariance:
-        `identify_spectra`; many points of one kind: `RealisationsPlan`, `identify_batch`.
+        `identify_spectra`; many points of one kind: `PoleEstimator`, `identify_batch`.
     band_hz : (low, high), optional
         When absent, around the strongest resonance of a recording, or all lines of a response.
     structure : ModelStructure, optional
