@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
-from identification import mode_at_250_hz as mode
+from poles import mode_at_250_hz as mode
 
 from benchmarks.poles_plant import (
     BAND_HZ,
