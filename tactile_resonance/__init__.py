@@ -15,7 +15,7 @@ from typing import Any
 __path__ = __import__("pkgutil").extend_path(__path__, __name__)
 
 _HOMES = {
-    "front": ("estimate_frf", "identify_poles", "read_record"),
+    "front": ("estimate_frf", "identify_poles", "read_record", "read_run"),
     "analysis": ("Analysis", "analyse"),
     "multisine": ("Excitation", "Grid", "design_multisine"),
     "frf.result": ("FRF", "FrfStatus"),
@@ -24,7 +24,6 @@ _HOMES = {
     "poles.result": ("Poles", "PolesBatch", "PolesStatus"),
     "poles.structure": ("ModelStructure",),
     "recording.recording": ("Recording", "make_recording"),
-    "scan.run_content": ("RunContent", "read_run"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -39,4 +38,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__doc__", "__file__", "__name__", "__path__"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
@@ -23,6 +24,11 @@ from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store_recording import read_store_recording, recording_of
+
+if TYPE_CHECKING:
+    from tactile_resonance.scan.run_content import RunContent
+
+WITHOUT_ROSBAGS = "rosbags not found, which reads runs: pip install 'rosbags>=0.11.1,<0.12'"
 
 
 def read_record(
@@ -92,8 +98,44 @@ def read_record(
     try:
         from tactile_resonance.scan.recorded import read_recorded
     except ImportError as error:
-        raise ValueError(f"{path}: {error.name} not found; pip install rosbags") from error
+        raise ValueError(f"{path}: {WITHOUT_ROSBAGS}") from error
     return recording_of(read_recorded(path, measurement_id), periods)
+
+
+def read_run(path: str | PathLike[str]) -> RunContent:
+    """Read the run of a scan: its plan, and the result of each point, also while it is recorded.
+
+    Parameters
+    ----------
+    path : path
+        Folder of the run.
+
+    Returns
+    -------
+    RunContent
+        ``facts``, ``points`` of the plan, and ``results``, a `scan.point_result.PointResult` for each attempt.
+
+    Raises
+    ------
+    ValueError
+        If it is not a run, or rosbags is not installed.
+
+    Examples
+    --------
+    >>> run = tr.read_run("runs/demo")  # doctest: +SKIP
+    >>> [result.f0_hz for result in run.results]  # doctest: +SKIP
+    """
+    try:
+        from tactile_resonance.scan import run_content
+    except ImportError as error:
+        raise ValueError(f"{path}: {WITHOUT_ROSBAGS}") from error
+    return run_content.read_run(Path(path))
+
+
+def _require(data: object, kinds: tuple[type, ...]) -> None:
+    if not isinstance(data, kinds):
+        accepted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"data: got a {type(data).__name__}; accepted is a {accepted}")
 
 
 def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> FRF:
@@ -136,6 +178,7 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     >>> bool(np.all(np.abs(poles.main.estimate - [250, 0.02]) < 4 * poles.main.std))
     True
     """
+    _require(recording, (Recording,))
     recording.require_driven()
     record = Spectrum.of(recording.u, recording.y)
     harmonics = recording.excited_harmonics
@@ -190,6 +233,7 @@ def identify_poles(
     >>> print(f"{poles.main.f0_hz:.3f} Hz +- {poles.main.std[0]:.3f}, {poles.status.value}")
     249.999 Hz +- 0.004, ok
     """
+    _require(data, (Recording, FRF))
     if isinstance(data, FRF):
         return poles_stage.identify_poles(data, band_hz, structure)
     return analyse(data, band_hz=band_hz, structure=structure).poles

@@ -24,7 +24,7 @@ def test_every_public_name_is_there():
         value = getattr(tr, name)
         assert value.__name__ == name
         assert value.__doc__
-    assert set(tr.__all__) <= set(dir(tr))
+    assert set(tr.__all__) < set(dir(tr))
     with pytest.raises(AttributeError, match="no attribute 'estimate_frv'"):
         tr.estimate_frv  # noqa: B018
 
@@ -57,6 +57,25 @@ def test_a_file_goes_to_its_poles(tmp_path):
     of_frf = tr.identify_poles(tr.estimate_frf(recording), band_hz=(200, 300))
     assert np.all(np.abs(of_frf.main.estimate - [f0_hz, damping]) < 5 * of_frf.main.std)
     assert of_frf.main.std[0] > poles.main.std[0]
+
+
+def test_something_else_than_a_recording_is_refused():
+    for call in (tr.estimate_frf, tr.identify_poles):
+        with pytest.raises(ValueError, match="data: got a str; accepted is a Recording"):
+            call("record.npz")
+
+
+def test_run_without_rosbags_is_refused_with_what_to_install(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("tactile_resonance.scan")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr(sys.modules["tactile_resonance"], "scan", raising=False)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    for name in [name for name in sys.modules if name.startswith("rosbags.")]:
+        monkeypatch.delitem(sys.modules, name)
+    (tmp_path / "run.json").write_text("{}")
+    for call in (tr.read_run, tr.read_record):
+        with pytest.raises(ValueError, match="pip install 'rosbags"):
+            call(tmp_path)
 
 
 def test_fields_of_a_file_are_refused_for_a_folder(tmp_path):
