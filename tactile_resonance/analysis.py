@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
-from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
@@ -75,7 +75,7 @@ def analyse(
     candidates : sequence of ModelStructure, optional
         Of which the data choose one in place of `structure`, by minimum description length.
     frf_method : str
-        See `frf.estimate.estimate_frf`.
+        See `frf.estimate.frf_of_record`.
     poles_method : {"auto", "joint", "frf"}
         Poles from all bins of the band together with the transients (`poles.joint`, of
         several realisations `poles.realisations`), or from the FRF. ``auto`` takes the
@@ -105,8 +105,7 @@ def analyse(
         harmonics = find_excited_harmonics(record)
         warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
     found = time.perf_counter()
-    spectra = mean_spectra(record, harmonics, method=frf_method)
-    frf = frf_of_realisations(spectra, sample_rate_hz=rate_hz)
+    frf = frf_of_record(record, harmonics, sample_rate_hz=rate_hz, method=frf_method)
     faults = find_faults(
         record, sample_rate_hz=rate_hz, harmonics=harmonics, transient_removed=record.periods > 1
     )

@@ -6,15 +6,13 @@ The names are those of the package itself (``import tactile_resonance as tr``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import errno
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy.typing as npt
+from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
@@ -35,13 +33,8 @@ def read_record(
     path: str | PathLike[str],
     measurement_id: int | None = None,
     *,
-    u: str = "u",
-    y: str = "y",
-    sample_rate_hz: float | None = None,
-    samples_per_period: int | None = None,
     periods: int | None = None,
-    segments: Sequence[tuple[int, int]] | None = None,
-    excited_harmonics: npt.ArrayLike | None = None,
+    **fields: Any,
 ) -> Recording:
     """Read whole periods of both channels.
 
@@ -52,12 +45,11 @@ def read_record(
         scan.
     measurement_id : int, optional
         Which one of a folder or run that holds several.
-    u, y : str
-        Names of the actuator and the sensor field of a file.
-    sample_rate_hz, samples_per_period, segments, excited_harmonics
-        Of a file, and win over what it says: see `recording.recording.make_recording`.
     periods : int, optional
         Use the first so many.
+    **fields
+        Of a file: names of its fields, `u` and `y`, and what overrides its content, ``sample_rate_hz``,
+        ``samples_per_period``, ``segments``, ``excited_harmonics``. See `recording.files.read_recording`.
 
     Raises
     ------
@@ -71,27 +63,14 @@ def read_record(
     >>> recording = tr.read_record("runs/demo", measurement_id=3)  # doctest: +SKIP
     """
     path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(errno.ENOENT, "no such file or folder", str(path))
     if not path.is_dir():
         if measurement_id is not None:
-            raise ValueError("measurement: only for a folder of records")
-        return read_recording(
-            path,
-            u=u,
-            y=y,
-            sample_rate_hz=sample_rate_hz,
-            samples_per_period=samples_per_period,
-            periods=periods,
-            segments=segments,
-            excited_harmonics=excited_harmonics,
-        )
-    given = {
-        "sample_rate": sample_rate_hz,
-        "samples_per_period": samples_per_period,
-        "segments": segments,
-        "harmonics": excited_harmonics,
-    }
-    for name, value in given.items():
-        if value is not None:
+            raise ValueError(f"measurement: {measurement_id}, only for a folder of records")
+        return read_recording(path, periods=periods, **fields)
+    for name in ("sample_rate_hz", "samples_per_period", "segments", "excited_harmonics"):
+        if fields.get(name) is not None:
             raise ValueError(f"{name}: not for a folder of records, which say it themselves")
     if not (path / "run.json").is_file():
         return read_store_recording(path, measurement_id, periods)
@@ -146,7 +125,7 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     recording : Recording
         Its excited lines are found from the input spectrum where it does not name them.
     method : {"local polynomial", "average"}
-        See `frf.estimate.estimate_frf`.
+        See `frf.estimate.frf_of_record`.
 
     Raises
     ------
@@ -184,8 +163,7 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     harmonics = recording.excited_harmonics
     if harmonics is None:
         harmonics = find_excited_harmonics(record)
-    spectra = mean_spectra(record, harmonics, method=method)
-    return frf_of_realisations(spectra, sample_rate_hz=recording.sample_rate_hz)
+    return frf_of_record(record, harmonics, sample_rate_hz=recording.sample_rate_hz, method=method)
 
 
 def identify_poles(

@@ -93,7 +93,7 @@ class NodeProcesses:
             process.wait()
 
     def check(self) -> None:
-        """RuntimeError if a node has ended by itself, with the last line it printed."""
+        """RuntimeError if a node has ended without being stopped, with the last line it printed."""
         for node, process in self._processes.items():
             if process.poll() is not None:
                 lines = (self._log_folder / f"{node}.log").read_text(errors="replace").split("\n")

@@ -79,7 +79,10 @@ def test_run_without_rosbags_is_refused_with_what_to_install(tmp_path, monkeypat
 
 
 def test_fields_of_a_file_are_refused_for_a_folder(tmp_path):
-    with pytest.raises(ValueError, match="sample_rate: not for a folder"):
+    with pytest.raises(ValueError, match="sample_rate_hz: not for a folder"):
         tr.read_record(tmp_path, sample_rate_hz=1e3)
-    with pytest.raises(ValueError, match="measurement: only for a folder"):
+    (tmp_path / "x.npz").touch()
+    with pytest.raises(ValueError, match="measurement: 3, only for a folder"):
         tr.read_record(tmp_path / "x.npz", 3)
+    with pytest.raises(FileNotFoundError, match="nothing_here"):
+        tr.read_record(tmp_path / "nothing_here")

@@ -150,7 +150,7 @@ class ForceInfo:
 
 
 class Cell(Protocol):
-    """A force sensor by itself: wrenches in its own frame, `ForceSource` in all else."""
+    """A force sensor alone: wrenches in its own frame, `ForceSource` in all else."""
 
     @property
     def info(self) -> ForceInfo:

@@ -85,7 +85,7 @@ class CellCommands:
     rates : mapping
         From wrenches a second to the command that sets it; empty where the rate is fixed.
     request : bytes or None
-        Sent for each wrench, where the cell does not stream by itself.
+        Sent for each wrench, where the cell does not stream unasked.
     reply : Reply or None
     """
 
@@ -133,7 +133,7 @@ class CanDescription:
     full_scale_counts : int or None
         At and beyond which a count is an overload.
     commands : CellCommands
-        None of them where the cell takes none and streams by itself.
+        None of them where the cell takes none and streams unasked.
     """
 
     frame_ids: tuple[int, ...]

@@ -153,7 +153,7 @@ class ClientProcess:
             if self._ended:
                 return ArmError(ArmFault.CLIENT_DIED, "the client process was ended")
             said = self.last_error()
-        # on a lost connection the library reconnects by itself, says so, and now and then crashes
+        # on a lost connection the library reconnects without being asked, prints it, and now and then crashes
         # where a command is under way: the link is why
         if status == EXIT_LINK_LOST or (status < 0 and LIBRARY_LOST in said):
             return ArmError(ArmFault.LINK_LOST, f"the connection to {self._host} is lost")

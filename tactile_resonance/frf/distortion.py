@@ -166,7 +166,7 @@ def estimate_distortion(
     record : Spectrum
         Of (..., M) realisations.
     sample_rate_hz, harmonics, method
-        See `estimate.estimate_frf`.
+        See `estimate.frf_of_record`.
 
     Raises
     ------

@@ -32,12 +32,11 @@ WEAK_INPUT_DB = 10.0
 TRANSIENT_SCORE = 3.7
 
 
-def estimate_frf(
-    u: npt.ArrayLike,
-    y: npt.ArrayLike,
+def frf_of_record(
+    record: Spectrum,
+    harmonics: npt.ArrayLike,
     *,
     sample_rate_hz: float,
-    harmonics: npt.ArrayLike,
     method: str = "local polynomial",
     order: int = 2,
     dof: int = 6,
@@ -46,11 +45,11 @@ def estimate_frf(
 
     Parameters
     ----------
-    u, y : (..., M, P, N) float
-        Actuator and sensor [V]: M realisations of P consecutive periods of N samples.
-    sample_rate_hz : float
+    record : Spectrum
+        Of M realisations, samples (..., M, 2, P, N).
     harmonics : (F,) int
         Excited lines.
+    sample_rate_hz : float
     method : {"local polynomial", "average"}
         How the transient is dealt with: estimated and removed, or waited for: ``average`` drops the
         first of three periods or more. A single period is taken as settled by either.
@@ -68,7 +67,6 @@ def estimate_frf(
     ValueError
         For another method, or shapes that do not fit.
     """
-    record = Spectrum.of(u, y)
     spectra = mean_spectra(record, harmonics, method=method, order=order, dof=dof)
     return frf_of_realisations(spectra, sample_rate_hz=sample_rate_hz)
 
@@ -81,7 +79,7 @@ def mean_spectra(
     order: int = 2,
     dof: int = 6,
 ) -> PeriodicSpectra:
-    """Mean spectra (..., 2, F) of a record; parameters are those of `estimate_frf`."""
+    """Mean spectra (..., 2, F) of a record; parameters are those of `frf_of_record`."""
     if method not in METHODS:
         raise ValueError(f"method: {method!r}, accepted are {', '.join(METHODS)}")
     samples, periods = record.samples_per_period, record.periods

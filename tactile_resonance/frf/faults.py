@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Acquisition faults that a record shows by itself."""
+"""Acquisition faults that a single record shows."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ class MeasurementFrf:
         self._frf = replace(frf, bins=bins)
 
     def _check(self, block: Spectrum, excitation: Excitation) -> None:
-        """Keep the worst fault of each kind that one block shows by itself."""
+        """Keep the worst fault of each kind that a single block shows."""
         report = find_faults(
             block,
             sample_rate_hz=excitation.sample_rate_hz,

@@ -100,7 +100,7 @@ def _is_run(path: Path) -> bool:
 
 
 def _source_of(path: Path) -> MeasurementSource | None:
-    """The measurements of a scan's run; None for what the device reads by itself."""
+    """The measurements of a scan's run; None for a folder that the device reads without them."""
     if not _is_run(path):
         return None
     try:

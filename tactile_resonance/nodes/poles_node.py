@@ -10,10 +10,10 @@ from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, RESULTS, run_node
 from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_frf
-from tactile_resonance.poles.likelihood import compiled
 from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.tables import compiled
 from tactile_resonance.recording.messages import origin_from_message
 
 PARAMETERS = (

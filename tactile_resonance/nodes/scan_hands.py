@@ -183,7 +183,7 @@ class NodeHands:
             poll = self._poll_of([*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])])
             held = (lambda: None) if self._tip is None else self._tip.check
             last = self._measure.measure(
-                *(design, label, seed, enough_of, recording, check, poll, held)
+                design, label, seed, enough_of, recording, check, poll, held
             )
         if last is None:
             raise PointFailed("measurement: it ended before its first block")

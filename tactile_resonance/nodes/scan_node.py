@@ -121,10 +121,8 @@ class ScanNode(ManagedNode):
         done, busy = Scan.Result.COMPLETE, Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
         goals.act(Scan, "scan", self._check_scan, self._scan, done, busy)
         done, busy = CalibrateTable.Result.DONE, no_table(CalibrateTable.Result.FAILED, RUNNING)
-        goals.act(
-            *(CalibrateTable, "calibrate_table", self._check_calibration, self._calibrate),
-            *(done, busy),
-        )
+        check = self._check_calibration
+        goals.act(CalibrateTable, "calibrate_table", check, self._calibrate, done, busy)
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
@@ -199,7 +197,10 @@ class ScanNode(ManagedNode):
         (seed,) = values(self, "seed")
         controls, files = self._goals.controls, self._files
         started = start_run(
-            *(files.checked(scan_goal(goal.request)), frames, files, self._hands),
+            files.checked(scan_goal(goal.request)),
+            frames,
+            files,
+            self._hands,
             seed=seed,
             tip_use=None if self._tip_use is None else self._tip_use.ask,
             tell=self._tell,
@@ -216,8 +217,14 @@ class ScanNode(ManagedNode):
             for cdr in recorded_results(run.content):  # of a run that is continued
                 self._publish(cdr)
             runner = ScanRunner(
-                *(started.scene, plan, run, self._hands, controls),
-                *(self._tell, started.seed, self._publish),
+                started.scene,
+                plan,
+                run,
+                self._hands,
+                controls,
+                self._tell,
+                started.seed,
+                self._publish,
             )
             fill_scan_result(result, runner.run())
 

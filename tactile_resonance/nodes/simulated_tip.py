@@ -79,8 +79,14 @@ class SimulatedTip:
             place = Contact(position_m=(x, y, z), frame_id=base_frame)
             self.stays.add(Stay(0, 0.0, pose_to_message(place)))
             self._contact = IdealContact(
-                *(node, self.stays, self._found_at, self._placed, now_ns, stop),
-                *(base_frame, self._frame_id),
+                node,
+                self.stays,
+                self._found_at,
+                self._placed,
+                now_ns,
+                stop,
+                base_frame,
+                self._frame_id,
             )
         else:
             self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)

@@ -15,14 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.poles.likelihood import (
-    Arrays,
-    Tables,
-    compiled,
-    from_planes,
-    in_blocks,
-    planes,
-)
+from tactile_resonance.poles.likelihood import Arrays, planes
+from tactile_resonance.poles.tables import Tables, compiled, from_planes, in_blocks
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]

@@ -108,7 +108,7 @@ class RecordsInverse:
 
 
 def start_values(problem: Problem, data: BinData) -> FloatArray:
-    """(points, M, n) coefficients; NaN where there are none.
+    """(points, M, n) start values; NaN where the equations are singular.
 
     By two Sanathanan-Koerner iterations.
     """

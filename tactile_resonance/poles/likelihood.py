@@ -12,9 +12,9 @@ of driven bins with U = 1 and without C.
 
 Derivatives of the error are basis functions times one complex factor for A, one for B, one for C. So the
 normal matrix ``Re J^H J`` and the gradient are sums over bins of products of two basis functions, which
-are computed once (`Tables`), times weights that all coefficients of a kind share (`_weigh`). The gradient
-is exact; the normal matrix leaves out the derivative of the variance, which is smaller by the
-signal-to-noise ratio of the input.
+are computed once (`tables.Tables`), times weights that all coefficients of a kind share (`_weigh_driven`
+and its neighbours). The gradient is exact; the normal matrix leaves out the derivative of the variance,
+which is smaller by the signal-to-noise ratio of the input.
 
 numba keeps the machine code beside this file, or in its own cache directory (NUMBA_CACHE_DIR). It looks
 at the date of this file alone: whatever is compiled for the fit is in here.
@@ -22,9 +22,8 @@ at the date of this file alone: whatever is compiled for the fit is in here.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
-from functools import cache, wraps
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,17 +43,21 @@ OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 
-_KERNELS: list[Any] = []
+KERNELS: list[Any] = []
+"""Those that Python calls."""
 
 
 def _entry(kernel: Callable) -> Callable:
     """What Python calls: one kind of arrays, whatever it is given, so that a kernel is compiled once."""
-    _KERNELS.append(kernel)
+    KERNELS.append(kernel)
 
     @wraps(kernel)
     def call(*arguments):
         return kernel(
-            *(np.require(x, None, ["C", "W"]) if isinstance(x, np.ndarray) else x for x in arguments)
+            *(
+                np.require(x, None, ["C", "W"]) if isinstance(x, np.ndarray) else x
+                for x in arguments
+            )
         )
 
     return call
@@ -65,12 +68,22 @@ BLOCK = 48
 
 # Rows of a block in the memory of a kernel: real parts of A, B, C, the error E, and behind each the
 # imaginary ones; one over the variance of E; the variances of Y and U, their covariance.
-_A, _B, _C, _E, _V, _VY, _VU, _COV = 0, 2, 4, 6, 8, 9, 10, 11
+ROW_A, ROW_B, ROW_C, ROW_E, ROW_V, ROW_VY, ROW_VU, ROW_COV = 0, 2, 4, 6, 8, 9, 10, 11
 # Then weights, in the order of their rows, complex ones real part first. With X = Y - E and w = 1 / (|A|^2
 # v): w |X|^2, -w conj(X), w; the gradient by A, and minus that by C. With an input: -w conj(X) U, w |U|^2,
 # w conj(U); minus the gradient by B.
-_AA, _AC, _CC, _OF_A, _OF_C, _AB, _BB, _BC, _OF_B = 13, 14, 16, 17, 19, 21, 23, 24, 26
-_ROWS = 28
+ROW_AA, ROW_AC, ROW_CC, ROW_OF_A, ROW_OF_C, ROW_AB, ROW_BB, ROW_BC, ROW_OF_B = (
+    13,
+    14,
+    16,
+    17,
+    19,
+    21,
+    23,
+    24,
+    26,
+)
+ROWS = 28
 
 # What is linearised: the error, or ``A Y - B U - C`` over |A| or over 1 (Sanathanan-Koerner iterations).
 EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
@@ -78,139 +91,6 @@ EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 TINY = float(np.finfo(float).tiny)
 MOST_DAMPING = 1e10
 LEAST_DAMPING = 1e-3
-
-
-# Weight of the products of two kinds of coefficients, of C, A and B in this order.
-_WEIGHTS = {(0, 0): _CC, (0, 1): _AC, (0, 2): _BC, (1, 1): _AA, (1, 2): _AB, (2, 2): _BB}
-
-
-class Part(NamedTuple):
-    """Undriven or driven bins in blocks, the last one filled up with bins that add nothing.
-
-    Attributes
-    ----------
-    bins : int
-    last : (blocks, 2, BLOCK) float
-        Polynomial of A whose coefficient is 1: real and imaginary part.
-    basis : (blocks, pairs, 2, BLOCK) float
-        Real or imaginary parts of basis functions, those that are not 0 throughout: of polynomials of an
-        imaginary variable every second one is. In pairs that add to the same row of the memory.
-    row : (pairs,) int
-        That row; less one and with a minus where nothing is there yet.
-    place : (pairs, 2) int
-        Which coefficient each belongs to, in the order C, A, B and 1.
-    products : (blocks, pairs, 2, BLOCK) float
-        Products of basis functions, real or imaginary parts, in pairs with the same weight.
-    weight : (pairs,) int
-        Its row in the memory.
-    target : (pairs, 2) int
-        Where each sum goes in a flat (n, n + 1) matrix: above the diagonal, the gradient in the last
-        column; one beyond the end for a row that fills a pair.
-    """
-
-    bins: int
-    last: FloatArray
-    basis: FloatArray
-    row: IntArray
-    place: IntArray
-    products: FloatArray
-    weight: IntArray
-    target: IntArray
-
-    @classmethod
-    def of(cls, last: ComplexArray, bases: Sequence[ComplexArray], n: int) -> Part:
-        """Of the last polynomial of A (K,), bases (K, terms) of C, A and B, and all coefficients."""
-        bins, empty = last.size, -last.size % BLOCK
-        last = np.append(last, np.ones(empty))
-        functions = [
-            (np.append(f, np.zeros(empty)), kind)
-            for kind, basis in enumerate(bases)
-            for f in basis.T
-        ]
-        by_row: dict[int, list[tuple[FloatArray, int]]] = {_A: [], _A + 1: []}
-        by_weight: dict[int, list[tuple[FloatArray, int]]] = {}
-        for i, (f, kind) in enumerate(functions):
-            row, weight = (_C, _A, _B)[kind], (_OF_C, _OF_A, _OF_B)[kind]
-            for k, values in enumerate((f.real, f.imag)):
-                if np.any(values):
-                    by_row.setdefault(row + k, []).append((values, i))
-            # a complex weight times the product, its real part
-            products = [(weight, f, n)]
-            for j, (g, its) in enumerate(functions[i:], i):
-                backwards = kind == 0 and its > 0  # weights are of conj(A) C and conj(B) C
-                products.append(
-                    (_WEIGHTS[kind, its], f * g.conj() if backwards else f.conj() * g, j)
-                )
-            for weight, values, j in products:
-                parts = [values.real] if weight in (_AA, _BB, _CC) else [values.real, -values.imag]
-                for k, part in enumerate(parts):
-                    if np.any(part):
-                        by_weight.setdefault(weight + k, []).append((part, i * (n + 1) + j))
-        for k, values in enumerate((last.real, last.imag)):
-            by_row[_A + k].append((values, n))
-        zeros, blocks = np.zeros(last.size), last.size // BLOCK
-        added = [
-            (-1 - row if k == 0 else row, *pair)
-            for row, entries in by_row.items()
-            for k, pair in enumerate(zip(entries[::2], [*entries[1::2], (zeros, n)], strict=False))
-        ]
-        pairs = [
-            (weight, *pair)
-            for weight, entries in sorted(by_weight.items())
-            for pair in zip(entries[::2], [*entries[1::2], (zeros, n * (n + 1))], strict=False)
-        ]
-        return cls(
-            bins,
-            _blocks([last.real, last.imag], blocks),
-            _paired([pair for _, *pair in added], blocks),
-            *_numbers(added),
-            _paired([pair for _, *pair in pairs], blocks),
-            *_numbers(pairs),
-        )
-
-
-def _paired(pairs: list[list[tuple[FloatArray, int]]], blocks: int) -> FloatArray:
-    """(blocks, pairs, 2, BLOCK)."""
-    rows = _blocks([values for pair in pairs for values, _ in pair], blocks)
-    return rows.reshape(blocks, len(pairs), 2, BLOCK)
-
-
-def _numbers(pairs: list[tuple]) -> tuple[IntArray, IntArray]:
-    """(pairs,) first entries, (pairs, 2) last entries of both."""
-    return (
-        np.array([first for first, *_ in pairs], np.int64),
-        np.array([[place for _, place in pair] for _, *pair in pairs], np.int64).reshape(-1, 2),
-    )
-
-
-def _blocks(rows: list[FloatArray], blocks: int) -> FloatArray:
-    """(blocks, rows, BLOCK) of rows (blocks BLOCK,)."""
-    values = np.array(rows, float).reshape(len(rows), blocks, BLOCK)
-    return np.ascontiguousarray(values.swapaxes(0, 1))
-
-
-class Tables(NamedTuple):
-    """Basis functions on all bins, and the numbers of coefficients of A, B and C."""
-
-    undriven: Part
-    driven: Part
-    a: int
-    b: int
-    c: int
-
-    @classmethod
-    def of(
-        cls, denominator: ComplexArray, numerator: ComplexArray, transient: ComplexArray
-    ) -> Tables:
-        """Of bases (K, a + 1), (K_driven, b) and (K, c) with the undriven bins first."""
-        first = denominator.shape[0] - numerator.shape[0]
-        a, b, c = denominator.shape[1] - 1, numerator.shape[1], transient.shape[1]
-        n = a + b + c
-        undriven, driven = (
-            Part.of(denominator[here, a], [transient[here], denominator[here, :a], *more], n)
-            for here, more in ((slice(0, first), ()), (slice(first, None), (numerator,)))
-        )
-        return cls(undriven, driven, a, b, c)
 
 
 class Arrays(NamedTuple):
@@ -257,31 +137,6 @@ def planes(values, order, undriven):
     return out
 
 
-def from_planes(blocks: FloatArray, undriven: int, driven: int) -> ComplexArray:
-    """Complex values (points, M, K) of `planes`."""
-    values = (blocks[..., 0, :] + 1j * blocks[..., 1, :]).reshape(*blocks.shape[:2], -1)
-    first = -(-undriven // BLOCK) * BLOCK
-    return np.concatenate([values[..., :undriven], values[..., first : first + driven]], axis=-1)
-
-
-def in_blocks(values: Sequence[npt.NDArray], points: int = 1) -> FloatArray:
-    """Real values (points, M or 1, K or 1) in blocks (points, M or 1, blocks, how many, BLOCK), filled with 1.
-
-    One block of one for all bins where the last axis is 1 long; no block where there are no values.
-    """
-    if not values:
-        return np.empty((points, 1, 0, 1, 1))
-    shape, bins = values[0].shape[:-1], values[0].shape[-1]
-    if bins == 1:
-        return np.ascontiguousarray(np.stack(values, axis=-2), float)[..., None, :, :]
-    blocks = -(-bins // BLOCK)
-    out = np.ones((*shape, blocks * BLOCK, len(values)))
-    for k, value in enumerate(values):
-        out[..., :bins, k] = value
-    out = out.reshape(*shape, blocks, BLOCK, len(values))
-    return np.ascontiguousarray(out.swapaxes(-1, -2))
-
-
 @njit(**OPTIONS)
 def _set(row, value, rows):
     for k in range(BLOCK):
@@ -313,12 +168,12 @@ def _combine(basis, row, place, block, coefficients, linear, rows):
         to = row[i]
         f, g = coefficients[place[i, 0]], coefficients[place[i, 1]]
         if to >= 0:
-            if not (linear and to >= _B):
+            if not (linear and to >= ROW_B):
                 for k in range(BLOCK):
                     rows[to, k] += f * basis[block, i, 0, k] + g * basis[block, i, 1, k]
         else:
             to = -1 - to
-            if not (linear and to >= _B):
+            if not (linear and to >= ROW_B):
                 for k in range(BLOCK):
                     rows[to, k] = f * basis[block, i, 0, k] + g * basis[block, i, 1, k]
 
@@ -327,8 +182,8 @@ def _combine(basis, row, place, block, coefficients, linear, rows):
 def _weigh_linear(y, u, last, block, weighted, flat):
     """Weights of ``A Y - B U - C`` over ``|A|``, or over 1, with the derivatives at 0."""
     for k in range(BLOCK):
-        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
-        w = 1 / flat[_VY * BLOCK + k]
+        re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
+        w = 1 / flat[ROW_VY * BLOCK + k]
         if weighted:
             w /= re * re + im * im
         l_re, l_im = last[block, 0, k], -last[block, 1, k]
@@ -336,17 +191,20 @@ def _weigh_linear(y, u, last, block, weighted, flat):
         u_re, u_im = u[0, k], u[1, k]
         squared, x_re, x_im = w * (y_re * y_re + y_im * y_im), -w * y_re, w * y_im
         z_re, z_im = x_re * l_re - x_im * l_im, x_re * l_im + x_im * l_re
-        flat[_AA * BLOCK + k] = squared
-        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = x_re, x_im
-        flat[_CC * BLOCK + k] = w
-        flat[_OF_A * BLOCK + k], flat[(_OF_A + 1) * BLOCK + k] = squared * l_re, squared * l_im
-        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = z_re, z_im
-        flat[_AB * BLOCK + k] = x_re * u_re - x_im * u_im
-        flat[(_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
-        flat[_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
-        flat[_BC * BLOCK + k], flat[(_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
-        flat[_OF_B * BLOCK + k] = z_re * u_re - z_im * u_im
-        flat[(_OF_B + 1) * BLOCK + k] = z_re * u_im + z_im * u_re
+        flat[ROW_AA * BLOCK + k] = squared
+        flat[ROW_AC * BLOCK + k], flat[(ROW_AC + 1) * BLOCK + k] = x_re, x_im
+        flat[ROW_CC * BLOCK + k] = w
+        flat[ROW_OF_A * BLOCK + k], flat[(ROW_OF_A + 1) * BLOCK + k] = (
+            squared * l_re,
+            squared * l_im,
+        )
+        flat[ROW_OF_C * BLOCK + k], flat[(ROW_OF_C + 1) * BLOCK + k] = z_re, z_im
+        flat[ROW_AB * BLOCK + k] = x_re * u_re - x_im * u_im
+        flat[(ROW_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
+        flat[ROW_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
+        flat[ROW_BC * BLOCK + k], flat[(ROW_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
+        flat[ROW_OF_B * BLOCK + k] = z_re * u_re - z_im * u_im
+        flat[(ROW_OF_B + 1) * BLOCK + k] = z_re * u_im + z_im * u_re
 
 
 @njit(**OPTIONS)
@@ -354,23 +212,23 @@ def _weigh_undriven(y, flat):
     """Errors and weights of a block of undriven bins; its cost."""
     cost = 0.0
     for k in range(BLOCK):
-        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
-        v = 1 / flat[_VY * BLOCK + k]
+        re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
+        v = 1 / flat[ROW_VY * BLOCK + k]
         squared = 1 / (re * re + im * im)
         i_re, i_im = re * squared, -im * squared
-        c_re, c_im = flat[_C * BLOCK + k], flat[(_C + 1) * BLOCK + k]
+        c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
         m_re, m_im = c_re * i_re - c_im * i_im, c_re * i_im + c_im * i_re
         e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
         w = v * squared
         z_re, z_im = v * (e_re * i_re + e_im * i_im), v * (e_re * i_im - e_im * i_re)
         cost += v * (e_re * e_re + e_im * e_im)
-        flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k] = e_re, e_im
-        flat[_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
-        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = -w * m_re, w * m_im
-        flat[_CC * BLOCK + k] = w
-        flat[_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im
-        flat[(_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re
-        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = -z_re, -z_im
+        flat[ROW_E * BLOCK + k], flat[(ROW_E + 1) * BLOCK + k] = e_re, e_im
+        flat[ROW_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
+        flat[ROW_AC * BLOCK + k], flat[(ROW_AC + 1) * BLOCK + k] = -w * m_re, w * m_im
+        flat[ROW_CC * BLOCK + k] = w
+        flat[ROW_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im
+        flat[(ROW_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re
+        flat[ROW_OF_C * BLOCK + k], flat[(ROW_OF_C + 1) * BLOCK + k] = -z_re, -z_im
     return cost
 
 
@@ -382,21 +240,21 @@ def _weigh_driven(y, u, flat):
     """
     cost = 0.0
     for k in range(BLOCK):
-        re, im = flat[_A * BLOCK + k], flat[(_A + 1) * BLOCK + k]
+        re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
         squared = 1 / (re * re + im * im)
         i_re, i_im = re * squared, -im * squared
-        b_re, b_im = flat[_B * BLOCK + k], flat[(_B + 1) * BLOCK + k]
+        b_re, b_im = flat[ROW_B * BLOCK + k], flat[(ROW_B + 1) * BLOCK + k]
         g_re, g_im = b_re * i_re - b_im * i_im, b_re * i_im + b_im * i_re
         u_re, u_im = u[0, k], u[1, k]
-        c_re, c_im = flat[_C * BLOCK + k], flat[(_C + 1) * BLOCK + k]
+        c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
         m_re = c_re * i_re - c_im * i_im + g_re * u_re - g_im * u_im
         m_im = c_re * i_im + c_im * i_re + g_re * u_im + g_im * u_re
         e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
-        s_re, s_im = flat[_COV * BLOCK + k], flat[(_COV + 1) * BLOCK + k]
+        s_re, s_im = flat[ROW_COV * BLOCK + k], flat[(ROW_COV + 1) * BLOCK + k]
         # half the derivative of the variance by g
-        d_re = flat[_VU * BLOCK + k] * g_re - s_re
-        d_im = s_im - flat[_VU * BLOCK + k] * g_im
-        v = 1 / (flat[_VY * BLOCK + k] + (d_re - s_re) * g_re - (d_im + s_im) * g_im)
+        d_re = flat[ROW_VU * BLOCK + k] * g_re - s_re
+        d_im = s_im - flat[ROW_VU * BLOCK + k] * g_im
+        v = 1 / (flat[ROW_VY * BLOCK + k] + (d_re - s_re) * g_re - (d_im + s_im) * g_im)
         power = v * (e_re * e_re + e_im * e_im)
         cost += power
         w = v * squared
@@ -404,19 +262,23 @@ def _weigh_driven(y, u, flat):
         h = v * power
         h_re, h_im = h * (d_re * i_re - d_im * i_im), h * (d_re * i_im + d_im * i_re)
         x_re, x_im = -w * m_re, w * m_im
-        flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k], flat[_V * BLOCK + k] = e_re, e_im, v
-        flat[_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
-        flat[_AC * BLOCK + k], flat[(_AC + 1) * BLOCK + k] = x_re, x_im
-        flat[_CC * BLOCK + k] = w
-        flat[_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im + h_re * g_re - h_im * g_im
-        flat[(_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re + h_re * g_im + h_im * g_re
-        flat[_OF_C * BLOCK + k], flat[(_OF_C + 1) * BLOCK + k] = -z_re, -z_im
-        flat[_AB * BLOCK + k] = x_re * u_re - x_im * u_im
-        flat[(_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
-        flat[_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
-        flat[_BC * BLOCK + k], flat[(_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
-        flat[_OF_B * BLOCK + k] = -(z_re * u_re - z_im * u_im + h_re)
-        flat[(_OF_B + 1) * BLOCK + k] = -(z_re * u_im + z_im * u_re + h_im)
+        flat[ROW_E * BLOCK + k], flat[(ROW_E + 1) * BLOCK + k], flat[ROW_V * BLOCK + k] = (
+            e_re,
+            e_im,
+            v,
+        )
+        flat[ROW_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
+        flat[ROW_AC * BLOCK + k], flat[(ROW_AC + 1) * BLOCK + k] = x_re, x_im
+        flat[ROW_CC * BLOCK + k] = w
+        flat[ROW_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im + h_re * g_re - h_im * g_im
+        flat[(ROW_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re + h_re * g_im + h_im * g_re
+        flat[ROW_OF_C * BLOCK + k], flat[(ROW_OF_C + 1) * BLOCK + k] = -z_re, -z_im
+        flat[ROW_AB * BLOCK + k] = x_re * u_re - x_im * u_im
+        flat[(ROW_AB + 1) * BLOCK + k] = x_re * u_im + x_im * u_re
+        flat[ROW_BB * BLOCK + k] = w * (u_re * u_re + u_im * u_im)
+        flat[ROW_BC * BLOCK + k], flat[(ROW_BC + 1) * BLOCK + k] = w * u_re, -w * u_im
+        flat[ROW_OF_B * BLOCK + k] = -(z_re * u_re - z_im * u_im + h_re)
+        flat[(ROW_OF_B + 1) * BLOCK + k] = -(z_re * u_im + z_im * u_re + h_im)
     return cost
 
 
@@ -439,13 +301,13 @@ def _turn(u, flat):
     """Weighted errors, turned by the phase of the input, in place of the weights of A with C."""
     for k in range(BLOCK):
         re, im = u[0, k], u[1, k]
-        e_re, e_im = flat[_E * BLOCK + k], flat[(_E + 1) * BLOCK + k]
+        e_re, e_im = flat[ROW_E * BLOCK + k], flat[(ROW_E + 1) * BLOCK + k]
         squared = re * re + im * im
         nothing = not squared > 0
         re, squared = (1.0 if nothing else re), (1.0 if nothing else squared)
-        scale = np.sqrt(flat[_V * BLOCK + k] / squared)
-        flat[_AC * BLOCK + k] = scale * (e_re * re + e_im * im)
-        flat[(_AC + 1) * BLOCK + k] = scale * (e_im * re - e_re * im)
+        scale = np.sqrt(flat[ROW_V * BLOCK + k] / squared)
+        flat[ROW_AC * BLOCK + k] = scale * (e_re * re + e_im * im)
+        flat[(ROW_AC + 1) * BLOCK + k] = scale * (e_im * re - e_re * im)
 
 
 @njit(**OPTIONS)
@@ -469,14 +331,14 @@ def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, err
     before = y.shape[2] - last.shape[0] if driven else 0
     for block in range(last.shape[0]):
         here, its = y[point, m, before + block], u[point, m, before + block]
-        _fill(variance, block, _VY, 1, rows)
+        _fill(variance, block, ROW_VY, 1, rows)
         if kind != LINEAR_UNWEIGHTED:
             _combine(basis, row, place, block, coefficients, kind == LINEAR, rows)
         if kind != EXACT:
             _weigh_linear(here, its, last, block, kind == LINEAR, flat)
         elif driven:
-            _fill(of_input, block, _VU, 1, rows)
-            _fill(covariance, block, _COV, 2, rows)
+            _fill(of_input, block, ROW_VU, 1, rows)
+            _fill(covariance, block, ROW_COV, 2, rows)
             cost += _weigh_driven(here, its, flat)
         else:
             cost += _weigh_undriven(here, flat)
@@ -485,10 +347,10 @@ def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, err
         if sums.size > 0:
             _add_power(its, BLOCK * block, bins, size, rows, sums)
         if errors.size > 0:
-            out, first = _E, BLOCK * block
+            out, first = ROW_E, BLOCK * block
             if driven:
                 _turn(its, flat)
-                out = _AC
+                out = ROW_AC
             for k in range(min(BLOCK, bins - first)):
                 errors[first + k] = complex(rows[out, k], rows[out + 1, k])
     return cost
@@ -621,7 +483,7 @@ def _unpacked(gram, c, gradient, normal):
 @njit(**OPTIONS)
 def _memory(records, c, n):
     """Memory of a block, a gram, what `_solve` computes in, coefficients, a step, costs."""
-    rows = np.zeros((_ROWS, BLOCK))
+    rows = np.zeros((ROWS, BLOCK))
     return (
         (rows.reshape(-1), rows, np.empty(0, np.complex128), np.empty((4, 0))),
         np.zeros((records, 2, n * (n + 1) + 1)),
@@ -693,7 +555,7 @@ def _add_power(u, first, bins, size, rows, sums):
         until = min(end, (piece + 1) * size - first) if piece < pieces - 1 else end
         of_error = of_u = cross_re = cross_im = 0.0
         for i in range(k, until):
-            e_re, e_im, u_re, u_im = rows[_E, i], rows[_E + 1, i], u[0, i], u[1, i]
+            e_re, e_im, u_re, u_im = rows[ROW_E, i], rows[ROW_E + 1, i], u[0, i], u[1, i]
             of_error += e_re * e_re + e_im * e_im
             of_u += u_re * u_re + u_im * u_im
             cross_re += e_re * u_re + e_im * u_im
@@ -1010,35 +872,3 @@ def invert(matrices):
         if not good:
             inverse[:] = np.nan
     return inverses, conditions
-
-
-@cache
-def compiled() -> int:
-    """How many kernels were not in the cache and had to be compiled, of those that fits call.
-
-    Some ten seconds of work, once per installation: what was compiled is said on the log.
-    """
-    bins, undriven = 4 * BLOCK, 3 * BLOCK
-    s = 1j * np.linspace(0.8, 1.2, bins)
-    one = np.ones((bins, 1), complex)
-    tables = Tables.of(np.stack([one[:, 0], s, s**2 + 0.5], axis=-1), one[undriven:], one)
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal((1, 1, bins, 2)).view(complex)[..., 0]
-    y = u / (s**2 + 0.04 * s + 1)
-    flat = in_blocks([np.ones((1, 1, 1))])
-    order = np.arange(bins)
-    data = Arrays(
-        planes(y, order, undriven), planes(u, order, undriven), flat, flat, flat, in_blocks([])
-    )
-    theta, _ = begin(tables, True, data, 1.0, BLOCK, 3)
-    linear_fit(tables, data, theta, LINEAR)
-    undriven_powers(tables, data, theta, BLOCK, 3)
-    undriven_errors(tables, data, theta)
-    minimise(tables, data, theta, 2, 1e-2, 1e-14)
-    invert(moments(tables, data, theta)[2][:, 0, 1])
-    missing = sum(sum(kernel.stats.cache_misses.values()) for kernel in _KERNELS)
-    if missing:
-        logging.getLogger(__name__).warning(
-            "pole fits: %d kernels compiled, which is done once per installation", missing
-        )
-    return missing

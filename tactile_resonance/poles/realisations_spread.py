@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each realisation by itself puts the poles: a nonlinear resonator is another system in each.
+"""Where each realisation alone puts the poles: a nonlinear resonator is another system in each.
 
 Its departures are not independent from line to line, so what lines scatter by says too little of
 them; what the realisations' poles scatter by does. That scatter has few degrees of freedom: ellipses
@@ -113,7 +113,7 @@ class Spread:
 
     @property
     def known(self) -> BoolArray:
-        """(batch,) whether each realisation by itself determines a pole."""
+        """(batch,) whether each realisation alone determines a pole."""
         return np.asarray(np.isfinite(self.ratio).any(axis=(1, 2)))
 
     @property

@@ -91,7 +91,10 @@ def prepare(
     force_n, count = asked.force_n or scene.force_n, len(plan.points)
     try:
         normals, left = find_normals(
-            *(plan.points, asked, ball_radius_m, heading_rad),
+            plan.points,
+            asked,
+            ball_radius_m,
+            heading_rad,
             lambda point: find(point, force_n, count),
         )
     except (PointFailed, ScanEnded) as error:

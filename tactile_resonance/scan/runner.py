@@ -247,7 +247,7 @@ class ScanRunner:
                 mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
             )
             decision = decide(
-                *(at.compared, at.covariance, at.covariance, blocks, wanted, limits, block_s)
+                at.compared, at.covariance, at.covariance, blocks, wanted, limits, block_s
             )
             if np.isnan(at.compared).any() and at.note:
                 return replace(decision, reason=at.note)

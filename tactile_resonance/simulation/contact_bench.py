@@ -38,7 +38,7 @@ from tactile_resonance.simulation.transducer import (
 )
 
 PROTECTIVE_DECELERATION_M_S2 = 2.0
-"""With which the robot brakes by itself (chosen)."""
+"""With which the robot brakes without a command (chosen)."""
 
 
 class VirtualBench:
@@ -167,7 +167,7 @@ class VirtualArm:
         self._frozen_until_ns = self._bench.time_ns + round(1e9 * duration_s)
 
     def halt(self, fault: ArmFault) -> None:
-        """The robot stops by itself: protective or emergency stop, program stopped."""
+        """The robot stops without a command: protective or emergency stop, program stopped."""
         self._stopped = fault
         self._motion.speed(np.zeros(6), PROTECTIVE_DECELERATION_M_S2)
 

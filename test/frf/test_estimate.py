@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import design_multisine
 
 N, RATE_HZ = 1000, 1000.0
@@ -43,7 +44,9 @@ def records(seed, realisations=1, periods=4, noise_y=0.0, noise_u=0.0, correlati
 @pytest.fixture(params=["local polynomial", "average"])
 def estimate(request):
     def run(u, y, harmonics):
-        return estimate_frf(u, y, sample_rate_hz=RATE_HZ, harmonics=harmonics, method=request.param)
+        return frf_of_record(
+            Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=harmonics, method=request.param
+        )
 
     return run
 
@@ -94,9 +97,9 @@ def test_total_variance_matches_noise_where_there_is_no_distortion(estimate):
 def test_degrees_of_freedom():
     u, y, harmonics, _ = records(2, realisations=6, noise_y=0.01)
     options = {"sample_rate_hz": RATE_HZ, "harmonics": harmonics}
-    average = estimate_frf(u, y, method="average", **options)
+    average = frf_of_record(Spectrum.of(u, y), method="average", **options)
     assert (average.noise_dof, average.periods) == (6 * 2, 3)  # the first period is dropped
-    assert estimate_frf(u, y, dof=9, **options).noise_dof >= 6 * 9
+    assert frf_of_record(Spectrum.of(u, y), dof=9, **options).noise_dof >= 6 * 9
 
 
 def test_what_cannot_be_told_is_none(estimate):
@@ -118,4 +121,6 @@ def test_single_precision_stays_close(estimate):
 def test_an_unknown_method_is_refused():
     u, y, harmonics, _ = records(5)
     with pytest.raises(ValueError, match="method: 'welch', accepted are local polynomial, average"):
-        estimate_frf(u, y, sample_rate_hz=RATE_HZ, harmonics=harmonics, method="welch")
+        frf_of_record(
+            Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=harmonics, method="welch"
+        )

@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.measurement import MeasurementFrf, mean_force
 from tactile_resonance.frf.result import PER_LINE, FrfStatus
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import Channel, Contact, Origin, Record
 
@@ -62,8 +63,8 @@ def test_block_by_block_is_all_at_once(channels, band_hz, order, dof):
             frf = measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
             if m == 0 and p > 0:
                 so_far = (slice(1), slice(p + 1))
-                assert_equal(frf, estimate_frf(u[so_far], y[so_far], **options))
-    assert_equal(frf, estimate_frf(u, y, **options))
+                assert_equal(frf, frf_of_record(Spectrum.of(u[so_far], y[so_far]), **options))
+    assert_equal(frf, frf_of_record(Spectrum.of(u, y), **options))
     assert (frf.realisations, frf.periods) == (2, 4)
 
 

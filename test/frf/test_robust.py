@@ -7,7 +7,7 @@ from scipy import signal
 
 from tactile_resonance.frf.estimate import (
     TRANSIENT_SCORE,
-    estimate_frf,
+    frf_of_record,
     robust_frf,
     transient_score,
 )
@@ -131,7 +131,7 @@ def test_single_periods_from_rest_are_told_from_settled_ones():
     y = np.fft.irfft(np.fft.rfft(twice, 4 * n) * response)[:, : 2 * n].reshape(6, 2, 1, n)
     y = y + 0.1 * rng.standard_normal(y.shape)
     from_rest, settled = (
-        estimate_frf(u, y[:, k], sample_rate_hz=float(n), harmonics=lines) for k in (0, 1)
+        frf_of_record(Spectrum.of(u, y[:, k]), sample_rate_hz=float(n), harmonics=lines) for k in (0, 1)
     )
     assert from_rest.status is FrfStatus.SUSPECT
     assert "transient" in from_rest.message

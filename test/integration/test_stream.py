@@ -11,7 +11,8 @@ from tactile_resonance.action import Measure
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
 from tactile_resonance.nodes.messages import frf_from_message
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
@@ -133,7 +134,7 @@ def test_messages_of_a_measurement(session):
         for name in ("actuator", "sensor")
     )
     frf, _ = frf_from_message(last)
-    alone = estimate_frf(u, y, sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
+    alone = frf_of_record(Spectrum.of(u, y), sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
     np.testing.assert_allclose(frf.g, alone.g, rtol=1e-12)
     np.testing.assert_allclose(frf.variance_total, alone.variance_total, rtol=1e-9)
     assert (frf.periods, frf.realisations) == (5, 2)

@@ -8,7 +8,8 @@ import pytest
 from scipy import signal, stats
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles import estimator
 from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -115,7 +116,7 @@ def test_a_joint_fit_that_does_not_converge_is_followed_by_the_frf(monkeypatch):
 
 def test_where_the_frf_gives_no_poles_either_the_first_answer_stays():
     u, y = record(1, kind="white", periods=4)
-    frf = estimate_frf(u[None], y[None], sample_rate_hz=RATE_HZ, harmonics=ODD)
+    frf = frf_of_record(Spectrum.of(u[None], y[None]), sample_rate_hz=RATE_HZ, harmonics=ODD)
     frf = replace(frf, g=np.random.default_rng(1).standard_normal(ODD.size) + 0j)
     lost = Poles(status=PolesStatus.NOT_CONVERGED, message="the iterations found no minimum")
     poles = estimator.second_attempt(lost, frf, BAND_HZ, ModelStructure(2, 2))

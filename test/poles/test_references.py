@@ -8,8 +8,9 @@ import pytest
 import scipy.io
 from scipy import stats
 
-from tactile_resonance.frf.estimate import estimate_frf
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_poles,
@@ -81,8 +82,8 @@ def silverbox_records(shared_data):
 
 @pytest.fixture(scope="module")
 def silverbox(silverbox_records):
-    return estimate_frf(
-        *silverbox_records, sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2)
+    return frf_of_record(
+        Spectrum.of(*silverbox_records), sample_rate_hz=1e7 / 2**14, harmonics=np.arange(1, 2684, 2)
     )
 
 
