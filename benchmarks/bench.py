@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -19,15 +20,15 @@ import scipy.fft
 import scipy.signal
 
 from tactile_resonance.multisine import Excitation, design_multisine
-from tactile_resonance.simulation.acquisition import BenchEffects
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.contact_history import ContactHistory
-from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.linear import Lines, sample_period
-from tactile_resonance.simulation.nonlinear import NonlinearStream, nonlinear_steady_state
-from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.tip import SprungIndenter
+from tactile_resonance.simulation.plant.tip import SprungIndenter
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.changing_contact import ContactHistory
+from tactile_resonance.simulation.sensor.linear import Lines, sample_period
+from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream, nonlinear_steady_state
+from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -96,7 +97,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         return scipy.fft.rfft(u), scipy.fft.rfft(y)
 
     def creep() -> object:
-        run = setup.bench.start_varying(setup.creep, effects=IDEAL)
+        run = setup.bench.start_varying(partial(setup.creep.coupled_at, setup.bench.sensor), effects=IDEAL)
         return run.block(setup.excitation, PERIODS)
 
     def lsim() -> object:

@@ -17,14 +17,14 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.contact_bench import ContactBench
-from tactile_resonance.simulation.indenter import Ball, Indenter
-from tactile_resonance.simulation.surfaces import FlatSurface, PlantSurface
-from tactile_resonance.simulation.tip import Tip
-from tactile_resonance.simulation.tissue import Tissue
-from tactile_resonance.simulation.tracking import TrackingParameters
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.surfaces import FlatSurface, PlantSurface
+from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
+from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03
 TOOL = {

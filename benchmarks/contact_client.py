@@ -18,7 +18,7 @@ from tactile_resonance import msg
 from tactile_resonance.nodes.client import HANGS_S, NodeClient
 from tactile_resonance.nodes.running import SERIES
 from tactile_resonance.recording.messages import time_from_message
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 TURN = Rotation.from_rotvec(TABLE_IN_BASE[3:]).as_quat().tolist()
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.processor import fft_s, loop_s
 from tactile_resonance.configuration import share_path
 from tactile_resonance.processes import free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import PRIORITY
+from tactile_resonance.simulation.plant.defaults import PRIORITY
 
 if TYPE_CHECKING:
     from benchmarks.live_bench import LiveScan, Shares

@@ -26,7 +26,7 @@ from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.hands import NodeAway
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -13,9 +13,9 @@ from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_P
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.simulation.acquisition import BenchEffects
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 TISSUES = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver")
 PERIODS = 8

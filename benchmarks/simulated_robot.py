@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tactile_resonance.processes import end_with_parent
-from tactile_resonance.simulation.plant_defaults import READY
+from tactile_resonance.simulation.plant.defaults import READY
 
 START_WITHIN_S = 60.0
 

@@ -17,13 +17,13 @@ from tqdm import tqdm
 from benchmarks.lock_in_touch import ScatterTouch, lock_in
 from tactile_resonance.contact.estimator import TouchDetector
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
-from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.linear import Lines
-from tactile_resonance.simulation.response import ResponseStream
-from tactile_resonance.simulation.tip import SprungIndenter
+from tactile_resonance.simulation.plant.tip import SprungIndenter
+from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.linear import Lines
+from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 FloatArray = NDArray[np.float64]
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -33,10 +34,10 @@ from tactile_resonance.poles.result import (
     natural_frequency_and_damping,
 )
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.simulation.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
-from tactile_resonance.simulation.contact_history import ContactHistory, pole_trajectory
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.linear import Lines
+from tactile_resonance.simulation.sensor.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.changing_contact import ContactHistory, pole_trajectory
+from tactile_resonance.simulation.sensor.linear import Lines
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -270,7 +271,8 @@ def _creep_row(name: str, blocks: int, count: int) -> str:
     middle = {"force_n": CREEP_FORCE_N, "hold_time_s": HELD_FROM_S + length_s / 2}
     found, constant = [], []
     for seed in range(count):
-        found.append(_poles_of(bench.start_varying(history, seed=seed), blocks, seed))
+        creeping = bench.start_varying(partial(history.coupled_at, bench.sensor), seed=seed)
+        found.append(_poles_of(creeping, blocks, seed))
         constant.append(_poles_of(bench.start(tissue, seed=seed, **middle), blocks, seed))
     errors, rates, inside, instants = [], [], [], []
     for poles in found:

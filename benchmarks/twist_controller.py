@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_resonance.contact.samples import CellSample, Pose
-from tactile_resonance.simulation.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
 
 
 class TwistController:

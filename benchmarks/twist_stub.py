@@ -21,12 +21,12 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.beam import sensor_modes
-from tactile_resonance.simulation.contact_bench import ContactBench
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.surfaces import FlatSurface
-from tactile_resonance.simulation.tip import Tip
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
+from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 COMMAND_TOPIC, POSE_TOPIC, WRENCH_TOPIC = "twist_commands", "tool_pose", "tool_wrench"
 CLEAR_M = 0.02

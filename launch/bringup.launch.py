@@ -21,7 +21,7 @@ from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from launch import LaunchDescription
 from tactile_resonance.bringup import plan_bringup, read_parameter_file
 from tactile_resonance.processes import may_take_priority
-from tactile_resonance.simulation.plant_defaults import PRIORITY
+from tactile_resonance.simulation.plant.defaults import PRIORITY
 
 PACKAGE = "tactile_resonance"
 DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"

@@ -18,7 +18,7 @@ import yaml
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import numbers, read_text, require
 from tactile_resonance.scan.table_file import read_table
-from tactile_resonance.simulation.plant_defaults import HOST, STALLS_S, TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import HOST, STALLS_S, TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
 
 NODES = (

@@ -18,9 +18,9 @@ from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.fields import LONGEST
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.scene import read_scene
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.strict_yaml import dump_yaml, parse_yaml
 
 LIBRARY = read_tissues()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant_defaults import HOST, PRIORITY
+from tactile_resonance.simulation.plant.defaults import HOST, PRIORITY
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan

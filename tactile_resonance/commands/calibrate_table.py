@@ -16,7 +16,7 @@ import numpy as np
 from tactile_resonance.commands.bench_scan import Job, node_parameters, require_packages
 from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses, free_domain_id
-from tactile_resonance.simulation.plant_defaults import HOST, TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import HOST, TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
 
 if TYPE_CHECKING:

@@ -49,9 +49,9 @@ def _simulation(output: Path) -> None:
     from tactile_resonance.report import simulation_figures
     from tactile_resonance.report.drawing import save_figure
     from tactile_resonance.scan.scene import read_scan_scene
-    from tactile_resonance.simulation.bench import SimulatedBench
-    from tactile_resonance.simulation.library import read_tissues
-    from tactile_resonance.simulation.scene import read_scene
+    from tactile_resonance.simulation.sensor.bench import SimulatedBench
+    from tactile_resonance.simulation.tissue.library import read_tissues
+    from tactile_resonance.simulation.tissue.scene import read_scene
 
     bench, library = SimulatedBench.from_configuration(), read_tissues()
     path = share_path("config/scenes/inclusion.yaml")
@@ -76,7 +76,7 @@ def _distortion(output: Path) -> None:
     from tactile_resonance.frf.spectra import Spectrum
     from tactile_resonance.report.distortion_figure import draw_distortion, draw_distortion_levels
     from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.simulation.experiments import records_at_levels
+    from tactile_resonance.simulation.sensor.experiments import records_at_levels
 
     cases = {
         level_v: estimate_distortion(Spectrum.of(u, y), sample_rate_hz=rate_hz, harmonics=harmonics)
@@ -102,7 +102,7 @@ def _variance(output: Path) -> None:
     from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.report.variance_figure import draw_variance
-    from tactile_resonance.simulation.experiments import repeated_records
+    from tactile_resonance.simulation.sensor.experiments import repeated_records
 
     u, y, harmonics, rate_hz = repeated_records(progress=_progress)
     lines = Spectrum.of(u, y).by_period[..., harmonics]  # (..., 2, P, F)

@@ -13,11 +13,16 @@ from pathlib import Path
 
 from tactile_resonance.commands.simulate_ur import require_loopback
 from tactile_resonance.fields import number
-from tactile_resonance.simulation.bench_time import BenchTime
-from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.robot.reactor import Reactor
-from tactile_resonance.simulation.tcp_bus import Receiver, SlcanServer, SocketcandServer, TcpBus
-from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.cell.load_cell import LoadCell
+from tactile_resonance.simulation.cell.tcp_bus import (
+    Receiver,
+    SlcanServer,
+    SocketcandServer,
+    TcpBus,
+)
+from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 BUSES: dict[str, Callable[[Reactor, int, Receiver], TcpBus]] = {
     "socketcand": SocketcandServer,

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.processes import take_priority
-from tactile_resonance.simulation.plant_defaults import CAN_PORT, READY, TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import CAN_PORT, READY, TABLE_IN_BASE
 
 if TYPE_CHECKING:
-    from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+    from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 
 
 BENCH_DEFAULTS = {
@@ -92,10 +92,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve until SIGINT or SIGTERM, then report how well the pace was kept."""
     _check(options)
-    from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
-    from tactile_resonance.simulation.robot.controller import ControllerConfig, UrController
-    from tactile_resonance.simulation.robot.machine import MachineConfig
-    from tactile_resonance.simulation.robot.simulated_robot import SimulatedRobot
+    from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
+    from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
+    from tactile_resonance.simulation.ur5e.controller import ControllerConfig, UrController
+    from tactile_resonance.simulation.ur5e.machine import MachineConfig
 
     nothing = options.tissue is None and options.scene is None
     bench = None if nothing else _Bench(options)
@@ -137,9 +137,9 @@ class _Bench:
         from tactile_resonance.contact.interfaces import Mount
         from tactile_resonance.contact.samples import Pose
         from tactile_resonance.sensor import read_sensor
-        from tactile_resonance.simulation.library import read_tissues
-        from tactile_resonance.simulation.plant_process import BenchSetup, LaidScene, Tabletop
-        from tactile_resonance.simulation.scene import read_scene
+        from tactile_resonance.simulation.plant.tabletop import BenchSetup, LaidScene, Tabletop
+        from tactile_resonance.simulation.tissue.library import read_tissues
+        from tactile_resonance.simulation.tissue.scene import read_scene
 
         library = read_tissues()
         laid = None
@@ -158,10 +158,10 @@ class _Bench:
 
     def attach(self, robot: SimulatedRobot) -> None:
         """Serve the cell's bus and take orders for both at the robot's control port."""
-        from tactile_resonance.simulation.load_cell import LoadCell
-        from tactile_resonance.simulation.plant_process import CellOnBus, attach
-        from tactile_resonance.simulation.tcp_bus import SocketcandServer
-        from tactile_resonance.simulation.transducer import CellParameters
+        from tactile_resonance.simulation.cell.load_cell import LoadCell
+        from tactile_resonance.simulation.cell.tcp_bus import SocketcandServer
+        from tactile_resonance.simulation.cell.transducer import CellParameters
+        from tactile_resonance.simulation.plant.tabletop import CellOnBus, attach
 
         options = self._options
         cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed + 1)

@@ -15,9 +15,9 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.record import Channel, Origin, Record
-from tactile_resonance.simulation.acquisition import Block, ChannelSamples
-from tactile_resonance.simulation.bench_time import BenchTime
-from tactile_resonance.simulation.robot.reactor import Reactor
+from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.sensor.acquisition import Block, ChannelSamples
+from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 STEP_NS = 2_000_000
 CLOCK_S = 0.04

@@ -24,13 +24,13 @@ from tactile_resonance.nodes.simulated_tip import SimulatedTip
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import truth_to_response
 from tactile_resonance.recording.messages import excitation_from_message
-from tactile_resonance.simulation.acquisition import BenchEffects
-from tactile_resonance.simulation.bench import BenchRun, SimulatedBench
-from tactile_resonance.simulation.bimorph import truth_of
-from tactile_resonance.simulation.contact_so_far import BenchTip, ContactSoFar
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.scene import read_scene
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import truth_of
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactSoFar
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
@@ -204,7 +204,7 @@ class FakeHardwareNode(ManagedNode):
     ) -> BenchRun:
         """A run from rest; the nonlinearity takes the contact as fixed."""
         if so_far is not None and not effects.nonlinearity:
-            return self._bench.start_following(so_far.coupled_at, seed=seed, effects=effects)
+            return self._bench.start_varying(so_far.coupled_at, seed=seed, effects=effects)
         return self._bench.start(
             tip.tissue,
             force_n=tip.force_n or None,

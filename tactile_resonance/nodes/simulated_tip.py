@@ -18,11 +18,11 @@ from tactile_resonance.nodes.running import PLACES, STREAM
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import TruthTopic
 from tactile_resonance.record import Contact
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.contact_so_far import BenchTip, ContactState, parts_of
-from tactile_resonance.simulation.plant_process import LaidScene
-from tactile_resonance.simulation.response import INTERVAL_S
-from tactile_resonance.simulation.scene import PhantomScene
+from tactile_resonance.simulation.plant.tabletop import LaidScene
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState, parts_of
+from tactile_resonance.simulation.sensor.response import INTERVAL_S
+from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
 
 PLANT_CHECK_S = 0.5

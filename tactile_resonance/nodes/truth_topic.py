@@ -23,9 +23,9 @@ from tactile_resonance.recording.messages import (
     fill_complex,
     time_from_message,
 )
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bimorph import CoupledBimorph, Truth
-from tactile_resonance.simulation.contact_so_far import BenchTip
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, Truth
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from tactile_resonance.srv import Truth as TruthService
 
 

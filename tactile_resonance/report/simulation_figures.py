@@ -10,21 +10,21 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from tactile_resonance.report.drawing import SIMULATED, new_figure
-from tactile_resonance.simulation.beam import mode_shape, sensor_modes
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.contact_history import (
+from tactile_resonance.simulation.plant.tip import SprungIndenter
+from tactile_resonance.simulation.sensor.beam import mode_shape, sensor_modes
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.changing_contact import (
     ContactHistory,
     Indentation,
     indent,
     pole_trajectory,
 )
-from tactile_resonance.simulation.experiments import truth_map
-from tactile_resonance.simulation.indenter import Indenter
-from tactile_resonance.simulation.library import TissueLibrary
-from tactile_resonance.simulation.scene import PhantomScene
-from tactile_resonance.simulation.shapes import Sphere
-from tactile_resonance.simulation.tip import SprungIndenter
-from tactile_resonance.simulation.tissue import Tissue
+from tactile_resonance.simulation.sensor.experiments import truth_map
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.library import TissueLibrary
+from tactile_resonance.simulation.tissue.scene import PhantomScene
+from tactile_resonance.simulation.tissue.shapes import Sphere
 
 FloatArray = npt.NDArray[np.float64]
 

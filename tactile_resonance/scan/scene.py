@@ -2,7 +2,7 @@
 """A scan's scene: what is on the table and what is wanted from it.
 
 The same file may hold ``regions``, what is ``buried`` and the ``motion`` of the surface, which the simulated
-bench reads (`tactile_resonance.simulation.scene`) and a scan does not need.
+bench reads (`tactile_resonance.simulation.tissue.scene`) and a scan does not need.
 """
 
 from __future__ import annotations

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated hardware: the bimorph sensor, the tissue it touches, and the bench around them.
 
-From the outside in: `bench` (blocks of samples), `scene` (what lies where), `library` (tissues),
-`bimorph` (poles, zeros and response of the coupled sensor), `response` and `nonlinear` (its time
-domain), `tissue` and `beam` (the physics), `indenter` (force against depth through time).
-`plant` and `robot` are what a tip moves on; `plant_process` puts them on ports, `contact_bench` in
-virtual time. Nothing simulated here is a measurement; sources of the parameters stand in ``config/``.
+`sensor/`: `bench` (blocks of samples), `bimorph` and `beam` (poles, zeros and response of the coupled sensor),
+`response` and `nonlinear` (its time domain), `changing_contact`.
+`tissue/`: `scene` (what lies where), `library`, `materials`, `shapes`, `hertz` (the contact that a small
+vibration sees), `indenter` (force against depth through time).
+`ur5e/`: the robot and its controller, which know nothing of the rest; `cell/`: the load cell and its buses.
+`plant/`: tip, tissue and cell on one clock; `contact_bench` moves them in virtual time, `tabletop` and
+`simulated_robot` on the ports of real devices, in the time of `bench_time`.
+
+Nothing simulated here is a measurement; sources of the parameters stand in ``config/``.
 """

@@ -14,7 +14,7 @@ from tactile_resonance.contact.interfaces import ArmFault
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, SOFT, contact, lower, started, stiffer

@@ -22,7 +22,8 @@ from tactile_resonance.contact.moving_surface import SPEED_STD_M_S
 from tactile_resonance.contact.observer import ArmModel
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.tracking import TipMotion, TrackingParameters
+from tactile_resonance.simulation.plant.tip_motion import TipMotion
+from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 NOISE_N, DT = 1e-3, 0.002
 

@@ -21,9 +21,9 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.contact_bench import DISH_KG
-from tactile_resonance.simulation.tracking import TrackingParameters
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
+from tactile_resonance.simulation.plant.contact_bench import DISH_KG
+from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, lower, started, stiffer

@@ -17,8 +17,8 @@ from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.simulation.surfaces import FlatSurface
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, SOFT, stiffer

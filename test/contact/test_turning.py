@@ -19,9 +19,9 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.tip_path import MARGIN_M, PASSED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.simulation.contact_bench import ContactBench
-from tactile_resonance.simulation.surfaces import FlatSurface, RoundSurface
-from tactile_resonance.simulation.tip import Tip
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface
+from tactile_resonance.simulation.plant.tip import Tip
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT

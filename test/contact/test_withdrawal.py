@@ -11,9 +11,8 @@ import pytest
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.simulation.obstacles import Clinging
-from tactile_resonance.simulation.surfaces import FlatSurface
-from tactile_resonance.simulation.tip import RigidTip
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
+from tactile_resonance.simulation.plant.tip import Clinging, RigidTip
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, RADIUS_M, SOFT, contact, started, stiffer

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.simulation.bench_time import BenchTime
-from tactile_resonance.simulation.load_cell import LoadCell
-from tactile_resonance.simulation.robot.reactor import Reactor
-from tactile_resonance.simulation.tcp_bus import SocketcandServer
-from tactile_resonance.simulation.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.cell.load_cell import LoadCell
+from tactile_resonance.simulation.cell.tcp_bus import SocketcandServer
+from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 HOST = "127.0.6.4"
 STEP_NS = round(SAMPLE_PERIOD_S * 1e9)

@@ -25,7 +25,7 @@ from cell_bench import HOST, STEP_NS, CellBench, cell_config  # noqa: E402
 
 from tactile_resonance.drivers import can_wrench  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
-from tactile_resonance.simulation.tcp_bus import QUIET_S  # noqa: E402
+from tactile_resonance.simulation.cell.tcp_bus import QUIET_S  # noqa: E402
 
 PATIENCE_S = 60.0
 SHORTEST_DELAY_S = 1e-4  # of config/force/can_simulated.yaml: taken off every stamp

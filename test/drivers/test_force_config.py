@@ -10,7 +10,7 @@ import yaml
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
 
 
 def test_the_simulated_cell_serves_1_cn():

@@ -10,7 +10,7 @@ import pytest
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.force_sources import force_source
-from tactile_resonance.simulation.transducer import CellParameters
+from tactile_resonance.simulation.cell.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 

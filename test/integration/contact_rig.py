@@ -28,7 +28,7 @@ from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses, end_with_parent
-from tactile_resonance.simulation.plant_defaults import READY, TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import READY, TABLE_IN_BASE
 
 HOST = own_host(13)
 STEP_S = 0.002

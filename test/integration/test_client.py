@@ -18,7 +18,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 EXAMPLE = DOCS / "examples" / "scan_client.py"

@@ -25,10 +25,10 @@ from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.report.run_report import read_silent
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bimorph import truth_of
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import truth_of
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 SCENE = """
 name: three points

@@ -27,7 +27,7 @@ from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_node import ScanNode
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 POLICY = share_path("config/security/policy.xml")
 INCLUDE = "{http://www.w3.org/2001/XInclude}include"

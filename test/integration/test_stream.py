@@ -22,8 +22,8 @@ from tactile_resonance.recording.messages import (
     poles_from_message,
     record_from_message,
 )
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 TIME = own_time(14)

@@ -19,7 +19,7 @@ from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "scan_node")
 SCENE = """

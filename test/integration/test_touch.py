@@ -18,7 +18,7 @@ from tactile_resonance.nodes.client import HANGS_S
 from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 SURFACE = """surface:
   touch: {points_m: [[-0.01, -0.01], [0.01, -0.01], [0.01, 0.01], [-0.01, 0.01]], form: plane}

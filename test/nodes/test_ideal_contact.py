@@ -32,10 +32,10 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import STREAM, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.contact_so_far import BenchTip
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant_process import LaidScene
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.tabletop import LaidScene
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 
 SECOND_NS = 10**9
 WITHIN_S = 60.0

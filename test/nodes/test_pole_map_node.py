@@ -28,9 +28,9 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.point_result import PointKind, PointOutcome
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, shares
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.plant_defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
 from test.spinning import spin_until
 
 NUMPY = {PointField.FLOAT32: "<f4", PointField.UINT8: "u1"}

@@ -25,7 +25,7 @@ from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.recorded import file_of
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.simulation.contact_so_far import BenchTip
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from test.spinning import spin_until
 
 KEY, TRUTHS = 7, 12

@@ -13,10 +13,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.truth_topic import TruthTopic
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.bimorph import truth_of
-from tactile_resonance.simulation.contact_so_far import BenchTip
-from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import truth_of
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip
+from tactile_resonance.simulation.tissue.library import read_tissues
 
 
 def test_truth_of_a_contact_that_changes_is_its_mean():

@@ -13,9 +13,9 @@ from tactile_resonance.scan.point_outcome import measured_result
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.run_start import run_facts
 from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.scene import read_scene
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import read_scene
 
 START_NS = 1_700_000_000_000_000_000
 AGE_S = 1.0  # of contacts of the bench that do not creep

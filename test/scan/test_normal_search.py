@@ -21,9 +21,9 @@ from tactile_resonance.scan.plan import make_plan, plan_with, tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
-from tactile_resonance.simulation.contact_bench import ContactBench
-from tactile_resonance.simulation.surfaces import RoundSurface
-from tactile_resonance.simulation.tip import Tip
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.surfaces import RoundSurface
+from tactile_resonance.simulation.plant.tip import Tip
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT

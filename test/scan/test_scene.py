@@ -9,9 +9,9 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import Hold, OnFailure, Output, read_scan_scene
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
-from tactile_resonance.simulation.scene import read_scene
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.tissue.classify import classify
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.sensor import SensorParameters, read_sensor
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import TissueLibrary, read_tissues
-from tactile_resonance.simulation.linear import Lines
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.linear import Lines
+from tactile_resonance.simulation.tissue.library import TissueLibrary, read_tissues
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,8 @@ import pytest
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.simulation.bench import SimulatedBench
-from tactile_resonance.simulation.library import read_tissues
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.tissue.classify import UNKNOWN, classify
 from tactile_resonance.tissue.nominal_contact import (
     ContactLoad,

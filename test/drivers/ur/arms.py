@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError
-from tactile_resonance.simulation.robot.target import CYCLE_S
+from tactile_resonance.simulation.ur5e.target import CYCLE_S
 
 DOWN = np.array([0.0, 0.0, -0.005, 0.0, 0.0, 0.0])
 UP = -DOWN

@@ -15,7 +15,7 @@ from tactile_resonance.clock import PORT
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.processes import end_with_parent
-from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
+from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 sys.path.insert(0, str(Path(__file__).parent))
 from arms import ACCELERATION_M_S2, LAG_S, UP, connect_again, keep, keep_for

@@ -8,8 +8,8 @@ import time
 import pytest
 
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
-from tactile_resonance.simulation.robot.control_port import PORT
+from tactile_resonance.simulation.plant.control_port import PORT
+from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_resonance.simulation.robot.rtde_server import Kind, Layout, PacketReader, packet
+from tactile_resonance.simulation.ur5e.rtde_server import Kind, Layout, PacketReader, packet
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 VALUES = {

@@ -24,7 +24,7 @@ from tactile_resonance.drivers.ur_exchange import (
 from tactile_resonance.drivers.ur_motion import REST, UrMotion
 from tactile_resonance.drivers.ur_safety import motion_fault
 from tactile_resonance.drivers.ur_states import StateReader
-from tactile_resonance.simulation.plant_process import TIP_IN_FLANGE
+from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 
 @pytest.fixture

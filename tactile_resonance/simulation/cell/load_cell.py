@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A load cell on CAN that speaks as those of Robotous do.
+
+Source: Robotous, Force/Torque Sensor RFT Series, CAN manual, revision 1.7. Identifiers have 11 bits. A
+command is one frame; a response 16 bytes in two frames, called D1 to D16 as in the manual, whose first
+byte repeats the command. A wrench is such a response.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from operator import sub
+from typing import NamedTuple
+
+from tactile_resonance.simulation.cell.transducer import (
+    SAMPLE_PERIOD_S,
+    CellFaults,
+    CellParameters,
+    Transducer,
+)
+from tactile_resonance.simulation.noise import Seed
+
+READ_MODEL, READ_SERIAL, READ_FIRMWARE = 0x01, 0x02, 0x03
+SET_IDS, READ_IDS = 0x04, 0x05
+SET_FILTER, READ_FILTER = 0x08, 0x09
+READ_ONCE, START, STOP = 0x0A, 0x0B, 0x0C
+SET_RATE, READ_RATE = 0x0F, 0x10
+SET_BIAS, READ_OVERLOADS = 0x11, 0x12
+
+RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
+FILTERS_HZ = (0, 500, 300, 200, 150, 100, 50, 40, 30, 20, 10, 5, 3, 2, 1)
+UNSUPPORTED, OUT_OF_RANGE = 1, 2
+WHILE_STREAMING = (STOP, SET_BIAS)
+
+
+class CanFrame(NamedTuple):
+    """One frame on the bus: when it was sent (plant's clock) [s], identifier, up to 8 bytes."""
+
+    time_s: float
+    can_id: int
+    data: bytes
+
+
+class LoadCell:
+    """The cell, moved by whoever steps it.
+
+    Parameters
+    ----------
+    parameters : CellParameters
+    seed : int
+        Of its noise.
+    command_id : int
+        Identifier of the frames that it takes.
+    response_ids : tuple of 2 int
+        Identifiers of the frames that it sends.
+
+    Attributes
+    ----------
+    faults : CellFaults
+        May be set at any time.
+    streaming : bool
+    rate_hz : float
+        Wrenches a second while it streams; 200 after power-up.
+    """
+
+    def __init__(
+        self,
+        parameters: CellParameters,
+        seed: Seed = 1,
+        command_id: int = 0x64,
+        response_ids: tuple[int, int] = (0x001, 0x002),
+    ) -> None:
+        self._transducer = Transducer(parameters, seed)
+        self._model = parameters.name
+        self.command_id, self.response_ids = command_id, response_ids
+        self._next_ids = (command_id, *response_ids)
+        self.streaming = False
+        self._rate_code = self._filter_code = 0
+        self._decimation = _decimation(0)
+        self._time_s: float | None = None
+        self._ticks = self._sent = 0
+        self._wrench = [0.0] * 6
+        self._counts, self._bits = [0] * 6, 0
+
+    @property
+    def faults(self) -> CellFaults:
+        """What is wrong with it at present."""
+        return self._transducer.faults
+
+    @property
+    def rate_hz(self) -> float:
+        """Wrenches a second while it streams."""
+        return 1 / (self._decimation * SAMPLE_PERIOD_S)
+
+    def reseed(self, seed: Seed) -> None:
+        """Take all noise from the next conversion on from a seed, whatever was drawn before."""
+        self._transducer.reseed(seed)
+
+    def step(self, wrench: Iterable[float], time_s: float) -> list[CanFrame]:
+        """Advance to a time of the plant, at which `wrench`, 6 [N, N m], acts on the cell.
+
+        Between two calls the wrench runs linearly.
+
+        Returns
+        -------
+        list of CanFrame
+            Sent meanwhile, oldest first.
+        """
+        load = list(map(float, wrench))
+        if self._time_s is None:
+            self._time_s, self._wrench = time_s, load
+        span = time_s - self._time_s
+        change = list(map(sub, load, self._wrench))
+        frames: list[CanFrame] = []
+        period = SAMPLE_PERIOD_S
+        start_s = self._time_s
+        while self._time_s + period <= time_s + 1e-9:
+            self._time_s += period
+            part = (self._time_s - start_s) / span
+            now = [old + part * way for old, way in zip(self._wrench, change, strict=True)]
+            self._counts, self._bits = self._transducer.convert(now)
+            self._ticks += 1
+            if self.streaming and self._ticks % self._decimation == 0:
+                frames += self._wrench_frames(START, self._time_s)
+        # what is left of the span counts for the next call
+        left = (time_s - self._time_s) / span if span > 0 else 0.0
+        self._wrench = [new - left * way for new, way in zip(load, change, strict=True)]
+        return frames
+
+    def receive(self, can_id: int, data: bytes) -> list[CanFrame]:
+        """Take one frame from the bus; return the answer, empty where the cell gives none."""
+        if can_id != self.command_id or not data or self.faults.silent:
+            return []
+        command = data[0]
+        if self.streaming and command not in WHILE_STREAMING:
+            return []
+        parameters = [*data[1:], *[0] * 7]
+        if command == START:
+            self.streaming, self._ticks = True, 0
+            return []
+        if command == STOP:
+            self.streaming = False
+            return []
+        if command == SET_BIAS:
+            self._transducer.set_zero(bool(parameters[0]))
+            return []
+        if command == READ_ONCE:
+            return self._wrench_frames(READ_ONCE, self._time_s or 0.0)
+        return self._frames(bytes([command, *self._answer(command, parameters)]))
+
+    def _answer(self, command: int, parameters: list[int]) -> bytes:
+        """D2 onwards."""
+        if command in (READ_MODEL, READ_SERIAL, READ_FIRMWARE):
+            texts = {READ_MODEL: self._model, READ_SERIAL: "SIMULATED", READ_FIRMWARE: "1.7"}
+            return texts[command].encode("ascii", "replace")[:15]
+        if command == SET_IDS:
+            good = all(0 < i < 0x100 for i in parameters[:3]) and len(set(parameters[:3])) == 3
+            if good:  # valid from the next power-up
+                self._next_ids = (parameters[0], parameters[1], parameters[2])
+            return _result(good)
+        if command == READ_IDS:
+            return bytes([self.command_id, *self.response_ids, *self._next_ids])
+        if command == SET_FILTER:
+            kind, code = parameters[:2]
+            good = kind in (0, 1) and code < len(FILTERS_HZ)
+            if good:
+                self._filter_code = code if kind else 0
+                self._transducer.cutoff_hz = FILTERS_HZ[self._filter_code]
+            return _result(good)
+        if command == READ_FILTER:
+            return bytes([1 if self._filter_code else 0, self._filter_code])
+        if command == SET_RATE:
+            good = parameters[0] < len(RATES_HZ)
+            if good:
+                self._rate_code = parameters[0]
+                self._decimation = _decimation(self._rate_code)
+            return _result(good)
+        if command == READ_RATE:
+            return bytes([self._rate_code])
+        if command == READ_OVERLOADS:
+            return bytes(min(255, count) for count in self._transducer.overload_counts)
+        return bytes([0, UNSUPPORTED])
+
+    def _wrench_frames(self, command: int, time_s: float) -> list[CanFrame]:
+        if self.faults.silent:
+            return []
+        self._sent += 1
+        frames = self._frames(struct.pack(">B6hB", command, *self._counts, self._bits), time_s)
+        every = self.faults.lose_second_every
+        return frames[:1] if every and self._sent % every == 0 else frames
+
+    def _frames(self, response: bytes, time_s: float | None = None) -> list[CanFrame]:
+        whole = response.ljust(16, b"\0")
+        at = self._time_s or 0.0 if time_s is None else time_s
+        first, second = self.response_ids
+        return [CanFrame(at, first, whole[:8]), CanFrame(at, second, whole[8:])]
+
+
+def _decimation(rate_code: int) -> int:
+    """Conversions from one wrench that is sent to the next."""
+    return round(1 / (RATES_HZ[rate_code] * SAMPLE_PERIOD_S))
+
+
+def _result(good: bool) -> bytes:
+    return bytes([1, 0]) if good else bytes([0, OUT_OF_RANGE])

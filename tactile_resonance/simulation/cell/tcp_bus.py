@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CAN buses over TCP, each with any number of clients: as socketcand and as serial adapters (slcan) serve them.
+
+For machines without a kernel CAN. socketcand in its raw mode (https://github.com/linux-can/socketcand,
+doc/protocol.md): only what clients of a raw bus need, ``open``, ``rawmode``, ``send``, ``frame`` and ``echo``.
+slcan, at ``socket://host:port`` for pyserial: commands of Lawicel's CAN232 (manual, version 3), ``Sn``, ``O``,
+``L``, ``C``, ``tiiildd..``, ``V``, ``N``; each ends with CR and is answered with CR, or BELL where it fails.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+
+from tactile_resonance.simulation.cell.load_cell import CanFrame
+from tactile_resonance.simulation.plant.bench_time import STALL_S
+from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
+
+LONGEST_QUEUE = 1 << 20
+"""Bytes that a client may leave unread before it is dropped."""
+
+Receiver = Callable[[int, bytes], Iterable[CanFrame]]
+"""Takes identifier and data of a frame of the bus; returns those that answer it."""
+
+
+class BusClient(MessageService):
+    """One connection.
+
+    Attributes
+    ----------
+    listens_from_s : float or None
+        From when on it gets the bus's frames (monotonic clock); None: not yet.
+    frames : int
+        Of the bus, sent to it.
+    """
+
+    def __init__(self, bus: TcpBus, connection: Connection) -> None:
+        super().__init__(connection)
+        self._bus = bus
+        self.listens_from_s: float | None = None
+        self.frames = 0
+
+    def closed(self) -> None:
+        """It has gone."""
+        self._bus.clients.discard(self)
+
+
+class TcpBus(ABC):
+    """One bus, any number of clients.
+
+    Parameters
+    ----------
+    reactor : Reactor
+        Whose port it becomes.
+    port : int
+        0: a free one, to be found in `port`.
+    receiver : callable
+        The cell.
+
+    Attributes
+    ----------
+    port : int
+    epoch_s : float
+        Time [s] at time 0 of the frames: they are stamped with the sum. To be set by whoever owns the plant's
+        clock.
+    clients : set of BusClient
+
+    Raises
+    ------
+    ValueError
+        Where the port cannot be had.
+    """
+
+    def __init__(self, reactor: Reactor, port: int, receiver: Receiver) -> None:
+        self.epoch_s = 0.0
+        self.clients: set[BusClient] = set()
+        self._receiver = receiver
+        self.port = reactor.listen(port, self._serve, freezable=False, most_unsent=LONGEST_QUEUE)
+
+    @abstractmethod
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
+
+    @abstractmethod
+    def text_of(self, frame: CanFrame) -> bytes:
+        """A frame of the bus as clients read it."""
+
+    def take(self, can_id: int, data: bytes) -> None:
+        """Hand a client's frame to the cell, and its answer to all."""
+        self.send(self._receiver(can_id, data))
+
+    def send(self, frames: Iterable[CanFrame]) -> None:
+        """Hand frames of the bus to every client that listens."""
+        now_s = time.monotonic()
+        listening = [
+            client
+            for client in self.clients
+            if client.listens_from_s is not None and client.listens_from_s <= now_s
+        ]
+        texts = [self.text_of(frame) for frame in frames] if listening else []
+        if not texts:
+            return
+        text = b"".join(texts)
+        for client in listening:
+            client.frames += len(texts)
+            client.connection.send(text)
+
+    def keep_epoch(self, machine_s: float, plant_s: float) -> None:
+        """Stamp frames on the plant's clock, never ahead of this machine's; anew after a stall [s]."""
+        ahead_s = machine_s - plant_s
+        if not self.epoch_s <= ahead_s <= self.epoch_s + STALL_S:
+            self.epoch_s = ahead_s
+
+    def frames_sent(self, port: int) -> int:
+        """Frames of the bus that were sent to a client's port."""
+        return max((c.frames for c in self.clients if c.connection.peer_port == port), default=0)
+
+    def drop_clients(self) -> None:
+        """Close every connection, as a server that dies does; new clients are served again."""
+        for client in list(self.clients):
+            client.connection.close()
+
+    def _serve(self, connection: Connection) -> BusClient:
+        client = self.client(connection)
+        self.clients.add(client)
+        return client
+
+
+MOST_EXTENDED = 0x1FFFFFFF
+"""Largest identifier of 29 bits."""
+_HEXADECIMAL = re.compile("[0-9A-Fa-f]{1,8}")
+QUIET_S = 0.05
+"""Clients read their last `ok` in one piece: no frame follows it for this long, or until they speak."""
+
+
+class SocketcandServer(TcpBus):
+    """The bus `channel`; see `TcpBus`."""
+
+    def __init__(
+        self, reactor: Reactor, port: int, receiver: Receiver, channel: str = "can0"
+    ) -> None:
+        super().__init__(reactor, port, receiver)
+        self.channel = channel
+
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
+        return _SocketcandClient(self, connection)
+
+    def text_of(self, frame: CanFrame) -> bytes:
+        """A frame of the bus as clients read it."""
+        stamp = self.epoch_s + frame.time_s
+        return b"< frame %03X %.6f %s >" % (frame.can_id, stamp, frame.data.hex().upper().encode())
+
+
+class _SocketcandClient(BusClient):
+    END = b">"
+
+    def __init__(self, bus: SocketcandServer, connection: Connection) -> None:
+        super().__init__(bus, connection)
+        self._server = bus
+        self.connection.send(b"< hi >")
+
+    def understand(self, message: bytes) -> None:
+        """Execute one message."""
+        words = message.strip(b"< \r\n").decode("ascii", "replace").split()
+        if not words:
+            return
+        if words[0] == "send" and self.listens_from_s is not None:
+            frame = _socketcand_frame(words[1:])
+            if frame is None:
+                self.connection.send(b"< error syntax of send >")
+                return
+            self.listens_from_s = time.monotonic()
+            self._server.take(*frame)
+        elif words[0] == "open" and words[1:] != [self._server.channel]:
+            self.connection.send(b"< error could not open bus >")
+        elif words[0] in ("open", "rawmode"):
+            self.connection.send(b"< ok >")
+            if words[0] == "rawmode":
+                self.listens_from_s = time.monotonic() + QUIET_S
+        elif words[0] == "echo":
+            self.connection.send(b"< echo >")
+        else:
+            self.connection.send(b"< error unknown command >")
+
+
+def _socketcand_frame(words: list[str]) -> tuple[int, bytes] | None:
+    """Identifier and data of ``send``: identifier, length, bytes, all hexadecimal; None where they disagree."""
+    if len(words) < 2 or not all(_HEXADECIMAL.fullmatch(word) for word in words):
+        return None
+    can_id, length, *data = (int(word, 16) for word in words)
+    if can_id > MOST_EXTENDED or len(data) != length or length > 8 or any(b > 255 for b in data):
+        return None
+    return can_id, bytes(data)
+
+
+OK, FAILED = b"\r", b"\a"
+_FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
+
+
+class SlcanServer(TcpBus):
+    """See `TcpBus`. Frames carry no time stamps."""
+
+    def client(self, connection: Connection) -> BusClient:
+        """Serve a new connection."""
+        return _SlcanClient(self, connection)
+
+    def text_of(self, frame: CanFrame) -> bytes:
+        """A frame of the bus as clients read it."""
+        return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
+
+
+class _SlcanClient(BusClient):
+    END = b"\r"
+
+    def understand(self, message: bytes) -> None:
+        """Execute one line."""
+        line = message.decode("ascii", "replace")
+        command = line[:1]
+        if command in ("S", "s"):  # while it listens the speed stays as it is
+            self.connection.send(OK if self.listens_from_s is None else FAILED)
+        elif command in ("O", "L"):
+            self.listens_from_s = time.monotonic()
+            self.connection.send(OK)
+        elif command == "C":
+            self.listens_from_s = None
+            self.connection.send(OK)
+        elif command == "t":
+            frame = _slcan_frame(line)
+            if frame is None or self.listens_from_s is None:
+                self.connection.send(FAILED)
+            else:
+                self.connection.send(b"z" + OK)
+                self._bus.take(*frame)
+        elif command in ("V", "N"):
+            self.connection.send(command.encode() + b"0000" + OK)
+        else:
+            self.connection.send(FAILED)
+
+
+def _slcan_frame(line: str) -> tuple[int, bytes] | None:
+    """Identifier and data of a line ``tiiildd..``; None for any other line."""
+    found = _FRAME.fullmatch(line)
+    if found is None:
+        return None
+    data = bytes.fromhex(found[3])
+    return (int(found[1], 16), data) if len(data) == int(found[2]) else None

@@ -1,0 +1,385 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole contact bench in virtual time: plant, arm and load cell behind the contracts of the real drivers.
+
+Time goes on only while somebody waits for it, so a run repeats to the last bit and takes as long as it takes to
+compute. Arm and cell have every fault of real ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from tactile_resonance.clock import Demand
+from tactile_resonance.contact.interfaces import (
+    ArmError,
+    ArmFault,
+    ForceError,
+    ForceFault,
+    ForceInfo,
+    Mount,
+)
+from tactile_resonance.contact.payload import Payload
+from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
+from tactile_resonance.contact.tip_force import Mounting, TipForce
+from tactile_resonance.contact.vectors import six, vector
+from tactile_resonance.simulation.cell.transducer import (
+    NO_NUMBER,
+    CellFaults,
+    CellParameters,
+    Transducer,
+)
+from tactile_resonance.simulation.plant.plant import CellMounting, Plant
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
+from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.plant.tip_motion import TipMotion
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.ur5e.poses import transform_from_pose
+from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
+
+PROTECTIVE_DECELERATION_M_S2 = 2.0
+"""With which the robot brakes without a command (chosen)."""
+
+
+class VirtualBench:
+    """Robot, plant and time. It is the clock of the control loop.
+
+    Parameters
+    ----------
+    plant : Plant
+    start : Pose
+        Of the tip at time 0.
+    tracking : TrackingParameters
+    period_s : float
+        Of the robot [s].
+    seed : int
+
+    Attributes
+    ----------
+    time_ns : int
+    motion : TipMotion
+    on_step : list of callables
+        Called after every period: recorders, and faults at their time.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        start: Pose,
+        *,
+        tracking: TrackingParameters | None = None,
+        period_s: float = 0.002,
+        seed: int = 0,
+    ) -> None:
+        self.plant = plant
+        self.time_ns = 0
+        self.motion = TipMotion(
+            tracking or TrackingParameters(), start, period_s=period_s, seed=seed
+        )
+        self.on_step: list[Callable[[], None]] = []
+        self._period_ns = round(1e9 * period_s)
+        plant.step(transform_from_pose(start.vector), period_s)
+
+    def now_ns(self) -> int:
+        """Virtual time since the start [ns]."""
+        return self.time_ns
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Let whole periods pass until a time is reached, whatever the demand."""
+        while self.time_ns < time_ns:
+            self.motion.step()
+            self.plant.step(transform_from_pose(self.motion.pose.vector), self.motion.period_s)
+            self.time_ns += self._period_ns
+            for action in self.on_step:
+                action()
+
+
+class VirtualArm:
+    """An `Arm` on the bench, with the faults of a real one.
+
+    While the link is frozen nothing is heard and no command arrives; the robot goes on as it was
+    last commanded until its own watchdog stops it.
+
+    Parameters
+    ----------
+    bench : VirtualBench
+    watchdog_s : float
+        Without a command for so long the robot stops [s]: 25 Hz.
+    stale_s : float
+        `state` refuses states older than this [s].
+    """
+
+    def __init__(
+        self, bench: VirtualBench, *, watchdog_s: float = 0.04, stale_s: float = 0.02
+    ) -> None:
+        self._bench, self._motion = bench, bench.motion
+        self._watchdog_ns, self._stale_ns = round(1e9 * watchdog_s), round(1e9 * stale_s)
+        self._connected = False
+        self._broken: ArmFault | None = None  # what connect and all commands meet
+        self._stopped: ArmFault | None = None  # why the robot does not move
+        self._frozen_until_ns = -1
+        self._heard_ns = 0  # last command, or sign of life of the client
+        self._sample = self._fresh()
+        bench.on_step.append(self._step)
+
+    # the contract
+
+    def connect(self) -> None:
+        """Connect; ends a stop by the watchdog, but no protective or emergency stop."""
+        self._raise_if(self._broken)
+        if self._stopped in (ArmFault.PROTECTIVE_STOP, ArmFault.EMERGENCY_STOP):
+            self._raise_if(self._stopped)
+        self._stopped = None
+        self._connected = True
+        self._heard_ns = self._bench.time_ns
+        self._sample = self._fresh()
+
+    def state(self) -> ArmSample:
+        """Newest state that was heard."""
+        self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
+        if self._bench.time_ns >= self._frozen_until_ns:
+            self._sample = self._fresh()
+        if self._bench.time_ns - self._sample.time_ns > self._stale_ns:
+            self._raise_if(ArmFault.STALE)
+        return self._sample
+
+    def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
+        """Move with a twist until the next command."""
+        if self._may_move():
+            self._motion.speed(twist, acceleration_m_s2)
+
+    def stop(self, deceleration_m_s2: float) -> None:
+        """Stop."""
+        self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
+        if self._heard():
+            self._motion.speed(np.zeros(6), deceleration_m_s2)
+
+    def close(self) -> None:
+        """Stop and disconnect."""
+        if self._connected and self._broken is None and self._heard():
+            self._motion.speed(np.zeros(6), 1.0)
+        self._connected = False
+
+    # faults
+
+    def freeze(self, duration_s: float) -> None:
+        """Nothing is heard and no command arrives for a time."""
+        self._frozen_until_ns = self._bench.time_ns + round(1e9 * duration_s)
+
+    def halt(self, fault: ArmFault) -> None:
+        """The robot stops without a command: protective or emergency stop, program stopped."""
+        self._stopped = fault
+        self._motion.speed(np.zeros(6), PROTECTIVE_DECELERATION_M_S2)
+
+    def break_link(self, fault: ArmFault) -> None:
+        """Every call meets this fault until `repair`: link lost, client died, registers in use ..."""
+        self._broken = fault
+
+    def repair(self) -> None:
+        """All faults end; `connect` makes the arm usable."""
+        self._broken = self._stopped = None
+        self._frozen_until_ns = -1
+        self._connected = False
+
+    def _step(self) -> None:
+        """The robot's own watchdog, which a live client on a live link keeps quiet."""
+        bench = self._bench
+        alive = self._connected and self._broken is None
+        if alive and bench.time_ns >= self._frozen_until_ns:
+            return
+        if bench.time_ns - self._heard_ns > self._watchdog_ns and self._stopped is None:
+            self.halt(ArmFault.PROGRAM_STOPPED)
+
+    def _heard(self) -> bool:
+        """Whether a command reaches the robot; the client cannot tell."""
+        if self._bench.time_ns < self._frozen_until_ns:
+            return False
+        self._heard_ns = self._bench.time_ns
+        return True
+
+    def _may_move(self) -> bool:
+        self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
+        heard = self._heard()
+        if heard:
+            self._raise_if(self._stopped)
+        return heard
+
+    def _fresh(self) -> ArmSample:
+        bench, motion = self._bench, self._motion
+        self._heard_ns = bench.time_ns
+        return ArmSample(
+            time_ns=bench.time_ns,
+            robot_time_s=bench.time_ns * 1e-9,
+            position_m=vector(motion.reported.position_m),
+            rotation_rad=vector(motion.reported.rotation_rad),
+            velocity=six(motion.twist),
+            moving_allowed=self._stopped is None,
+            message="" if self._stopped is None else self._stopped.value,
+        )
+
+    @staticmethod
+    def _raise_if(fault: ArmFault | None) -> None:
+        if fault is not None:
+            raise ArmError(fault, f"simulated fault: {fault.value}")
+
+
+class VirtualCell:
+    """A `Cell` on the bench: one wrench per period of the robot.
+
+    With `TipForce` around it, it is a `ForceSource`.
+
+    Parameters
+    ----------
+    bench : VirtualBench
+    parameters : CellParameters, optional
+        By default those of ``config/load_cells/fine.yaml``.
+    delay_s : float
+        From a measurement to its arrival [s].
+    seed : int
+
+    Attributes
+    ----------
+    faults : CellFaults
+        Of the cell itself.
+    error : ForceFault or None
+        What `read` and `start` raise, as the driver of a cell does that finds a fault.
+    """
+
+    def __init__(
+        self,
+        bench: VirtualBench,
+        parameters: CellParameters | None = None,
+        *,
+        delay_s: float = 0.001,
+        seed: int = 0,
+    ) -> None:
+        self.error: ForceFault | None = None
+        self._bench = bench
+        self._parameters = CellParameters.from_yaml() if parameters is None else parameters
+        self._transducer = Transducer(self._parameters, seed)
+        self.faults: CellFaults = self._transducer.faults
+        self._scale = np.repeat(
+            [1 / self._parameters.force_divisor, 1 / self._parameters.torque_divisor], 3
+        )
+        self._delay_ns = round(1e9 * delay_s)
+        self._waiting: list[CellSample] = []
+        self._count = 0
+        bench.on_step.append(self._measure)
+
+    @property
+    def info(self) -> ForceInfo:
+        """What it can do."""
+        p = self._parameters
+        return ForceInfo(
+            name=p.name,
+            rate_hz=1 / self._bench.motion.period_s,
+            noise_rms_n=p.force_noise_rms_n,
+            resolution_n=1 / p.force_divisor,
+            range_n=p.force_range_n,
+            mount=self._bench.plant.mounting.mount,
+        )
+
+    def start(self) -> None:
+        """Begin to stream anew."""
+        self._raise_if_broken()
+        self._waiting.clear()
+
+    def read(self) -> list[CellSample]:
+        """Wrenches that have arrived since the last call."""
+        self._raise_if_broken()
+        until = self._bench.time_ns - self._delay_ns
+        count = sum(sample.time_ns <= until for sample in self._waiting)
+        arrived, self._waiting = self._waiting[:count], self._waiting[count:]
+        return arrived
+
+    def close(self) -> None:
+        """Stop to stream."""
+        self._waiting.clear()
+
+    def _raise_if_broken(self) -> None:
+        if self.error is not None:
+            raise ForceError(self.error, f"simulated fault: {self.error.value}")
+
+    def _measure(self) -> None:
+        force_n, torque_nm = self._bench.plant.wrench_at_cell()
+        counts, bits = self._transducer.convert((*force_n, *torque_nm))
+        self._count += 1
+        every = self.faults.lose_second_every
+        if self.faults.silent or (every and self._count % every == 0):
+            return
+        wrench = self._scale * counts
+        wrench[np.equal(counts, NO_NUMBER)] = np.nan
+        self._waiting.append(CellSample(self._bench.time_ns, six(wrench), bits != 0))
+
+
+DISH_KG = 0.2
+"""Of the sample with its dish on a cell under it (chosen)."""
+
+
+class ContactBench:
+    """The bench; connected and streaming.
+
+    Parameters
+    ----------
+    tissue : Tissue
+        Everywhere under the surface.
+    surface : PlantSurface
+        What takes its place later must be curved alike.
+    start : Pose
+        Of the tip.
+    tip : Tip
+    mount : Mount
+        Where the cell sits.
+    tool_kg : float
+        Mass beyond a tool-mounted cell [kg].
+    tracking : TrackingParameters
+    cell_parameters : CellParameters
+    period_s : float
+        Of robot and cell [s].
+    seed : int
+
+    Attributes
+    ----------
+    plant : Plant
+    clock : VirtualBench
+    arm : VirtualArm
+    cell : VirtualCell
+    force : TipForce
+        The cell as a force source at the tip.
+    """
+
+    def __init__(
+        self,
+        tissue: Tissue,
+        surface: PlantSurface,
+        start: Pose,
+        *,
+        tip: Tip | None = None,
+        mount: Mount = Mount.TABLE,
+        tool_kg: float = 0.03,
+        tracking: TrackingParameters | None = None,
+        cell_parameters: CellParameters | None = None,
+        period_s: float = 0.002,
+        seed: int = 0,
+    ) -> None:
+        tip = Tip() if tip is None else tip
+        on_tool = mount is Mount.TOOL
+        centre = np.array([-0.03, 0.0, 0.01] if on_tool else [0.0, 0.0, -0.01])
+        mounting = CellMounting(mount, carried_kg=tool_kg if on_tool else DISH_KG, centre_m=centre)
+        self.plant = Plant(
+            surface,
+            lambda _: tissue,
+            lambda found: tip.on(found, surface),
+            tip_radius_m=tip.radius_m,
+            mounting=mounting,
+        )
+        self.clock = VirtualBench(
+            self.plant, start, tracking=tracking, period_s=period_s, seed=seed
+        )
+        self.arm = VirtualArm(self.clock)
+        self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
+        payload = Payload(tool_kg, vector(centre)) if on_tool else None
+        self.force = TipForce(self.cell, Mounting(mount, mounting.frame, payload), self.arm.state)
+        self.arm.connect()
+        self.force.start()

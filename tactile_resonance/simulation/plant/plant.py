@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything mechanical on one clock: the tip at the robot, the tissue under it, the load cell.
+
+The tip is a ball, rigid or at the end of the beam, on a flat tilted surface or on a sphere, from
+outside or from inside. Along the surface normal the indenter says how tissue and beam answer; along
+the surface acts Coulomb friction with the elastic slip of Mindlin's contact. Of tilts up to some ten
+degrees only the lateral force is new: the beam is taken to bend along the surface normal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.payload import GRAVITY_M_S2
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import (
+    Vector,
+    cross,
+    difference,
+    dot,
+    rotated,
+    rotated_back,
+    turn_from_vector,
+    turn_product,
+    vector,
+)
+from tactile_resonance.fields import require
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
+from tactile_resonance.simulation.plant.tip import TipOnTissue
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform
+
+FloatArray = NDArray[np.float64]
+
+NEAR_M = 0.005
+"""Below this height the tip is stepped on its tissue: a beam that swings before it touches."""
+
+SAME_PLACE = 0.1
+"""In ball radii: how near to the last touch the tissue remembers it."""
+
+STANDING_M = 1e-5
+"""A tip that moves less than this along the surface in a step is above the place that it will touch."""
+
+
+@dataclass(frozen=True)
+class CellMounting:
+    """Where the load cell sits and what else it carries.
+
+    Attributes
+    ----------
+    mount : Mount
+    frame : Pose
+        Frame of the cell: in the frame `tip` on the tool, in the base under the sample.
+    carried_kg : float
+        Mass that the cell carries: tool beyond it, or the sample with its dish.
+    centre_m : (3,) array
+        Centre of that mass: in the frame `tip` on the tool, in the base under the sample.
+    """
+
+    mount: Mount = Mount.TABLE
+    frame: Pose = field(default_factory=Pose.at_origin)
+    carried_kg: float = 0.0
+    centre_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        good = 0 <= self.carried_kg < math.inf
+        require(good, "carried_kg", self.carried_kg, "a mass, 0 or above")
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Contact along the surface.
+
+    Attributes
+    ----------
+    coefficient : float
+        Of Coulomb friction; 0.1 is chosen for a wet plastic ball, not measured.
+    poisson_ratio : float
+        Tangential over normal stiffness is ``2 (1 - nu) / (2 - nu)`` (Mindlin 1949).
+    """
+
+    coefficient: float = 0.1
+    poisson_ratio: float = 0.49
+
+    @property
+    def stiffness_ratio(self) -> float:
+        """Tangential over normal stiffness of the contact before it slips."""
+        return 2 * (1 - self.poisson_ratio) / (2 - self.poisson_ratio)
+
+
+class Plant:
+    """Tip, tissue and cell, moved by whoever steps it.
+
+    Parameters
+    ----------
+    surface : PlantSurface
+        May be exchanged while the plant runs (``plant.surface = ...``).
+    tissue_at : callable
+        From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
+        touch. Asked when the tip comes near at a new place, and where it stops to come down.
+    tip : callable
+        From a tissue to a `TipOnTissue` at rest on it; its ball is that of `relative_radius_m`.
+    tip_radius_m : float
+    mounting : CellMounting
+    friction : Friction
+
+    Attributes
+    ----------
+    motion : SurfaceMotion or None
+        Of every point of the surface along its normal, over `time_s`; None: at rest. It may be exchanged
+        while the plant runs. What carries the tissue moves it: no inertia of it is on the cell.
+    time_s : float
+        Since the start [s].
+    force_n, torque_nm : Vector
+        True wrench of the tissue on the ball, about its centre, in the base [N], [N m].
+    depth_m : float
+        Depth of the ball's lowest point below the undisturbed surface [m], 0 above it.
+    contact_radius_m : float
+        Of the ball on the tissue [m]; 0 out of contact.
+    in_contact : bool
+        Whether the tissue pushes on the ball.
+    touches : int
+        How often contact has begun.
+    contact_s : float
+        How long this contact has lasted [s]; 0 out of contact.
+    tip_m : Vector
+        Place of the frame `tip` in the base [m].
+    site_m : Vector or None
+        Where the tissue was asked for last.
+    normal_force_n : float
+        True force along the normal [N], compression positive.
+    """
+
+    def __init__(
+        self,
+        surface: PlantSurface,
+        tissue_at: Callable[[FloatArray], Tissue | None],
+        tip: Callable[[Tissue], TipOnTissue],
+        *,
+        tip_radius_m: float,
+        mounting: CellMounting | None = None,
+        friction: Friction | None = None,
+    ) -> None:
+        require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")
+        self.surface = surface
+        self.motion: SurfaceMotion | None = None
+        self.tissue_at = tissue_at
+        self.tip_radius_m = tip_radius_m
+        self.mounting = CellMounting() if mounting is None else mounting
+        self.friction = Friction() if friction is None else friction
+        self.time_s = 0.0
+        self.force_n = self.torque_nm = ORIGIN
+        self.depth_m = self.contact_radius_m = 0.0
+        self.in_contact = False
+        self.touches = 0
+        self.contact_s = 0.0
+        self.tip_m = ORIGIN
+        self.normal_force_n = 0.0
+        self._tip = tip
+        self._tissue: Tissue | None = None
+        self._on: TipOnTissue | None = None
+        self.site_m: Vector | None = None
+        self._site_touched = False
+        self._slip = ORIGIN  # elastic displacement of the contact along the surface
+        self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
+        self._turn = IDENTITY[0]  # of the tip
+        self._stepped = False
+        cell = self.mounting
+        self._cell_m, self._carried_m = vector(cell.frame.position_m), vector(cell.centre_m)
+        self._cell_turn = turn_from_vector(vector(cell.frame.rotation_rad))
+        self._gravity_m_s2 = vector(GRAVITY_M_S2)
+        self._places: list[Vector] = []  # of the carried mass, newest last
+        self._period_s = 0.0
+
+    def step(self, tip: Transform, dt_s: float) -> None:
+        """Advance by `dt_s` [s], at whose end the frame `tip` is at `tip` in the base.
+
+        For a beam that is where the undeflected tip would be.
+        """
+        self._turn, place = tip
+        way = difference(place, self.tip_m) if self._stepped else ORIGIN
+        self._stepped, self._period_s = True, dt_s
+        self.time_s += dt_s
+        height, normal = self.surface.height_of(place)
+        if self.motion is not None:
+            height -= self.motion.displacement_m(self.time_s)
+        depth = self.tip_radius_m - height
+        pushed = held = 0.0
+        self._find_tissue(place, height, normal, math.hypot(*_along(way, normal)))
+        if self._on is not None:
+            held = self._on.step(depth, dt_s)
+            pushed = self._on.indenter.force_n
+            self.depth_m = max(0.0, self._on.indenter.depth_m)
+            self.contact_radius_m = self._on.indenter.contact_radius_m
+        else:
+            self.depth_m = self.contact_radius_m = 0.0
+        touching = pushed > 0
+        self._site_touched |= touching
+        self.touches += touching and not self.in_contact
+        self.in_contact = touching
+        self.contact_s = self.contact_s + dt_s if touching else 0.0
+        self.tip_m, self.normal_force_n = place, pushed
+        x, y, z = self._friction(way, normal, pushed)
+        nx, ny, nz = normal
+        self.force_n = (pushed * nx + x, pushed * ny + y, pushed * nz + z)
+        self._held_n = (held * nx + x, held * ny + y, held * nz + z)
+        # the ball is touched at its lowest point
+        radius = -self.tip_radius_m
+        self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
+        if self.mounting.mount is Mount.TOOL:
+            self._places = [*self._places[-2:], self._on_tip(self._carried_m)]
+
+    def wrench_at_cell(self) -> tuple[Vector, Vector]:
+        """Force [N] and torque [N m] on the cell about its origin, in its frame, without noise.
+
+        On the tool the cell feels the contact (through the beam), the weight of the tool beyond it
+        and its inertia; under the sample the reaction of the contact and the sample's weight.
+        """
+        if not self._stepped:
+            raise RuntimeError("wrench_at_cell: the plant has not been stepped yet")
+        mass = self.mounting.carried_kg
+        gx, gy, gz = self._gravity_m_s2
+        cx, cy, cz = self.torque_nm
+        if self.mounting.mount is Mount.TABLE:
+            turn, origin, centre = self._cell_turn, self._cell_m, self._carried_m
+            fx, fy, fz = self.force_n
+            fx, fy, fz, cx, cy, cz = -fx, -fy, -fz, -cx, -cy, -cz
+        else:
+            turn = turn_product(self._turn, self._cell_turn)
+            origin, centre = self._on_tip(self._cell_m), self._places[-1]
+            fx, fy, fz = self._held_n
+            ax, ay, az = self._mass_acceleration()
+            gx, gy, gz = gx - ax, gy - ay, gz - az
+        load = (mass * gx, mass * gy, mass * gz)
+        tx, ty, tz = cross(difference(self.tip_m, origin), (fx, fy, fz))
+        lx, ly, lz = cross(difference(centre, origin), load)
+        return (
+            rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
+            rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
+        )
+
+    def _find_tissue(self, place: Vector, height: float, normal: Vector, moved_m: float) -> None:
+        """Tissue remembers a touch at the same place; elsewhere it is fresh, and what lies exactly there."""
+        if self.in_contact or height > self.tip_radius_m + NEAR_M:
+            return
+        if self.site_m is not None:
+            away_m = math.hypot(*_along(difference(place, self.site_m), normal))
+            if self._site_touched:
+                known = away_m < SAME_PLACE * self.tip_radius_m
+            else:  # it is not asked for all along the way: that may take longer than a step
+                known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip_radius_m)
+            if known:
+                return
+        tissue = self.tissue_at(np.array(place))
+        if tissue != self._tissue or self._site_touched:  # else the beam goes on swinging
+            self._on = None if tissue is None else self._tip(tissue)
+        self._tissue = tissue
+        self.site_m, self._site_touched = place, False
+
+    def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:
+        """Force along the surface on the ball [N]."""
+        if pushed <= 0 or self.depth_m <= 0:
+            self._slip = ORIGIN
+            return ORIGIN
+        (x, y, z), (dx, dy, dz) = self._slip, way
+        x, y, z = _along((x + dx, y + dy, z + dz), normal)
+        stiffness = self.friction.stiffness_ratio * 1.5 * pushed / self.depth_m
+        length, most = math.hypot(x, y, z), self.friction.coefficient * pushed / stiffness
+        if length > most:
+            share = most / length
+            x, y, z = x * share, y * share, z * share
+        self._slip = (x, y, z)
+        return -stiffness * x, -stiffness * y, -stiffness * z
+
+    def _mass_acceleration(self) -> Vector:
+        """Of the carried mass [m/s2], by differences over the last two periods."""
+        if len(self._places) < 3:
+            return ORIGIN
+        first, second, third = self._places
+        (x, y, z), (lx, ly, lz) = difference(third, second), difference(second, first)
+        square = self._period_s**2
+        return (x - lx) / square, (y - ly) / square, (z - lz) / square
+
+    def _on_tip(self, place_m: Vector) -> Vector:
+        """What has a place in the frame `tip`, in the base."""
+        (x, y, z), (dx, dy, dz) = self.tip_m, rotated(self._turn, place_m)
+        return x + dx, y + dy, z + dz
+
+
+def _along(way: Vector, normal: Vector) -> Vector:
+    """What of a way is along the surface."""
+    height = dot(normal, way)
+    return way[0] - height * normal[0], way[1] - height * normal[1], way[2] - height * normal[2]

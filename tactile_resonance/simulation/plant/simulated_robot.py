@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated controller on its ports, stepped by the time of its bench."""
+
+from __future__ import annotations
+
+import gc
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.fields import number
+from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.plant.control_port import PORT as CONTROL_PORT
+from tactile_resonance.simulation.plant.control_port import ControlPort
+from tactile_resonance.simulation.ur5e import dashboard, rtde_server
+from tactile_resonance.simulation.ur5e.controller import UrController
+from tactile_resonance.simulation.ur5e.reactor import Reactor
+from tactile_resonance.simulation.ur5e.safety import RefusedError
+from tactile_resonance.simulation.ur5e.target import CYCLE_S
+
+# Programs come in here, nothing goes out: a real controller also sends its state, which no client of this
+# package reads.
+SCRIPT_PORT = 30003
+# The client's own has 42 kB; what has no end is searched anew with each piece that comes.
+_LONGEST_PROGRAM = 1 << 18
+# A program ends with a line `end` that is not indented.
+_END = re.compile(rb"^end[ \t]*\r?\n", re.MULTILINE)
+
+
+class ScriptService:
+    """Collects a program and hands it to the controller."""
+
+    def __init__(self, controller: UrController) -> None:
+        self._controller = controller
+        self._buffer = b""
+
+    def received(self, data: bytes) -> None:
+        """Start each program that is complete; what is refused goes to the controller's log."""
+        self._buffer += data
+        if len(self._buffer) > _LONGEST_PROGRAM:
+            raise ValueError(f"script: longer than {_LONGEST_PROGRAM} bytes")
+        while (end := _END.search(self._buffer)) is not None:
+            text, self._buffer = self._buffer[: end.end()], self._buffer[end.end() :]
+            try:
+                self._controller.start_program(text.decode("utf-8", "replace"))
+            except (ValueError, RefusedError) as error:
+                self._controller.log.append(str(error))
+
+    def closed(self) -> None:
+        """An unfinished program is forgotten, and that is logged."""
+        if self._buffer.strip():
+            begin = self._buffer[:40].decode("utf-8", "replace")
+            self._controller.log.append(f"program: got {begin!r}... and no line 'end': ignored")
+
+
+_LONGEST_FREEZE_S = 600.0
+
+
+class SimulatedRobot:
+    """A controller with RTDE, dashboard, script and control ports, and that of its time.
+
+    Parameters
+    ----------
+    controller : UrController
+    host : str
+        Address of all ports; any of 127.0.0.0/8.
+    simulated_time : bool
+        Time goes on as those who take part in it let it (`tactile_resonance.clock`); else at the pace of the
+        wall clock.
+    control_port : int
+
+    Attributes
+    ----------
+    controller : UrController
+    reactor : Reactor
+    rtde : RtdeServer
+    control : ControlPort
+    time : BenchTime
+    after_step : list of callables
+        Called after each step of the controller: what shares its clock.
+
+    Raises
+    ------
+    ValueError
+        Where a port cannot be had.
+    """
+
+    def __init__(
+        self,
+        controller: UrController,
+        host: str,
+        *,
+        simulated_time: bool = False,
+        control_port: int = CONTROL_PORT,
+    ) -> None:
+        self.controller = controller
+        self.after_step: list[Callable[[], None]] = []
+        self._cycle = 0
+        self._frozen_until_ns = self._halted_until_ns = 0
+        self.rtde = rtde_server.RtdeServer(controller)
+        self.control = ControlPort(self._orders())
+        self.reactor = Reactor(host)
+        self.time = BenchTime(self.reactor, round(CYCLE_S * 1e9), simulated=simulated_time)
+        self.time.steps.append(self._step)
+        self.time.repeats.append(self.rtde.repeat)
+        self.time.stalled.append(self._stood_still)
+        self.time.robot_sent_ns = self.rtde.sent_ns
+        self.time.packets_arrived = self._packets_arrived
+        try:
+            self.reactor.listen(rtde_server.PORT, self.rtde.serve)
+            self.reactor.listen(dashboard.PORT, partial(dashboard.DashboardService, controller))
+            self.reactor.listen(SCRIPT_PORT, lambda _: ScriptService(controller))
+            self.reactor.listen(control_port, self.control.serve, freezable=False)
+            if simulated_time:
+                self.reactor.listen(TIME_PORT, self.time.serve, freezable=False)
+        except ValueError:
+            self.reactor.close()
+            raise
+
+    def freeze_network(self, seconds: float) -> None:
+        """Let no packet of the robot's own ports pass for a time; the robot goes on."""
+        self._frozen_until_ns = self.time.now_ns + round(seconds * 1e9)
+        self.reactor.freeze(True)
+
+    def freeze_controller(self, seconds: float) -> None:
+        """Let the whole controller stand still for a time, its clock too."""
+        self._halted_until_ns = self.time.now_ns + round(seconds * 1e9)
+
+    def run(self) -> None:
+        """Step and serve until `time` is stopped, then close all ports."""
+        gc.collect()
+        gc.freeze()  # what is there to stay needs no search for garbage
+        try:
+            self.time.run()
+        finally:
+            self.reactor.close()
+
+    def _step(self) -> None:
+        now_ns = self.time.now_ns
+        if self._frozen_until_ns and now_ns >= self._frozen_until_ns:
+            self._frozen_until_ns = 0
+            self.reactor.freeze(False)
+        if now_ns < self._halted_until_ns:
+            return
+        self.controller.step()
+        for call in self.after_step:
+            call()
+        self.rtde.publish(self._cycle)
+        self._cycle += 1
+
+    def _stood_still(self, seconds: float) -> None:
+        """The robot's time stamps go on with the wall clock, as if packets had been lost."""
+        self.controller.stood_still_s += seconds
+
+    def _packets_arrived(self) -> int | None:
+        return None if self.reactor.frozen else self.rtde.packets
+
+    def _orders(self) -> dict[str, Callable[[dict], dict]]:
+        """What the control port does for the robot itself."""
+        controller, rtde = self.controller, self.rtde
+        return {
+            "state": self._state,
+            "freeze": self._freeze,
+            "drop": lambda _: {"dropped": rtde.drop()},
+            "protective_stop": _plain(controller.protective_stop),
+            "emergency_stop": _plain(controller.emergency_stop),
+            "release_emergency_stop": _plain(controller.release_emergency_stop),
+            "remote_control": _switch(controller, "remote_control"),
+            "script_starts": _switch(controller, "script_starts"),
+            "registers_in_use": _switch(rtde, "registers_in_use"),
+            "log": lambda _: {"log": list(controller.log)},
+        }
+
+    def _state(self, _: dict) -> dict:
+        controller = self.controller
+        return {
+            "time_s": controller.time_s,
+            "robot_mode": controller.robot_mode.name,
+            "safety_mode": controller.safety_mode.name,
+            "runtime_state": controller.runtime_state.name,
+            "tcp_pose": controller.outputs("actual_TCP_pose"),
+            "tcp_speed": controller.outputs("actual_TCP_speed"),
+            "tcp_force": controller.outputs("actual_TCP_force"),
+            "rtde_connections": self.rtde.connections,
+            "stalls": self.time.pace.stalls,
+            "stood_still_s": controller.stood_still_s,
+            "longest_delay_s": self.time.pace.longest_s,
+        }
+
+    def _freeze(self, fields: dict) -> dict:
+        seconds = number(fields.get("seconds"), "seconds")
+        if not 0 < seconds <= _LONGEST_FREEZE_S:
+            raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
+        part = fields.get("part", "network")
+        if part == "network":
+            self.freeze_network(seconds)
+        elif part == "controller":
+            self.freeze_controller(seconds)
+        else:
+            raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
+        return {}
+
+
+def _plain(action: Callable[[], None]) -> Callable[[dict], dict]:
+    """An order without fields and without an answer."""
+
+    def order(_: dict) -> dict:
+        action()
+        return {}
+
+    return order
+
+
+def _switch(target: Any, name: str) -> Callable[[dict], dict]:
+    """An order that sets an attribute to its field ``value``."""
+
+    def order(fields: dict) -> dict:
+        value = fields.get("value")
+        if not isinstance(value, bool):
+            raise ValueError(f"value: {value!r}, expected true or false")
+        setattr(target, name, value)
+        return {}
+
+    return order

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robot, tissue and load cell of the bench on one clock, each on the ports of a real one.
+
+What was true of the tip at every step is kept: no instrument shows it, but the simulated sensor follows the
+contact by it, and tests and benchmarks judge by it how deep, how hard and how long.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import takewhile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.fields import number, read_dataclass, require
+from tactile_resonance.sensor import SensorParameters
+from tactile_resonance.simulation.cell.load_cell import LoadCell
+from tactile_resonance.simulation.cell.tcp_bus import TcpBus
+from tactile_resonance.simulation.plant.plant import CellMounting, Plant
+from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
+from tactile_resonance.simulation.plant.surfaces import FlatSurface, SurfaceMotion
+from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import TissueLibrary
+from tactile_resonance.simulation.tissue.scene import PhantomScene
+
+KEEP_STEPS = 30_000
+"""A minute at 500 Hz."""
+
+MOST_STEPS = 250
+"""In one answer: to write more would hold the plant up."""
+
+
+@dataclass(frozen=True, slots=True)
+class _PlantStep:
+    time_s: float
+    tip_m: Vector
+    normal_force_n: float
+    contact_radius_m: float
+    depth_m: float
+
+
+class PlantHistory:
+    """Time, place of the tip and its contact, step by step.
+
+    Parameters
+    ----------
+    plant : Plant
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self._steps: deque[_PlantStep] = deque(maxlen=KEEP_STEPS)
+
+    def step(self) -> None:
+        """Note what is true now; to be called after each step of the plant."""
+        plant = self._plant
+        self._steps.append(
+            _PlantStep(
+                plant.time_s,
+                plant.tip_m,
+                plant.normal_force_n,
+                plant.contact_radius_m,
+                plant.depth_m,
+            )
+        )
+
+    def contact_over(self, fields: dict) -> dict:
+        """Control port: the contact from field ``after_s`` to ``until_s``, means over so many equal ``parts``.
+
+        Answers ``normal_force_n``, ``contact_radius_m`` and ``depth_m``, each (parts,); null for a part in
+        which the plant stood still, or of which nothing is kept.
+        """
+        after_s = number(fields.get("after_s"), "after_s")
+        until_s = number(fields.get("until_s"), "until_s")
+        parts = fields.get("parts")
+        require(after_s < until_s, "until_s", until_s, f"above after_s = {after_s:g}")
+        good = type(parts) is int and 1 <= parts <= MOST_STEPS
+        require(good, "parts", parts, f"an integer, 1 to {MOST_STEPS}")
+        assert isinstance(parts, int)
+        steps = [step for step in self._since(after_s) if step.time_s <= until_s]
+        times = np.array([step.time_s for step in steps])
+        # a step ends at its time
+        at = np.ceil((times - after_s) / (until_s - after_s) * parts - 1e-6).astype(int) - 1
+        at = at.clip(0, parts - 1)
+        counts = np.bincount(at, minlength=parts)
+        answer = {}
+        for name in ("normal_force_n", "contact_radius_m", "depth_m"):
+            sums = np.bincount(at, [getattr(step, name) for step in steps], parts)
+            pairs = zip(sums.tolist(), counts.tolist(), strict=True)
+            answer[name] = [total / count if count else None for total, count in pairs]
+        return answer
+
+    def since(self, fields: dict) -> dict:
+        """Control port: the first steps after field ``after_s``, 250 at most, oldest first.
+
+        Answers ``time_s`` (n,), ``tip_m`` (n, 3) in the base and ``normal_force_n`` (n,).
+        """
+        first = self._since(number(fields.get("after_s", 0.0), "after_s"))[:MOST_STEPS]
+        return {
+            name: [getattr(step, name) for step in first]
+            for name in ("time_s", "tip_m", "normal_force_n")
+        }
+
+    def _since(self, after_s: float) -> list[_PlantStep]:
+        """Steps after a time, oldest first."""
+        return list(takewhile(lambda step: step.time_s > after_s, reversed(self._steps)))[::-1]
+
+
+FloatArray = NDArray[np.float64]
+
+TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
+"""Where the tip sits: 0.12 m before the flange, its z against the flange's."""
+
+
+@dataclass(frozen=True)
+class BenchSetup:
+    """What lies on the table and how the cell is mounted.
+
+    Attributes
+    ----------
+    tissue : str
+        Name in the library.
+    surface_height_m, tilt_rad, azimuth_rad : float
+        Of the undisturbed surface in the robot's base; see `FlatSurface.tilted`.
+    rigid_tip : bool
+        The ball on the robot itself; else at the end of the sensor's beam.
+    mount : Mount
+    carried_kg : float
+        What the cell carries besides.
+    """
+
+    tissue: str = "gel12"
+    surface_height_m: float = 0.2
+    tilt_rad: float = 0.0
+    azimuth_rad: float = 0.0
+    rigid_tip: bool = False
+    mount: Mount = Mount.TABLE
+    carried_kg: float = 0.0
+
+    def __post_init__(self) -> None:
+        height = self.surface_height_m
+        require(-1 <= height <= 1, "surface_height_m", height, "-1 to 1")
+        require(abs(self.tilt_rad) <= 0.35, "tilt_rad", self.tilt_rad, "-0.35 to 0.35 (20 degrees)")
+        require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
+
+
+@dataclass(frozen=True)
+class LaidScene:
+    """A scene on the table: its surface, at height 0, and what lies where.
+
+    Attributes
+    ----------
+    scene : PhantomScene
+    table : Pose
+        Frame of the scene in the robot's base.
+    """
+
+    scene: PhantomScene
+    table: Pose
+
+    def surface(self) -> FlatSurface:
+        """The undisturbed surface in the base."""
+        return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+
+    def on_table(self, position_m: FloatArray) -> FloatArray:
+        """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
+        place = self.table.rotation.inv().apply(position_m - self.table.position_m)
+        return np.array([place[0], place[1], 0.0])
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        """What the tip touches under a place (3,) in the base."""
+        return self.scene.tissue_at(self.on_table(position_m))
+
+
+class Tabletop:
+    """The plant with what can be exchanged on it while it runs.
+
+    Attributes
+    ----------
+    plant : Plant
+        What the controller's tool touches.
+    """
+
+    def __init__(
+        self,
+        setup: BenchSetup,
+        library: TissueLibrary,
+        sensor: SensorParameters,
+        laid: LaidScene | None = None,
+    ) -> None:
+        self._library = library
+        self._tissue: Tissue | None = library[setup.tissue]
+        self._scene = laid
+        if laid is None:
+            surface = FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+        else:
+            surface = laid.surface()
+            # what is computed once must not hold up the first touch
+            laid.tissue_at(laid.table.position_m)
+        beam = None if setup.rigid_tip else sensor_modes(sensor)
+        tip = Tip(sensor.tip.radius_m, beam, library.contact.poisson_ratio)
+        self.plant = Plant(
+            surface,
+            self._tissue_at,
+            lambda tissue: tip.on(tissue, surface),
+            tip_radius_m=tip.radius_m,
+            mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
+        )
+        self.plant.motion = laid.scene.motion if laid else None
+
+    def place_surface(self, fields: dict) -> dict:
+        """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
+        setup = BenchSetup(
+            surface_height_m=number(fields.get("height_m"), "height_m"),
+            tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
+            azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
+        )
+        self.plant.surface = FlatSurface.tilted(
+            setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad
+        )
+        return {}
+
+    def move_surface(self, fields: dict) -> dict:
+        """Control port: how the surface moves from now on; fields of `SurfaceMotion`, none: at rest."""
+        asked = {name: value for name, value in fields.items() if name != "command"}
+        self.plant.motion = read_dataclass(SurfaceMotion, asked, "") if asked else None
+        return {}
+
+    def place_tissue(self, fields: dict) -> dict:
+        """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
+        name = fields.get("name")
+        self._tissue = None if name is None else self._library[str(name)]
+        self._scene = None
+        return {}
+
+    def _tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        return self._tissue if self._scene is None else self._scene.tissue_at(position_m)
+
+    def truth(self, _: dict) -> dict:
+        """Control port: the true state of the contact."""
+        plant = self.plant
+        return {
+            "time_s": plant.time_s,
+            "tip_m": plant.tip_m,
+            "site_m": plant.site_m,
+            "force_n": plant.force_n,
+            "normal_force_n": plant.normal_force_n,
+            "contact_s": plant.contact_s,
+            "depth_m": plant.depth_m,
+            "contact_radius_m": plant.contact_radius_m,
+            "in_contact": plant.in_contact,
+            "touches": plant.touches,
+        }
+
+
+class CellOnBus:
+    """A load cell stepped with the plant, on the bus that it sends to.
+
+    Parameters
+    ----------
+    plant : Plant
+    cell : LoadCell
+    bus : TcpBus
+    simulated_time : bool
+        Frames are stamped with the plant's time; else with this machine's.
+    """
+
+    def __init__(self, plant: Plant, cell: LoadCell, bus: TcpBus, simulated_time: bool) -> None:
+        self._plant, self._cell, self._bus = plant, cell, bus
+        self._simulated = simulated_time
+
+    def step(self) -> None:
+        """Advance to the plant's time, send what is due."""
+        if not self._simulated:
+            self._bus.keep_epoch(time.time(), self._plant.time_s)
+        force_n, torque_nm = self._plant.wrench_at_cell()
+        self._bus.send(self._cell.step((*force_n, *torque_nm), self._plant.time_s))
+
+    def inject(self, fields: dict) -> dict:
+        """Control port: fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
+        fault = fields.get("fault")
+        if fault == "server_gone":
+            self._bus.drop_clients()
+        else:
+            self._cell.faults.inject(str(fault), number(fields.get("value"), "value"))
+        return {}
+
+
+def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = None) -> None:
+    """Add the commands of table and cell to the robot's control port, and the cell to its clock."""
+    commands = robot.control.commands
+    commands["place_surface"] = tabletop.place_surface
+    commands["move_surface"] = tabletop.move_surface
+    commands["place_tissue"] = tabletop.place_tissue
+    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.pace.stalls}
+    history = PlantHistory(tabletop.plant)
+    commands["history"] = history.since
+    commands["contact_over"] = history.contact_over
+    robot.after_step.append(history.step)
+    if cell is not None:
+        commands["cell_fault"] = cell.inject
+        robot.after_step.append(cell.step)

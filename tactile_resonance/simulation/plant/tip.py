@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tip on what it touches through time: a ball held rigidly or by the beam, on tissue, bone, what clings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, cos, exp, sin, sqrt
+from typing import Protocol
+
+import numpy as np
+
+from tactile_resonance.fields import require
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
+from tactile_resonance.simulation.sensor.beam import BeamModes
+from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
+
+UP_M = 1e-7
+"""Over which the slope of a pull is taken [m]."""
+
+
+class OnSoft:
+    """A ball on soft tissue that something else acts on, too."""
+
+    def __init__(self, soft: Indenter) -> None:
+        self._soft = soft
+
+    @property
+    def depth_m(self) -> float:
+        """Of the ball's lowest point below the undisturbed surface [m]."""
+        return self._soft.depth_m
+
+    @property
+    def contact_radius_m(self) -> float:
+        """On the soft tissue [m]."""
+        return self._soft.contact_radius_m
+
+
+class OnBone(OnSoft):
+    """Soft tissue on an elastic half-space: both press on the ball, the lower from its depth on.
+
+    The layer's force is that of a thick one: on bone a thin one is stiffer (Dimitriadis
+    et al., Biophys. J. 82 (2002)), so the ball meets the bone faster here, which is the worse case.
+
+    Parameters
+    ----------
+    soft : Indenter
+        Ball on the layer.
+    layer_m : float
+        Its thickness [m].
+    radius_m : float
+        Of the ball.
+    modulus_pa, poisson_ratio : float
+        Of the bone.
+    """
+
+    def __init__(
+        self,
+        soft: Indenter,
+        *,
+        layer_m: float,
+        radius_m: float,
+        modulus_pa: float = 10e6,
+        poisson_ratio: float = 0.3,
+    ) -> None:
+        require(layer_m >= 0, "layer_m", layer_m, "0 or above")
+        super().__init__(soft)
+        self._layer_m = layer_m
+        self._c = 4 / 3 * modulus_pa / (1 - poisson_ratio**2) * math.sqrt(radius_m)
+
+    @property
+    def force_n(self) -> float:
+        """On the ball along the outward normal [N]."""
+        return self._soft.force_n + self._bone()[0]
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue."""
+        self._soft.reset()
+
+    def step(self, depth_m: float, dt_s: float) -> float:
+        """Move the ball to a depth within a time; return the force [N]."""
+        self._soft.step(depth_m, dt_s)
+        return self.force_n
+
+    def tangent(self, dt_s: float) -> tuple[float, float]:
+        """Force after holding for a time [N], and per further depth [N/m]."""
+        force_n, slope = self._soft.tangent(dt_s)
+        pressed_n, steeper = self._bone()
+        return force_n + pressed_n, slope + steeper
+
+    def _bone(self) -> tuple[float, float]:
+        """Force of the bone and its slope (Hertz)."""
+        root = math.sqrt(max(0.0, self._soft.depth_m - self._layer_m))
+        return self._c * root**3, 1.5 * self._c * root
+
+
+class Clinging(OnSoft):
+    """Tissue that, once touched, holds the ball back above its surface: a film, a fibre, a hook.
+
+    Parameters
+    ----------
+    soft : Indenter
+    pull : callable
+        Force [N] from the height of the ball above the surface [m] and its speed upwards [m/s]; None: it lets
+        go until the tissue is touched again.
+    """
+
+    def __init__(self, soft: Indenter, pull: Callable[[float, float], float | None]) -> None:
+        self.pull = pull
+        super().__init__(soft)
+        self._touched, self._pulled_n = False, 0.0
+
+    @property
+    def force_n(self) -> float:
+        """On the ball along the outward normal [N]."""
+        return self._soft.force_n - self._pulled_n
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue."""
+        self._soft.reset()
+        self._touched, self._pulled_n = False, 0.0
+
+    def step(self, depth_m: float, dt_s: float) -> float:
+        """Move the ball to a depth within a time; return the force [N]."""
+        up_m_s = (self._soft.depth_m - depth_m) / dt_s
+        self._touched |= self._soft.step(depth_m, dt_s) > 0
+        self._pulled_n = 0.0
+        if self._touched and depth_m < 0:
+            pulled_n = self.pull(-depth_m, up_m_s)
+            self._touched, self._pulled_n = pulled_n is not None, pulled_n or 0.0
+        return self.force_n
+
+    def tangent(self, dt_s: float) -> tuple[float, float]:
+        """Force after holding for a time [N], and per further depth [N/m]."""
+        force_n, slope = self._soft.tangent(dt_s)
+        height_m = -self._soft.depth_m
+        if not self._touched or height_m <= 0:
+            return force_n, slope
+        pulled_n = self.pull(height_m, 0.0) or 0.0
+        further_n = self.pull(height_m + UP_M, UP_M / dt_s) or 0.0
+        return force_n - pulled_n, slope + max(0.0, further_n - pulled_n) / UP_M
+
+
+SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
+
+
+class TipOnTissue(Protocol):
+    """A tip on one tissue through time: `RigidTip`, `SprungIndenter`."""
+
+    @property
+    def indenter(self) -> Ball:
+        """The ball."""
+        ...
+
+    def step(self, depth_m: float, dt_s: float, /) -> float:
+        """Advance with the depth of what holds the tip [m]; return the force on that [N]."""
+        ...
+
+
+@dataclass(frozen=True)
+class RigidTip:
+    """A ball that moves as the robot does."""
+
+    indenter: Ball
+
+    def step(self, depth_m: float, dt_s: float, /) -> float:
+        """Advance with the depth of the ball [m]; return the force on it [N]."""
+        return self.indenter.step(depth_m, dt_s)
+
+
+class SprungIndenter:
+    """An indenter at the end of the beam: static stiffness and first mode between base and tip.
+
+    One mass on a spring, ``m x'' = k (b - x) + c (b' - x') - F(x)``, x the depth of the tip, b that
+    which it would have with the beam straight. Each sub-step is the exact motion for the tangent
+    of F and a base at constant speed.
+
+    Parameters
+    ----------
+    indenter : Ball
+    stiffness_n_per_m, mass_kg, damping_ns_per_m : float
+        k, m, c.
+
+    Attributes
+    ----------
+    indenter : Ball
+    tip_depth_m : float
+        x [m].
+    force_n : float
+        At the base, along the outward normal [N]; the inertia of the beam beyond that of its
+        first mode is left out.
+    """
+
+    def __init__(
+        self,
+        indenter: Ball,
+        *,
+        stiffness_n_per_m: float,
+        mass_kg: float,
+        damping_ns_per_m: float,
+    ) -> None:
+        k, m, c = stiffness_n_per_m, mass_kg, damping_ns_per_m
+        require(0 < k < np.inf, "stiffness_n_per_m", k, "a number above 0")
+        require(0 < m < np.inf, "mass_kg", m, "a number above 0")
+        good = 0 <= c < 2 * sqrt(k * m)
+        require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
+        self.indenter = indenter
+        self._stiffness, self._mass, self._damping = k, m, c
+        self._swing_of = 0.0, 0.0  # stiffness and sub-step of the swing that was computed last
+        self._swing = 0.0, 0.0
+        self.reset()
+
+    @classmethod
+    def on_beam(cls, indenter: Ball, modes: BeamModes) -> SprungIndenter:
+        """Return the tip of a bimorph: ``k = 3 EI / L^3``, frequency and damping of mode 1."""
+        stiffness, natural = modes.static_stiffness_n_per_m, float(modes.natural_rad_s[0])
+        mass = stiffness / natural**2
+        return cls(
+            indenter,
+            stiffness_n_per_m=stiffness,
+            mass_kg=mass,
+            damping_ns_per_m=2 * modes.damping_ratio * natural * mass,
+        )
+
+    def reset(self) -> None:
+        """Return to undisturbed tissue; the next step begins at rest, with the beam straight."""
+        self.indenter.reset()
+        self.force_n = 0.0
+        self.tip_depth_m = -np.inf
+        self._speed = 0.0
+        self._base: float | None = None
+
+    def step(self, base_depth_m: float, dt_s: float) -> float:
+        """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""
+        if not dt_s > 0:
+            require(False, "dt_s", dt_s, "a number above 0")
+        if self._base is None:
+            self._base = self.tip_depth_m = base_depth_m
+        k, c, m, ball = self._stiffness, self._damping, self._mass, self.indenter
+        depth, speed = self.tip_depth_m, self._speed
+        count = ceil(dt_s / SUBSTEP_S - 1e-9)
+        h, rate = dt_s / count, (base_depth_m - self._base) / dt_s
+        half = c / (2 * m)
+        fall = exp(-half * h)
+        for n in range(count):
+            held, tangent = ball.tangent(h)
+            whole = k + tangent
+            # motion of equilibrium: offset + drift t
+            drift = k * rate / whole
+            offset = k * (self._base + n * h * rate) + c * (rate - drift) - held + tangent * depth
+            offset /= whole
+            y, dy = depth - offset, speed - drift
+            if (whole, h) != self._swing_of:
+                omega = sqrt(whole / m - half * half)
+                self._swing_of, self._swing = (whole, h), (cos(omega * h), sin(omega * h) / omega)
+            turn, lift = self._swing
+            depth = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
+            speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
+            ball.step(depth, h)
+        self._base, self.tip_depth_m, self._speed = base_depth_m, depth, speed
+        self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
+        return self.force_n
+
+
+@dataclass(frozen=True)
+class Tip:
+    """The ball, and the beam that holds it where there is one.
+
+    Attributes
+    ----------
+    radius_m : float
+    beam : BeamModes or None
+        None: held rigidly.
+    poisson_ratio : float
+        Of the tissue.
+    adhesion_j_per_m2 : float
+        See `Indenter`.
+    meets : callable, optional
+        From the ball on the tissue to what it meets: `OnBone`, `Clinging`.
+    """
+
+    radius_m: float = 2.5e-3
+    beam: BeamModes | None = None
+    poisson_ratio: float = 0.49
+    adhesion_j_per_m2: float = 0.0
+    meets: Callable[[Indenter], Ball] | None = None
+
+    def on(self, tissue: Tissue, surface: PlantSurface) -> TipOnTissue:
+        """Return the tip at rest over a tissue with that surface."""
+        radius_m = relative_radius_m(self.radius_m, surface)
+        soft = Indenter(
+            tissue,
+            tip_radius_m=radius_m,
+            poisson_ratio=self.poisson_ratio,
+            adhesion_j_per_m2=self.adhesion_j_per_m2,
+        )
+        ball: Ball = soft if self.meets is None else self.meets(soft)
+        return RigidTip(ball) if self.beam is None else SprungIndenter.on_beam(ball, self.beam)

@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated bench: an excitation in, blocks of sampled actuator and sensor voltage out.
+
+`SimulatedBench.start` brings the sensor to one point, where a `BenchRun` plays one excitation after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tactile_resonance.fields import require
+from tactile_resonance.sensor import SensorParameters, read_sensor
+from tactile_resonance.simulation.sensor.acquisition import (
+    BenchEffects,
+    Block,
+    ChannelSamples,
+    SignalParts,
+    convert,
+    join,
+)
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, Truth, couple, truth_of
+from tactile_resonance.simulation.sensor.linear import (
+    FloatArray,
+    Lines,
+    PeriodicExcitation,
+    PoleResidueModel,
+)
+from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
+from tactile_resonance.simulation.sensor.response import ResponseStream, VaryingStream, steady_state
+from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue, hertz_contact
+from tactile_resonance.simulation.tissue.library import read_tissues
+
+NEGLIGIBLE_COUNTS = 1e-3  # of the converter
+_SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
+
+Stream = ResponseStream | NonlinearStream | VaryingStream
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What is simulated for an excitation from rest, and what is left out because nobody could tell.
+
+    Attributes
+    ----------
+    lines, possible_lines : int
+        Lines of the steady state that are computed, and that a period has room for.
+    decays, poles : int
+        Poles whose free decay is computed, and all.
+    settled_s : float
+        Time after which no free decay is computed any more [s].
+    omitted_v : float
+        Bound on what is left out, at any instant [V].
+    """
+
+    lines: int
+    possible_lines: int
+    decays: int
+    poles: int
+    settled_s: float
+    omitted_v: float
+
+    def __str__(self) -> str:
+        """One line for a log."""
+        return (
+            f"simulates {self.lines} of {self.possible_lines} lines and the free decay of "
+            f"{self.decays} of {self.poles} poles, up to {self.settled_s:.2g} s; leaves out at "
+            f"most {self.omitted_v:.1g} V"
+        )
+
+
+class BenchRun:
+    """One stay of the tip at one point: excitations are played one after another, from rest.
+
+    The state of the sensor carries over from block to block and from excitation to excitation.
+    Playing the same excitation again continues its periods; another one starts a new realisation.
+    """
+
+    def __init__(
+        self,
+        sensor: SensorParameters,
+        coupled: CoupledBimorph,
+        seed: int,
+        effects: BenchEffects,
+        keep_parts: bool,
+        coupled_at: Callable[[float], CoupledBimorph] | None = None,
+    ) -> None:
+        good = isinstance(seed, (int, np.integer)) and seed >= 0
+        require(good, "seed", seed, "an integer, 0 or above")
+        self.coupled = coupled
+        self.seed = seed
+        self.effects = effects
+        self._coupled_at = coupled_at
+        self._acquisition = sensor.acquisition
+        self._keep_parts = keep_parts
+        skew = effects.channel_skew_s
+        direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
+        late_s = max(0.0, skew)
+        self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
+        self._sensor: Stream
+        self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
+        negligible_v = self.negligible_v
+        if coupled_at is not None:
+            self._sensor = VaryingStream(coupled_at, delay_s=late_s, negligible_v=negligible_v)
+        elif effects.nonlinearity:
+            self._sensor = NonlinearStream(coupled.modal, sensor.nonlinear, delay_s=late_s)
+            if keep_parts:
+                self._linear = ResponseStream(coupled.modal, delay_s=late_s)
+        else:
+            self._sensor = ResponseStream(coupled.modal, delay_s=late_s, negligible_v=negligible_v)
+        self._lines: Lines | None = None
+        self._realisation = -1
+        self._index = 0
+        self._samples = 0
+        hum = np.random.SeedSequence(seed, spawn_key=(_HUM,))
+        self.hum_phase_rad = float(np.random.default_rng(hum).uniform(0, 2 * np.pi))
+
+    @property
+    def negligible_v(self) -> float:
+        """What a converter would not tell [V]: no free decay is computed below it; 0: all are."""
+        return NEGLIGIBLE_COUNTS * self._acquisition.sensor_scale_v * self.effects.quantisation
+
+    def truth(self, frequency_hz: ArrayLike = (), *, time_s: float = 0.0) -> Truth:
+        """Return the exact linear behaviour, with the response at `frequency_hz` [Hz].
+
+        Of the contact at `time_s` since the start, where it changes.
+        """
+        coupled = self.coupled if self._coupled_at is None else self._coupled_at(time_s)
+        return truth_of(coupled, frequency_hz)
+
+    def effort(self, excitation: PeriodicExcitation | Lines) -> Effort:
+        """Return what an excitation from rest takes; computed without playing it."""
+        lines, model = Lines.of(excitation), self.coupled.modal
+        size = model.weights * np.abs(steady_state(model, lines))  # (K,)
+        # below the converter's floor, or lost in the rounding of the sum
+        floor = 0.0 if self.effects.nonlinearity else self.negligible_v
+        floor = max(floor, np.finfo(float).eps / 100 * float(size.max(initial=0.0)))
+        keep = size > floor
+        lasting = np.log(size[keep] / floor) / -model.poles_rad_s.real[keep]
+        return Effort(
+            lines=lines.harmonics.size,
+            possible_lines=(lines.samples_per_period - 1) // 2,
+            decays=int(keep.sum()),
+            poles=size.size,
+            settled_s=float(lasting.max(initial=0.0)),
+            omitted_v=float(np.minimum(size, floor).sum()),
+        )
+
+    def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Block:
+        """Return the next periods of an excitation as one block."""
+        require(periods >= 1, "periods", periods, "1 or above")
+        lines = self._take_up(excitation)
+        return join([self._make_period(lines) for _ in range(periods)])
+
+    def play(
+        self,
+        excitation: PeriodicExcitation | Lines,
+        periods: int,
+        *,
+        periods_per_block: int = 1,
+    ) -> Iterator[Block]:
+        """Yield the next periods of an excitation block by block; each is made when asked for."""
+        require(periods_per_block >= 1, "periods_per_block", periods_per_block, "1 or above")
+        whole = periods >= 1 and periods % periods_per_block == 0
+        require(whole, "periods", periods, f"a multiple of periods_per_block = {periods_per_block}")
+        lines = Lines.of(excitation)
+        for _ in range(periods // periods_per_block):
+            yield self.block(lines, periods_per_block)
+
+    def skip(self, excitation: PeriodicExcitation | Lines, periods: int) -> None:
+        """Let periods pass unrecorded, at little cost; what follows is as if they had been."""
+        require(periods >= 0, "periods", periods, "0 or above")
+        if periods == 0:
+            return
+        lines = self._take_up(excitation)
+        for stream in self._streams():
+            stream.skip(lines, periods)
+        self._index += periods
+        self._samples += periods * lines.samples_per_period
+
+    def _streams(self) -> list[Stream]:
+        linear = [] if self._linear is None else [self._linear]
+        return [self._drive, self._sensor, *linear]
+
+    def _take_up(self, excitation: PeriodicExcitation | Lines) -> Lines:
+        lines = Lines.of(excitation)
+        if self._lines is None or not lines.same_signal(self._lines):
+            self._lines = lines
+            self._realisation += 1
+            self._index = 0
+        return self._lines
+
+    def _make_period(self, lines: Lines) -> Block:
+        samples = lines.samples_per_period
+        drive, clean = self._drive.play(lines), self._sensor.play(lines)
+        linear = clean if self._linear is None else self._linear.play(lines)
+        drive_noise = self._noise(_ACTUATOR, self.effects.actuator_noise_v, samples)
+        sensor_rms = self._acquisition.noise_rms_v(lines.sample_rate_hz)
+        noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, samples)
+        disturbance = self._disturbance(lines.sample_rate_hz, samples)
+        parts = None
+        if self._keep_parts:
+            zero = np.zeros(samples)
+            parts = SignalParts(
+                actuator_v=drive,
+                actuator_noise_v=zero if drive_noise is None else drive_noise,
+                linear_v=linear,
+                distortion_v=clean - linear,
+                disturbance_v=zero if disturbance is None else disturbance,
+                noise_v=zero if noise is None else noise,
+            )
+        for added in (disturbance, noise):
+            clean = clean if added is None else clean + added
+        drive = drive if drive_noise is None else drive + drive_noise
+        block = Block(
+            realisation=self._realisation,
+            index=self._index,
+            start_time_s=self._samples / lines.sample_rate_hz,
+            sample_rate_hz=lines.sample_rate_hz,
+            samples_per_period=lines.samples_per_period,
+            actuator=self._channel(drive, self._acquisition.actuator_scale_v),
+            sensor=self._channel(clean, self._acquisition.sensor_scale_v),
+            parts=parts,
+        )
+        self._index += 1
+        self._samples += samples
+        return block
+
+    def _channel(self, volts: FloatArray, scale_v: float) -> ChannelSamples:
+        if self.effects.quantisation:
+            return convert(volts, scale_v, self._acquisition.adc_bits)
+        return ChannelSamples(None, 0.0, volts, False)
+
+    def _noise(self, channel: int, rms_v: float, samples: int) -> FloatArray | None:
+        """Return noise that depends on seed, realisation, period and channel only."""
+        if rms_v == 0.0:
+            return None
+        key = (channel, self._realisation, self._index)
+        sequence = np.random.SeedSequence(self.seed, spawn_key=key)
+        return rms_v * np.random.Generator(np.random.SFC64(sequence)).standard_normal(samples)
+
+    def _disturbance(self, sample_rate_hz: float, samples: int) -> FloatArray | None:
+        effects = self.effects
+        if effects.hum_v == effects.offset_v == effects.drift_v_per_s == 0.0:
+            return None
+        time_s = (self._samples + np.arange(samples)) / sample_rate_hz
+        phase = 2 * np.pi * effects.hum_frequency_hz * time_s + self.hum_phase_rad
+        hum = np.sqrt(2) * effects.hum_v * np.cos(phase)
+        return np.asarray(hum + effects.offset_v + effects.drift_v_per_s * time_s)
+
+
+DEFAULT_EFFECTS = BenchEffects()
+
+
+@dataclass(frozen=True)
+class SimulatedBench:
+    """A sensor on a bench; `start` brings it into contact and returns a run.
+
+    Examples
+    --------
+    >>> bench = SimulatedBench.from_configuration()
+    >>> run = bench.start(read_tissues()["gel10"], seed=1)  # doctest: +SKIP
+    >>> for block in run.play(excitation, periods=8):       # doctest: +SKIP
+    ...     block.actuator.volts, block.sensor.volts
+    """
+
+    sensor: SensorParameters
+    contact: HertzParameters
+
+    @classmethod
+    def from_configuration(cls) -> SimulatedBench:
+        """Return the bench of ``config/sensors/bimorph.yaml`` and ``config/tissues.yaml``."""
+        return cls(read_sensor(), read_tissues().contact)
+
+    def coupled(
+        self, tissue: Tissue | None, *, force_n: float | None = None, hold_time_s: float = 1.0
+    ) -> CoupledBimorph:
+        """Return the linear sensor in air (`tissue` None) or on tissue."""
+        if tissue is None:
+            return couple(self.sensor, None)
+        contact = hertz_contact(
+            tissue,
+            self.sensor.tip.radius_m,
+            self.contact,
+            force_n=force_n,
+            hold_time_s=hold_time_s,
+        )
+        return couple(self.sensor, contact)
+
+    def start(
+        self,
+        tissue: Tissue | None,
+        *,
+        force_n: float | None = None,
+        hold_time_s: float = 1.0,
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
+    ) -> BenchRun:
+        """Return a run of the sensor at rest.
+
+        Parameters
+        ----------
+        tissue : Tissue or None
+            None: in air.
+        force_n : float, optional
+            Preload [N]; that of the contact parameters by default. Not used in air.
+        hold_time_s : float
+            How long the preload has been held [s]; the contact creeps with it.
+        seed : int
+            Of everything random. The same seed gives the same samples however they are divided
+            into blocks.
+        effects : BenchEffects
+        keep_parts : bool
+            Keep clean signal, distortion, disturbance and noise apart in every block.
+        """
+        coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
+        return BenchRun(self.sensor, coupled, seed, effects, keep_parts)
+
+    def start_varying(
+        self,
+        coupled_at: Callable[[float], CoupledBimorph],
+        *,
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
+    ) -> BenchRun:
+        """Return a run whose linear sensor at each time [s] since its start is that of `coupled_at`.
+
+        It is asked for no time beyond the block that is made.
+
+        Raises
+        ------
+        ValueError
+            If the nonlinearity is asked for: it is not modelled on a changing contact.
+        """
+        require(not effects.nonlinearity, "nonlinearity", True, "off while the contact changes")
+        return BenchRun(self.sensor, coupled_at(0.0), seed, effects, keep_parts, coupled_at)

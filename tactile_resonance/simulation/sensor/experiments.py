@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole experiments on the simulated bench: drive levels, repeated records; and the truth over a surface.
+
+The spreads between positions and preparations are chosen (mark C) so that the order of the paper's figure 9
+(arXiv 1805.00682) shows around the mode: periods < repetitions < positions < preparations, the last near
+-30 dB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactile_resonance.fields import require
+from tactile_resonance.multisine import Grid, design_multisine
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.linear import ComplexArray, FloatArray
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import PhantomScene
+
+# Standard deviations; C.
+PREPARATION_PERCENT = 0.25  # of the concentration [% w/w] between two castings
+POSITION_PERCENT = 0.15  # of the concentration [% w/w] within one dish
+FORCE_N = 1.5e-4  # of the preload between repetitions [N]
+
+Progress = Callable[[str], None]
+
+
+def records_at_levels(
+    levels_v: Iterable[float],
+    *,
+    gelatine_percent: float = 10.0,
+    realisations: int = 4,
+    periods: int = 3,
+    seed: int = 1,
+    progress: Progress = lambda text: None,
+) -> dict[float, tuple[FloatArray, FloatArray, NDArray[np.int64], float]]:
+    """Records of an odd random multisine at several drive levels, nonlinearity switched on.
+
+    Returns
+    -------
+    dict
+        Per level [V rms]: actuator and sensor (M, P, N) [V], excited harmonics, sample rate [Hz].
+    """
+    bench = SimulatedBench.from_configuration()
+    tissue = read_tissues().gelatine(gelatine_percent)
+    records = {}
+    for level_v in levels_v:
+        channels = []
+        for m in range(realisations):
+            progress(f"{level_v:g} V, realisation {m + 1} of {realisations}")
+            excitation = design_multisine(
+                grid=Grid.ODD_RANDOM,
+                level_v=level_v,
+                seed=seed,
+                realisation=m,
+                realisations=realisations,
+            )
+            run = bench.start(tissue, seed=seed + m, effects=BenchEffects(nonlinearity=True))
+            block = run.block(excitation, periods)
+            channels.append([block.actuator.volts, block.sensor.volts])
+        u, y = np.moveaxis(np.array(channels), 1, 0).reshape(2, realisations, periods, -1)
+        records[level_v] = (u, y, excitation.harmonics, excitation.sample_rate_hz)
+    return records
+
+
+def repeated_records(
+    *,
+    preparations: int = 3,
+    positions: int = 4,
+    repetitions: int = 4,
+    periods: int = 4,
+    gelatine_percent: float = 12.0,
+    seed: int = 1,
+    progress: Progress = lambda text: None,
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64], float]:
+    """Records of the same excitation on several preparations, positions and repetitions.
+
+    Returns
+    -------
+    u, y : (preparations, positions, repetitions, periods, N) float
+        Actuator and sensor [V]; the first period of each repetition, not settled, is left out.
+    harmonics : (F,) int
+    sample_rate_hz : float
+    """
+    bench = SimulatedBench.from_configuration()
+    library = read_tissues()
+    rng = np.random.default_rng(seed)
+    excitation = design_multisine(seed=seed)
+    n = excitation.samples_per_period
+    u, y = np.empty((2, preparations, positions, repetitions, periods, n))
+    for i in range(preparations):
+        casting = gelatine_percent + PREPARATION_PERCENT * rng.standard_normal()
+        for j in range(positions):
+            progress(f"preparation {i + 1} of {preparations}, position {j + 1} of {positions}")
+            tissue = library.gelatine(casting + POSITION_PERCENT * rng.standard_normal())
+            for k in range(repetitions):
+                force_n = bench.contact.force_n + FORCE_N * rng.standard_normal()
+                run = bench.start(tissue, force_n=force_n, seed=int(rng.integers(2**62)))
+                block = run.block(excitation, periods + 1)
+                for target, channel in ((u, block.actuator), (y, block.sensor)):
+                    target[i, j, k] = channel.volts.reshape(periods + 1, n)[1:]
+    return u, y, excitation.harmonics, excitation.sample_rate_hz
+
+
+@dataclass(frozen=True, eq=False)
+class TruthMap:
+    """Exact small-signal truth at positions; NaN, or -1 for the region, where there is nothing.
+
+    Attributes
+    ----------
+    position_m : (..., 2 or 3) array
+    region_index : (...) int array
+        Into the scene's regions.
+    modulus_1s_pa : (...) array
+        E(1 s) that the tip feels.
+    pole_rad_s : (...) complex array
+        Of the resonance asked for.
+    contact_radius_m, indentation_m, force_n : (...) arrays
+    """
+
+    position_m: FloatArray
+    region_index: NDArray[np.int64]
+    modulus_1s_pa: FloatArray
+    pole_rad_s: ComplexArray
+    contact_radius_m: FloatArray
+    indentation_m: FloatArray
+    force_n: FloatArray
+
+    @property
+    def f0_hz(self) -> FloatArray:
+        """Undamped natural frequency [Hz], shape (...)."""
+        return np.abs(self.pole_rad_s) / (2 * np.pi)
+
+    @property
+    def damping_ratio(self) -> FloatArray:
+        """Shape (...)."""
+        return -self.pole_rad_s.real / np.abs(self.pole_rad_s)
+
+
+def truth_map(
+    bench: SimulatedBench,
+    scene: PhantomScene,
+    position_m: ArrayLike,
+    *,
+    near_hz: float = 250.0,
+    hold_time_s: float = 1.0,
+) -> TruthMap:
+    """Return the truth at positions (..., 2 or 3) [m], at the scene's force.
+
+    Parameters
+    ----------
+    bench, scene
+    position_m : (..., 2 or 3) array
+    near_hz : float
+        The resonance whose natural frequency is nearest to this.
+    hold_time_s : float
+        As in `hertz_contact`.
+    """
+    position = np.asarray(position_m, dtype=float)
+    index = scene.region_index(position)  # (...)
+    modulus, radius, depth, force = (np.full(index.shape, np.nan) for _ in range(4))
+    pole = np.full(index.shape, np.nan, dtype=complex)
+    for at in np.ndindex(index.shape):
+        tissue = scene.tissue_at(position[at])
+        if tissue is None:
+            continue
+        coupled = bench.coupled(tissue, force_n=scene.force_n, hold_time_s=hold_time_s)
+        contact = coupled.contact
+        assert contact is not None
+        modulus[at] = tissue.relaxation_modulus_1s_pa
+        radius[at], depth[at] = contact.contact_radius_m, contact.indentation_m
+        force[at] = contact.force_n
+        pole[at] = coupled.mode_near(near_hz).pole_rad_s
+    require(bool(np.any(index >= 0)), "position_m", position.shape, "a position on the phantoms")
+    return TruthMap(position, index, modulus, pole, radius, depth, force)

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Force mode: the arm gives way along chosen axes until it presses with the wrench asked for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from tactile_resonance.contact.vectors import Turn, Vector, cross, dot, rotated, rotated_back
+from tactile_resonance.simulation.ur5e.poses import ZERO, Six, Transform
+from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
+
+# Speed per missing force or torque at a gain scaling of 1 [m/s/N, rad/s/(N m)], and the time constant
+# without damping [s]. The robot's own figures are not published: these are the model's, stable on
+# contacts up to about 10 kN/m at the scaling of 0.5 that the client's program sets.
+GAIN = (0.004,) * 3 + (0.04,) * 3
+SETTLE_S = 0.02
+
+
+@dataclass(frozen=True)
+class ForceTask:
+    """What ``force_mode`` was asked for.
+
+    Attributes
+    ----------
+    frame : Transform
+        The task frame in the base.
+    selection : 6 bool
+        Compliant axes of the task frame.
+    wrench : 6 floats
+        What the arm exerts along compliant axes [N, N m].
+    kind : int
+        1: the task frame's y axis points from the TCP to its origin; 2: as given; 3: its x axis is
+        the TCP's velocity in the frame's x-y plane.
+    limits : 6 floats
+        Largest speed of the TCP along compliant axes [m/s, rad/s]. Limits of other axes, deviations
+        before a protective stop, are not modelled: the arm does not deviate there.
+    """
+
+    frame: Transform
+    selection: tuple[bool, ...]
+    wrench: Six
+    kind: int
+    limits: Six
+
+    def __post_init__(self) -> None:
+        if self.kind not in (1, 2, 3):
+            raise ScriptError(f"force_mode: type {self.kind}; accepted are 1, 2, 3")
+        if any(limit <= 0 for limit, on in zip(self.limits, self.selection, strict=True) if on):
+            limits = [round(limit, 6) for limit in self.limits]
+            raise ScriptError(f"force_mode: limits {limits}; accepted are speeds above 0")
+
+
+class ForceMode:
+    """Admittance along the compliant axes: speed from the missing wrench, first order.
+
+    Attributes
+    ----------
+    task : ForceTask or None
+        None outside of force mode.
+    gain_scaling, damping : float
+        As set by ``force_mode_set_gain_scaling`` (0 to 2) and ``force_mode_set_damping`` (0 to 1).
+    """
+
+    def __init__(self, target: Target) -> None:
+        self.task: ForceTask | None = None
+        self._target = target
+        self.gain_scaling = 1.0
+        self.damping = 0.005
+        self._speed = ZERO
+
+    def begin(self, task: ForceTask) -> None:
+        """Enter force mode, or go on with another task."""
+        if self.task is None:
+            self._target.yield_began_q = self._target.yielded_q
+        self.task = task
+
+    def end(self) -> None:
+        """Leave force mode."""
+        self.task = None
+        self._target.yield_began_q = None
+        self._speed = ZERO
+
+    def step(self, measured: Six) -> None:
+        """Move the target aside for one cycle; raises as `Target.command`.
+
+        Parameters
+        ----------
+        measured : 6 floats
+            Wrench on the TCP from outside, along the axes of the base.
+        """
+        if self.task is None:
+            return
+        task, target = self.task, self._target
+        axes = self._axes(task, target)
+        fx, fy, fz, mx, my, mz = measured
+        outside = (*rotated_back(axes, (fx, fy, fz)), *rotated_back(axes, (mx, my, mz)))
+        share = CYCLE_S / (SETTLE_S * (1.0 - self.damping) + CYCLE_S)
+        speeds = []
+        for axis, limit in enumerate(task.limits):
+            # what the arm exerts is the opposite of what it feels
+            wanted = GAIN[axis] * self.gain_scaling * (task.wrench[axis] + outside[axis])
+            speed = self._speed[axis] + (wanted - self._speed[axis]) * share
+            speeds.append(max(-limit, min(limit, speed)) if task.selection[axis] else 0.0)
+        self._speed = tuple(speeds)
+        x, y, z, rx, ry, rz = (speed * (CYCLE_S * target.pace) for speed in speeds)
+        target.shift(rotated(axes, (x, y, z)), rotated(axes, (rx, ry, rz)))
+
+    def _axes(self, task: ForceTask, target: Target) -> Turn:
+        """Return the rotation of the task frame in the base."""
+        turn, (x, y, z) = task.frame
+        upright = (turn[2], turn[5], turn[8])
+        if task.kind == 1:
+            tx, ty, tz = target.tool[1]
+            axis, place = (x - tx, y - ty, z - tz), 1
+        elif task.kind == 3:
+            vx, vy, vz = target.twist[:3]
+            axis, place = _beside((vx, vy, vz), upright), 0
+        else:
+            return turn
+        if math.hypot(*axis) < 1e-6:  # no direction to point to: the frame stays as given
+            return turn
+        return _completed(_unit(axis), place, upright)
+
+
+def _completed(axis: Vector, place: int, upright: Vector) -> Turn:
+    """Return right-handed axes with one at a place and z as near to `upright` as can be."""
+    z = _beside(upright, axis)
+    if math.hypot(*z) < 1e-6:  # parallel: any perpendicular direction serves
+        sizes = [abs(value) for value in axis]
+        least = sizes.index(min(sizes))
+        z = cross(axis, (float(least == 0), float(least == 1), float(least == 2)))
+    z = _unit(z)
+    first, second = (axis, cross(z, axis)) if place == 0 else (cross(axis, z), axis)
+    return (
+        first[0], second[0], z[0],
+        first[1], second[1], z[1],
+        first[2], second[2], z[2],
+    )  # fmt: skip
+
+
+def _beside(vector: Vector, axis: Vector) -> Vector:
+    """Return what of a vector is perpendicular to an axis of length 1."""
+    along = dot(vector, axis)
+    return vector[0] - axis[0] * along, vector[1] - axis[1] * along, vector[2] - axis[2] * along
+
+
+def _unit(vector: Vector) -> Vector:
+    """Return a vector of length 1 along another."""
+    length = math.hypot(*vector)
+    return vector[0] / length, vector[1] / length, vector[2] / length

@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated controller, stepped in robot time: registers, program, safety, arm and outputs."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from tactile_resonance.simulation.noise import Seed
+from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
+from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES, Outputs, OutputValue
+from tactile_resonance.simulation.ur5e.poses import largest
+from tactile_resonance.simulation.ur5e.program import Program, register_offset
+from tactile_resonance.simulation.ur5e.registers import (
+    INPUT_TYPES,
+    LARGEST_FIGURE,
+    InputValue,
+    Ports,
+    Registers,
+    write_registers,
+)
+from tactile_resonance.simulation.ur5e.safety import RefusedError, RobotMode, Safety, SafetyMode
+from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
+
+# Lines of the controller's log that are kept.
+_LOG_LINES = 200
+# Joints slower than this are at rest when power is removed [rad/s]; above their wander.
+_AT_REST_RAD_S = 0.05
+
+
+class RuntimeState(IntEnum):
+    """RTDE output ``runtime_state``."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """A simulated controller.
+
+    Attributes
+    ----------
+    machine : MachineConfig
+        The arm, its tool, its limits.
+    polyscope : tuple of 4 int
+        Version: major, minor, bugfix, build.
+    serial_number : str
+    switching_s : float
+        Time that powering on and releasing the brakes take each [s].
+    """
+
+    machine: MachineConfig = field(default_factory=MachineConfig)
+    polyscope: tuple[int, int, int, int] = (5, 21, 0, 0)
+    serial_number: str = "20265500001"
+    switching_s: float = 0.2
+
+
+class UrController:
+    """A UR5e and its controller.
+
+    Between steps clients write inputs and read outputs; `step` advances robot time by 2 ms.
+
+    Attributes
+    ----------
+    OUTPUT_TYPES, INPUT_TYPES : dict of str to str
+        RTDE types of all outputs and inputs, by name.
+    config : ControllerConfig
+    machine : Machine
+        The arm.
+    safety : Safety
+        Modes and stops.
+    registers : Registers
+    ports : Ports
+        Digital and analogue outputs, speed slider.
+    program : Program or None
+        The program that runs.
+    stood_still_s : float
+        What the time stamps are ahead of robot time [s]: how long the simulation stood still.
+    runtime_state : RuntimeState
+    remote_control : bool
+        Whether a network client may start programs.
+    script_starts : bool
+        False: an uploaded program is taken and never starts (a fault to be injected).
+    popup : str or None
+        Open on the pendant.
+    now : Outputs
+        RTDE outputs of this cycle.
+    log : deque of str
+        Newest lines of the controller's log, time stamped.
+    """
+
+    OUTPUT_TYPES = OUTPUT_TYPES
+    INPUT_TYPES = INPUT_TYPES
+
+    def __init__(
+        self,
+        config: ControllerConfig | None = None,
+        environment: Environment | None = None,
+        seed: Seed = 0,
+    ) -> None:
+        self.config = config or ControllerConfig()
+        self.machine = Machine(self.config.machine, environment, np.random.default_rng(seed))
+        self.safety = Safety(self.config.switching_s)
+        self.registers = Registers()
+        self.ports = Ports()
+        self.program: Program | None = None
+        self.runtime_state = RuntimeState.STOPPED
+        self.remote_control = True
+        self.script_starts = True
+        self.popup: str | None = None
+        self.log: deque[str] = deque(maxlen=_LOG_LINES)
+        self.stood_still_s = 0.0
+        self._cycles = 0
+        self._refreshed_s = 0.0
+        self.now = Outputs(self)
+
+    @property
+    def time_s(self) -> float:
+        """Robot time since power-up [s]."""
+        return self._cycles * CYCLE_S
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program runs."""
+        return self.program is not None
+
+    @property
+    def input_int(self) -> list[int]:
+        """Integer input registers, 48."""
+        return self.registers.input_int
+
+    @property
+    def input_double(self) -> list[float]:
+        """Double input registers, 48."""
+        return self.registers.input_double
+
+    @property
+    def output_int(self) -> list[int]:
+        """Integer output registers, 48."""
+        return self.registers.output_int
+
+    @property
+    def output_double(self) -> list[float]:
+        """Double output registers, 48."""
+        return self.registers.output_double
+
+    @property
+    def robot_mode(self) -> RobotMode:
+        """RTDE output ``robot_mode``."""
+        return self.safety.robot_mode
+
+    @property
+    def safety_mode(self) -> SafetyMode:
+        """RTDE output ``safety_mode``."""
+        return self.safety.safety_mode
+
+    def reseed(self, seed: Seed) -> None:
+        """Let all noise from the next step on be that of a seed, whatever was drawn before.
+
+        Vibration and drift begin anew, somewhere in their stationary distribution; the offset of the
+        flange's sensor is no noise and stays.
+        """
+        self.machine.reseed(np.random.default_rng(seed))
+
+    def write_inputs(self, values: Mapping[str, InputValue]) -> None:
+        """Take one package of RTDE inputs, by name.
+
+        The way to write registers: a watchdog counts what is written here, whatever the value.
+
+        Raises
+        ------
+        KeyError
+            Where an input is not known; nothing is written then.
+        """
+        if not INPUT_TYPES.keys() >= values.keys():
+            unknown = next(name for name in values if name not in INPUT_TYPES)
+            raise KeyError(f"RTDE input {unknown!r}: not known")
+        write_registers(self.registers, values)
+        self.ports.write(values)
+        if "external_force_torque" in values:
+            wrench = np.array(values["external_force_torque"], dtype=float).tolist()
+            if all(abs(value) <= LARGEST_FIGURE for value in wrench):
+                self.machine.external_wrench = tuple(wrench)
+            elif self.machine.external is not None:
+                self.protective_stop(f"external_force_torque {wrench}")
+
+    def outputs(self, name: str) -> OutputValue:
+        """Return an RTDE output: an int or a float, for vectors a list of them.
+
+        Raises
+        ------
+        KeyError
+            Where the output is not known.
+        """
+        return self.now.value(name)
+
+    def start_program(self, text: str) -> None:
+        """Run the client's control program, in place of one that runs.
+
+        Raises
+        ------
+        ValueError
+            Where the text is another program.
+        RefusedError
+            Not in remote control, without power, or during a stop.
+        """
+        offset = register_offset(text)
+        if not self.remote_control:
+            raise RefusedError("not in remote control: the program is ignored")
+        if not self.safety.may_move:
+            raise RefusedError(
+                f"robot mode {self.robot_mode.name}, safety mode {self.safety_mode.name}: "
+                "the program is ignored"
+            )
+        if not self.script_starts:
+            self._note("program taken, not started")
+            return
+        self._end_program("replaced by another program")
+        self.program = Program(self.machine, self.registers, offset)
+        self.runtime_state = RuntimeState.PLAYING
+        self._note("program started")
+
+    def stop_program(self) -> None:
+        """End the program and brake."""
+        self._end_program("stopped")
+
+    def protective_stop(self, reason: str = "injected") -> None:
+        """Stop, power kept, until unlocked; ends the program."""
+        self.safety.protective_stop(reason)
+        self._end_program(f"protective stop: {reason}")
+
+    def emergency_stop(self) -> None:
+        """Press the emergency stop; ends the program."""
+        self.safety.emergency_stop()
+        self._end_program("emergency stop")
+
+    def violation(self, reason: str = "injected") -> None:
+        """Stop for a violated safety limit, until safety is restarted; ends the program."""
+        self.safety.violation(reason)
+        self._end_program(f"safety violation: {reason}")
+
+    def release_emergency_stop(self) -> None:
+        """Release the emergency stop; power and brakes stay off."""
+        self.safety.release_emergency_stop()
+
+    def unlock_protective_stop(self) -> None:
+        """End a protective stop. Raises `RefusedError` within 5 s of it."""
+        self.safety.unlock_protective_stop()
+
+    def power_on(self) -> None:
+        """Power the arm. Raises `RefusedError` during a stop."""
+        self.safety.power_on()
+
+    def brake_release(self) -> None:
+        """Release the brakes. Raises `RefusedError` during a stop."""
+        self.safety.brake_release()
+
+    def power_off(self) -> None:
+        """Close the brakes and remove power; ends the program."""
+        self._end_program("power off")
+        self.safety.power_off()
+        self.machine.catch_with_brakes()
+
+    def restart_safety(self) -> None:
+        """Restart after a violation; the arm is without power then."""
+        self.safety.restart_safety()
+
+    def close_popup(self) -> None:
+        """Close a popup on the pendant."""
+        self.popup = None
+
+    def close_safety_popup(self) -> None:
+        """Close the popup of a stop."""
+        self.popup = None
+
+    def step(self) -> None:
+        """Advance robot time by one cycle of 2 ms."""
+        self._cycles += 1
+        target = self.machine.target
+        target.begin_cycle()
+        target.pace = self.ports.speed_slider
+        self._watch()
+        if self.program is not None:
+            self._run_program()
+        was_powered = self.safety.powered
+        self.machine.step(was_powered)
+        self.now = Outputs(self)
+        force = math.hypot(*self.machine.tcp_force[:3])
+        if force > self.machine.config.limits.tool_force_n and self.safety.may_move:
+            self.protective_stop(f"force of {force:.0f} N at the tool")
+        at_rest = not any(target.qd) and largest(self.machine.joints.qd) < _AT_REST_RAD_S
+        self.safety.step(self.time_s, at_rest)
+        if was_powered and not self.safety.powered:
+            self.machine.catch_with_brakes()
+        if self.runtime_state is RuntimeState.STOPPING and not any(target.qd):
+            self.runtime_state = RuntimeState.STOPPED
+
+    def _run_program(self) -> None:
+        assert self.program is not None
+        try:
+            if not self.program.step():
+                self._end_program("ended by its client")
+            self.machine.comply()
+        except ProtectiveStop as stop:
+            self.protective_stop(str(stop))
+        except ScriptError as error:
+            self.popup = f"Runtime error: {error}"
+            self._end_program(str(error))
+
+    def _watch(self) -> None:
+        """End the program where its client refreshes the command register too seldom."""
+        program = self.program
+        if program is not None and program.watchdog_s is not None:
+            if program.command_register in self.registers.refreshed:
+                self._refreshed_s = self.time_s
+            elif self.time_s - self._refreshed_s > program.watchdog_s + CYCLE_S / 2:
+                self._end_program("RTDE watchdog: the command register was not refreshed in time")
+        else:
+            self._refreshed_s = self.time_s
+        self.registers.refreshed.clear()
+
+    def _end_program(self, reason: str) -> None:
+        if self.program is not None:
+            self.program = None
+            self.machine.force_mode.end()
+            self.runtime_state = RuntimeState.STOPPING
+            self._note(f"program: {reason}")
+
+    def _note(self, line: str) -> None:
+        self.log.append(f"{self.time_s:.3f} s {line}")

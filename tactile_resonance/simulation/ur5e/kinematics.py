@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics of a UR5e in closed form: where the links are, how they move, and the inverse of both.
+
+Denavit-Hartenberg parameters: Universal Robots, "Parameters for calculations of kinematics and
+dynamics" (article 45257), table UR5e. Real arms carry a calibration of their own, tenths of a
+millimetre away from these nominal figures.
+
+Axes 2, 3 and 4 are parallel, so that joints 2 to 4 move the wrist in the plane of x and z of frame 1
+("outwards" and "up") as an arm of two links; axes 5 and 6 meet in the wrist's centre.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product as combinations
+
+from tactile_resonance.contact.vectors import Vector, cross
+from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform, product
+
+# Figures of the table. Lengths in m; the twists alpha are 90, 0, 0, 90, -90 and 0 degrees.
+D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
+
+# By how much a cosine may pass 1 from rounding alone: a joint at the edge of its reach.
+_EDGE = 1e-9
+
+
+class Posture:
+    """The arm at one set of joint angles.
+
+    Attributes
+    ----------
+    q : tuple of 6 float
+        Joint angles [rad].
+    flange : Transform
+        Tool flange in the base.
+    """
+
+    __slots__ = ("_carried", "_numbers", "_tool", "flange", "q")
+
+    def __init__(self, q: Six) -> None:
+        self.q = q
+        q1, q2, q3, q4, q5, q6 = q
+        q23 = q2 + q3
+        q234 = q23 + q4
+        s1, c1 = math.sin(q1), math.cos(q1)
+        s234, c234 = math.sin(q234), math.cos(q234)
+        s5, c5 = math.sin(q5), math.cos(q5)
+        s6, c6 = math.sin(q6), math.cos(q6)
+        # ends of links 2 and 3, and the wrist's centre: outwards and up from axis 2
+        r2, h2 = A2 * math.cos(q2), A2 * math.sin(q2)
+        r3, h3 = r2 + A3 * math.cos(q23), h2 + A3 * math.sin(q23)
+        r4, h4 = r3 + D5 * s234, h3 - D5 * c234
+        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+        # axes of frames 4 and 5; y of frame 4 is axis 2: (s1, -c1, 0)
+        z4x, z4y, z4z = s234 * c1, s234 * s1, -c234
+        x4x, x4y, x4z = c234 * c1, c234 * s1, s234
+        x5x, x5y, x5z = c5 * x4x + s5 * s1, c5 * x4y - s5 * c1, c5 * x4z
+        z5x, z5y, z5z = c5 * s1 - s5 * x4x, -c5 * c1 - s5 * x4y, -s5 * x4z
+        self.flange: Transform = (
+            (
+                c6 * x5x - s6 * z4x, -s6 * x5x - c6 * z4x, z5x,
+                c6 * x5y - s6 * z4y, -s6 * x5y - c6 * z4y, z5y,
+                c6 * x5z - s6 * z4z, -s6 * x5z - c6 * z4z, z5z,
+            ),
+            (wx + D6 * z5x, wy + D6 * z5y, wz + D6 * z5z),
+        )  # fmt: skip
+        self._numbers = s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4
+        self._carried, self._tool = IDENTITY, self.flange
+
+    def tool(self, tcp: Transform) -> Transform:
+        """Return a frame that the flange carries, in the base; computed anew for another frame only."""
+        if tcp != self._carried:
+            self._carried, self._tool = tcp, product(self.flange, tcp)
+        return self._tool
+
+    def twist(self, point_m: Vector, qd: Six) -> Six:
+        """Return the velocity [m/s] of a point that the flange carries and its angular velocity [rad/s].
+
+        Parameters
+        ----------
+        point_m : Vector
+            The point in the base [m].
+        qd : 6 floats
+            Speeds of the joints [rad/s].
+        """
+        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
+        qd1, qd2, qd3, qd4, qd5, qd6 = qd
+        bending = qd2 + qd3 + qd4
+        outwards = bending * (h3 - h4) - qd2 * h3 - qd3 * (h3 - h2)
+        up = bending * (r4 - r3) + qd2 * r3 + qd3 * (r3 - r2)
+        # angular velocity along x of frame 4 and along axis 2
+        along, across = -s5 * qd6, bending + c5 * qd6
+        ox = c1 * (c234 * along + s234 * qd5) + s1 * across
+        oy = s1 * (c234 * along + s234 * qd5) - c1 * across
+        oz = s234 * along - c234 * qd5 + qd1
+        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+        x, y, z = cross((ox, oy, oz), (point_m[0] - wx, point_m[1] - wy, point_m[2] - wz))
+        return x + outwards * c1 - qd1 * wy, y + outwards * s1 + qd1 * wx, z + up, ox, oy, oz
+
+    def speeds(self, point_m: Vector, twist: Six) -> Six | None:
+        """Return the joint speeds [rad/s] of a twist, the inverse of `twist`; None at a singularity."""
+        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
+        vx, vy, vz, ox, oy, oz = twist
+        # A2 A3 sin(q3): 0 where the elbow is stretched; r4: where the wrist is above the shoulder
+        elbow = r2 * h3 - h2 * r3
+        if s5 == 0.0 or r4 == 0.0 or elbow == 0.0:
+            return None
+        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+        x, y, z = cross((ox, oy, oz), (wx - point_m[0], wy - point_m[1], wz - point_m[2]))
+        x, y, z = x + vx, y + vy, z + vz  # velocity of the wrist's centre
+        qd1 = (c1 * y - s1 * x) / r4
+        outwards = c1 * x + s1 * y - qd1 * D4
+        oz -= qd1
+        level = c1 * ox + s1 * oy
+        qd5 = s234 * level - c234 * oz
+        qd6 = -(c234 * level + s234 * oz) / s5
+        bending = s1 * ox - c1 * oy - c5 * qd6
+        outwards -= bending * (h3 - h4)
+        up = z - bending * (r4 - r3)
+        qd2 = (outwards * (r3 - r2) + up * (h3 - h2)) / elbow
+        qd3 = -(outwards * r3 + up * h3) / elbow
+        return qd1, qd2, qd3, bending - qd2 - qd3, qd5, qd6
+
+    def torques(self, point_m: Vector, wrench: Six) -> Six:
+        """Return the torques [N m] of the joints that a wrench [N, N m] at a point in the base exerts."""
+        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
+        fx, fy, fz, mx, my, mz = wrench
+        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+        x, y, z = cross((point_m[0] - wx, point_m[1] - wy, point_m[2] - wz), (fx, fy, fz))
+        mx, my, mz = mx + x, my + y, mz + z  # about the wrist's centre
+        outwards, level, across = c1 * fx + s1 * fy, c1 * mx + s1 * my, s1 * mx - c1 * my
+        return (
+            mz + wx * fy - wy * fx,
+            across + r4 * fz - h4 * outwards,
+            across + (r4 - r2) * fz - (h4 - h2) * outwards,
+            across + (r4 - r3) * fz - (h4 - h3) * outwards,
+            s234 * level - c234 * mz,
+            c5 * across - s5 * (c234 * level + s234 * mz),
+        )
+
+    def frames(self) -> tuple[Transform, ...]:
+        """Return base and links 1 to 6 in the base."""
+        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
+        q2, q23 = self.q[1], self.q[1] + self.q[2]
+
+        def in_plane(cosine: float, sine: float, r: float, h: float) -> Transform:
+            turn = (cosine * c1, -sine * c1, s1, cosine * s1, -sine * s1, -c1, sine, cosine, 0.0)
+            return turn, (r * c1, r * s1, D1 + h)
+
+        x, y, z4 = c234 * c1, c234 * s1, (s234 * c1, s234 * s1, -c234)
+        fourth = (x, s1, z4[0], y, -c1, z4[1], s234, 0.0, z4[2])
+        fifth = (
+            c5 * x + s5 * s1, -z4[0], c5 * s1 - s5 * x,
+            c5 * y - s5 * c1, -z4[1], -c5 * c1 - s5 * y,
+            c5 * s234, -z4[2], -s5 * s234,
+        )  # fmt: skip
+        return (
+            IDENTITY,
+            in_plane(1.0, 0.0, 0.0, 0.0),
+            in_plane(math.cos(q2), math.sin(q2), r2, h2),
+            in_plane(math.cos(q23), math.sin(q23), r3, h3),
+            (fourth, (r3 * c1 + D4 * s1, r3 * s1 - D4 * c1, D1 + h3)),
+            (fifth, (r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4)),
+            self.flange,
+        )
+
+
+def inverse(flange: Transform, wrist_angle_rad: float = 0.0) -> list[Six]:
+    """Return every set of joint angles that brings the flange to a place, each in [-pi, pi].
+
+    Parameters
+    ----------
+    flange : Transform
+        The flange in the base.
+    wrist_angle_rad : float
+        Angle of joint 6 where axes 4 and 6 are parallel and only a sum of angles is determined.
+
+    Returns
+    -------
+    list of 6-tuples
+        At most eight; empty out of reach.
+    """
+    solutions = (
+        _solution(flange, shoulder, wrist, elbow, wrist_angle_rad)
+        for shoulder, wrist, elbow in combinations((1.0, -1.0), repeat=3)
+    )
+    return [joints for joints in solutions if joints is not None]
+
+
+def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.tau) -> Six | None:
+    """Return the joint angles for a place of the flange that are nearest to given ones.
+
+    Parameters
+    ----------
+    flange : Transform
+        The flange in the base.
+    near : 6 floats
+        Joint angles [rad]; whole turns are added to the solutions to come close to them.
+    joint_range_rad : float
+        Largest angle of a joint to either side [rad].
+
+    Returns
+    -------
+    6 floats or None
+        None where the place is out of reach.
+    """
+    turn, (x, y, _) = flange
+    wx, wy = x - D6 * turn[2], y - D6 * turn[5]
+    sideways = _cosine(D4, math.hypot(wx, wy))
+    if sideways is None:
+        return None
+    outwards = wx * math.cos(near[0]) + wy * math.sin(near[0])
+    fifth, third = math.remainder(near[4], math.tau), math.remainder(near[2], math.tau)
+    signs = math.copysign(1.0, -outwards), math.copysign(1.0, fifth), math.copysign(1.0, third)
+    solution = _solution(flange, *signs, near[5])
+    if solution is not None:
+        joints, way = _closest(solution, near, joint_range_rad)
+        third, fifth = abs(solution[2]), abs(solution[4])
+        # Others bend shoulder, elbow or wrist the other way, by as much: joint 1, 3 or 5 of theirs
+        # is twice one of these angles away. Nearer than half of that this one is the nearest.
+        if way < min(math.acos(sideways), third, math.pi - third, fifth, math.pi - fifth):
+            return joints
+    found = [_closest(each, near, joint_range_rad) for each in inverse(flange, near[5])]
+    return min(found, key=lambda each: each[1])[0] if found else None
+
+
+def _solution(
+    flange: Transform, shoulder: float, wrist: float, elbow: float, wrist_angle_rad: float
+) -> Six | None:
+    """Return the joint angles for a place of the flange with given signs, each in [-pi, pi].
+
+    Closed form: joint 1 from the wrist's centre, joints 5 and 6 from the flange's attitude, then a
+    planar arm of two links (joints 2, 3) and the angle left for joint 4.
+    """
+    (xx, yx, zx, xy, yy, zy, xz, yz, zz), (px, py, pz) = flange
+    # centre of the wrist, on joint 6's axis, D6 before the flange
+    wx, wy, wz = px - D6 * zx, py - D6 * zy, pz - D6 * zz
+    sideways = _cosine(D4, math.hypot(wx, wy))
+    if sideways is None:
+        return None
+    q1 = math.atan2(wy, wx) + shoulder * math.acos(sideways) + math.pi / 2
+    s1, c1 = math.sin(q1), math.cos(q1)
+    bend = _cosine(px * s1 - py * c1 - D4, D6)
+    if bend is None:
+        return None
+    # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
+    along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
+    # the arc cosine alone would lose half of the digits near 0 and half a turn
+    q5 = wrist * math.atan2(math.hypot(along_x, along_y), bend)
+    s5, c5 = math.sin(q5), math.cos(q5)
+    q6 = wrist_angle_rad if abs(s5) < _EDGE else math.atan2(-along_y / s5, along_x / s5)
+    s6, c6 = math.sin(q6), math.cos(q6)
+    # z and x axes of link 4 in the base
+    z4x, z4y, z4z = -s6 * xx - c6 * yx, -s6 * xy - c6 * yy, -s6 * xz - c6 * yz
+    fx, fy, fz = c5 * c6, -c5 * s6, -s5
+    x4x, x4y = fx * xx + fy * yx + fz * zx, fx * xy + fy * yy + fz * zy
+    x4z = fx * xz + fy * yz + fz * zz
+    q234 = math.atan2(x4z, x4x * c1 + x4y * s1)
+    # end of the two-link arm in the plane of x1 and the vertical
+    reach = (wx - D5 * z4x) * c1 + (wy - D5 * z4y) * s1
+    height = wz - D5 * z4z - D1
+    stretch = _cosine(reach * reach + height * height - A2 * A2 - A3 * A3, 2 * A2 * A3)
+    if stretch is None:
+        return None
+    q3 = elbow * math.acos(stretch)
+    q2 = math.atan2(height, reach) - math.atan2(A3 * math.sin(q3), A2 + A3 * math.cos(q3))
+    return (
+        math.remainder(q1, math.tau),
+        math.remainder(q2, math.tau),
+        q3,
+        math.remainder(q234 - q2 - q3, math.tau),
+        q5,
+        math.remainder(q6, math.tau),
+    )
+
+
+def _closest(solution: Six, near: Six, joint_range_rad: float) -> tuple[Six, float]:
+    """Return joint angles with whole turns added that bring them close to others, and how far they are."""
+    joints, way = [], 0.0
+    for angle, wanted in zip(solution, near, strict=True):
+        closest = wanted + math.remainder(angle - wanted, math.tau)
+        if abs(closest) > joint_range_rad:
+            closest -= math.copysign(math.tau, closest)
+        joints.append(closest)
+        way += abs(closest - wanted)
+    return tuple(joints), way
+
+
+def _cosine(numerator: float, denominator: float) -> float | None:
+    """Return a ratio as a cosine, clipped where rounding alone passes 1; None out of reach."""
+    if abs(numerator) > abs(denominator) * (1 + _EDGE) or denominator == 0.0:
+        return None
+    return max(-1.0, min(1.0, numerator / denominator))

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE outputs of the controller: names, types and how each follows from its state.
+
+Names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". Not modelled, and nominal
+therefore: temperatures, voltages, execution time, analogue inputs; the accelerometer in the tool feels
+gravity alone. Currents are torques over an assumed constant, without friction or inertia. Masses and
+centres of mass of the links: Universal Robots, "Parameters for calculations of kinematics and dynamics"
+(article 45257), table UR5e.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.contact.vectors import Vector, rotated_back
+from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
+from tactile_resonance.simulation.ur5e.kinematics import Posture
+from tactile_resonance.simulation.ur5e.machine import Machine
+from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, total
+from tactile_resonance.simulation.ur5e.registers import REGISTER_COUNT, Ports, Registers
+from tactile_resonance.simulation.ur5e.safety import RobotMode, Safety
+
+FloatArray = NDArray[np.float64]
+
+LINK_MASS_KG = np.array([3.761, 8.058, 2.846, 1.37, 1.3, 0.365])
+# In the frames of the links 1 to 6.
+LINK_CENTRE_M = np.array(
+    [
+        [0.0, -0.02561, 0.00193],
+        [0.2125, 0.0, 0.11336],
+        [0.15, 0.0, 0.0265],
+        [0.0, -0.0018, 0.01634],
+        [0.0, 0.0018, 0.01634],
+        [0.0, 0.0, -0.001159],
+    ]
+)
+
+
+def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: ToolPayload) -> Six:
+    """Return the torques [N m] that hold links and payload against gravity.
+
+    Parameters
+    ----------
+    posture : Posture
+    gravity_m_s2 : Vector
+        Acceleration of free fall in the base.
+    payload : ToolPayload
+    """
+    return tuple((_momentum_per_speed(posture, payload) @ np.negative(gravity_m_s2)).tolist())
+
+
+def momentum(posture: Posture, qd: Six, payload: ToolPayload) -> float:
+    """Return the norm of the linear momentum of links and payload [kg m/s]."""
+    return float(np.linalg.norm(np.array(qd) @ _momentum_per_speed(posture, payload)))
+
+
+def _momentum_per_speed(posture: Posture, payload: ToolPayload) -> FloatArray:
+    """Return the linear momentum that a unit speed of each joint carries, shape (6, 3)."""
+    frames = posture.frames()
+    turn = np.array([frame[0] for frame in frames]).reshape(7, 3, 3)
+    origin = np.array([frame[1] for frame in frames])
+    mass = np.append(LINK_MASS_KG, payload.mass_kg)
+    centre = np.concatenate([LINK_CENTRE_M, [payload.cog_m]])
+    carrier = [1, 2, 3, 4, 5, 6, 6]  # the payload sits on the last link
+    point = origin[carrier] + (turn[carrier] @ centre[..., None])[..., 0]  # (7, 3)
+    # first moment of all that a joint carries, about a point of its axis
+    carried = np.cumsum(mass[::-1])[::-1][:6]
+    moment = np.cumsum((mass[:, None] * point)[::-1], axis=0)[::-1][:6]
+    return np.cross(turn[:6, :, 2], moment - carried[:, None] * origin[:6])
+
+
+OutputValue = float | int | list[float] | list[int]
+
+# Joint torque per motor current [N m/A]; the maker publishes none.
+TORQUE_PER_CURRENT = 10.0
+# Of the joints (RTDE guide): running, or without power.
+JOINT_RUNNING, JOINT_POWER_OFF = 253, 239
+NOMINAL_TEMPERATURE_C = 28.0
+MAINS_V, ROBOT_BUS_V = 230.0, 48.0
+
+
+class Robot(Protocol):
+    """What the outputs are read from."""
+
+    machine: Machine
+    safety: Safety
+    registers: Registers
+    ports: Ports
+
+    stood_still_s: float
+
+    @property
+    def time_s(self) -> float:
+        """Robot time [s]."""
+        ...
+
+    @property
+    def runtime_state(self) -> int:
+        """Of the program."""
+        ...
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program runs."""
+        ...
+
+
+class Outputs:
+    """Outputs of one cycle; what several of them share is computed once, when first asked for."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+
+    def value(self, name: str) -> OutputValue:
+        """Return an output: an int or a float, for vectors a list of them. Raises KeyError."""
+        if name not in READERS:
+            raise KeyError(f"RTDE output {name!r}: not known")
+        value = READERS[name](self)
+        return list(value) if isinstance(value, tuple) else value
+
+    @cached_property
+    def target_moment(self) -> Six:
+        """Torques that hold the arm at its target."""
+        machine = self.robot.machine
+        return gravity_torque(machine.target.posture, machine.gravity_m_s2, machine.payload)
+
+    @cached_property
+    def actual_moment(self) -> Six:
+        """Torques that hold the arm against gravity and against what pushes the tool."""
+        machine = self.robot.machine
+        held = gravity_torque(machine.posture, machine.gravity_m_s2, machine.payload)
+        return total(held, machine.outer_torque)
+
+    @property
+    def tool_accelerometer(self) -> Vector:
+        """What an accelerometer at rest in the flange feels [m/s^2]."""
+        machine = self.robot.machine
+        x, y, z = rotated_back(machine.posture.flange[0], machine.gravity_m_s2)
+        return -x, -y, -z
+
+    @property
+    def status_bits(self) -> int:
+        """Power in bit 0, a running program in bit 1."""
+        powered = self.robot.safety.robot_mode is not RobotMode.POWER_OFF
+        return int(powered) | int(self.robot.program_running) << 1
+
+    @property
+    def joint_mode(self) -> list[int]:
+        """Mode of each joint."""
+        return [JOINT_RUNNING if self.robot.safety.powered else JOINT_POWER_OFF] * 6
+
+
+def _currents(moment: Six) -> Six:
+    """Motor currents [A] of joint torques [N m]."""
+    return tuple([torque / TORQUE_PER_CURRENT for torque in moment])
+
+
+Reader = Callable[[Outputs], tuple[float, ...] | OutputValue]
+
+_OUTPUTS: dict[str, tuple[str, Reader]] = {
+    "timestamp": ("DOUBLE", lambda o: o.robot.time_s + o.robot.stood_still_s),
+    "target_q": ("VECTOR6D", lambda o: o.robot.machine.target.q),
+    "target_qd": ("VECTOR6D", lambda o: o.robot.machine.target.qd),
+    "target_qdd": ("VECTOR6D", lambda o: o.robot.machine.target.qdd),
+    "target_current": ("VECTOR6D", lambda o: _currents(o.target_moment)),
+    "target_moment": ("VECTOR6D", lambda o: o.target_moment),
+    "actual_q": ("VECTOR6D", lambda o: o.robot.machine.joints.q),
+    "actual_qd": ("VECTOR6D", lambda o: o.robot.machine.joints.qd),
+    "actual_qdd": ("VECTOR6D", lambda o: o.robot.machine.joints.qdd),
+    "actual_moment": ("VECTOR6D", lambda o: o.actual_moment),
+    "actual_current": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
+    "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
+    "joint_control_output": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
+    "actual_TCP_pose": ("VECTOR6D", lambda o: pose_from_transform(o.robot.machine.tcp)),
+    "actual_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.tcp_twist),
+    "actual_TCP_force": ("VECTOR6D", lambda o: o.robot.machine.tcp_force),
+    "target_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.target.pose),
+    "target_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.target.twist),
+    "actual_digital_input_bits": ("UINT64", lambda o: o.robot.ports.digital_inputs),
+    "actual_digital_output_bits": ("UINT64", lambda o: o.robot.ports.digital_outputs),
+    "joint_temperatures": ("VECTOR6D", lambda o: [NOMINAL_TEMPERATURE_C] * 6),
+    "actual_execution_time": ("DOUBLE", lambda o: 0.0),
+    "robot_mode": ("INT32", lambda o: int(o.robot.safety.robot_mode)),
+    "joint_mode": ("VECTOR6INT32", lambda o: o.joint_mode),
+    "safety_mode": ("INT32", lambda o: int(o.robot.safety.safety_mode)),
+    "actual_tool_accelerometer": ("VECTOR3D", lambda o: o.tool_accelerometer),
+    "speed_scaling": (
+        "DOUBLE",
+        lambda o: o.robot.ports.speed_slider if o.robot.program_running else 0.0,
+    ),
+    "target_speed_fraction": ("DOUBLE", lambda o: o.robot.ports.speed_slider),
+    "actual_momentum": (
+        "DOUBLE",
+        lambda o: momentum(
+            o.robot.machine.posture, o.robot.machine.joints.qd, o.robot.machine.payload
+        ),
+    ),
+    "actual_main_voltage": ("DOUBLE", lambda o: MAINS_V),
+    "actual_robot_voltage": ("DOUBLE", lambda o: ROBOT_BUS_V if o.robot.safety.powered else 0.0),
+    "actual_robot_current": (
+        "DOUBLE",
+        lambda o: sum(map(abs, o.actual_moment)) / TORQUE_PER_CURRENT,
+    ),
+    "actual_joint_voltage": ("VECTOR6D", lambda o: [ROBOT_BUS_V * o.robot.safety.powered] * 6),
+    "runtime_state": ("UINT32", lambda o: int(o.robot.runtime_state)),
+    "standard_analog_input0": ("DOUBLE", lambda o: 0.0),
+    "standard_analog_input1": ("DOUBLE", lambda o: 0.0),
+    "standard_analog_output0": ("DOUBLE", lambda o: o.robot.ports.analog_outputs[0]),
+    "standard_analog_output1": ("DOUBLE", lambda o: o.robot.ports.analog_outputs[1]),
+    "robot_status_bits": ("UINT32", lambda o: o.status_bits),
+    "safety_status_bits": ("UINT32", lambda o: o.robot.safety.status_bits),
+    "ft_raw_wrench": ("VECTOR6D", lambda o: o.robot.machine.sensor.raw),
+    "payload": ("DOUBLE", lambda o: o.robot.machine.payload.mass_kg),
+    "payload_cog": ("VECTOR3D", lambda o: o.robot.machine.payload.cog_m),
+    "payload_inertia": ("VECTOR6D", lambda o: o.robot.machine.payload.inertia_kg_m2),
+    "tcp_offset": ("VECTOR6D", lambda o: pose_from_transform(o.robot.machine.target.tcp)),
+    # no program of the model writes boolean registers
+    "output_bit_registers0_to_31": ("UINT32", lambda o: 0),
+    "output_bit_registers32_to_63": ("UINT32", lambda o: 0),
+    "tcp_force_scalar": (
+        "DOUBLE",
+        lambda o: math.hypot(*o.robot.machine.tcp_force[:3]),
+    ),
+}
+
+
+def _register(kind: str, number: int) -> Reader:
+    return lambda o: getattr(o.robot.registers, f"output_{kind}")[number]
+
+
+for _number in range(REGISTER_COUNT):
+    _OUTPUTS[f"output_int_register_{_number}"] = ("INT32", _register("int", _number))
+    _OUTPUTS[f"output_double_register_{_number}"] = ("DOUBLE", _register("double", _number))
+
+# RTDE types of all outputs, and what reads them, by name.
+OUTPUT_TYPES: dict[str, str] = {name: kind for name, (kind, _) in _OUTPUTS.items()}
+READERS: dict[str, Reader] = {name: reader for name, (_, reader) in _OUTPUTS.items()}

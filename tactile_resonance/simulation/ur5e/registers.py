@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE inputs of the controller, and what a running program works with: its registers and threads."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.simulation.ur5e.target import ScriptError
+
+# Numbers 0 to 23 are the lower range, 24 to 47 the upper one.
+REGISTER_COUNT = 48
+# Larger figures are refused: sums and squares of them would not be finite.
+LARGEST_FIGURE = 1e6
+
+
+def _zeros() -> list[int]:
+    return [0] * REGISTER_COUNT
+
+
+def _float_zeros() -> list[float]:
+    return [0.0] * REGISTER_COUNT
+
+
+@dataclass
+class Registers:
+    """Registers of a controller.
+
+    Attributes
+    ----------
+    input_int, input_double : lists of 48
+        Written by clients.
+    output_int, output_double : lists of 48
+        Written by the program.
+    refreshed : set of str
+        Names of inputs written since the last cycle, with whatever value: what a watchdog watches.
+    """
+
+    input_int: list[int] = field(default_factory=_zeros)
+    input_double: list[float] = field(default_factory=_float_zeros)
+    output_int: list[int] = field(default_factory=_zeros)
+    output_double: list[float] = field(default_factory=_float_zeros)
+    refreshed: set[str] = field(default_factory=set)
+
+
+# Place of each general purpose register among those of its kind.
+_INT_REGISTERS = {f"input_int_register_{n}": n for n in range(REGISTER_COUNT)}
+_DOUBLE_REGISTERS = {f"input_double_register_{n}": n for n in range(REGISTER_COUNT)}
+_REGISTERS = _INT_REGISTERS.keys() | _DOUBLE_REGISTERS.keys()
+
+# Types of all inputs, as the RTDE guide names them.
+INPUT_TYPES: dict[str, str] = {
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8",
+    "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8",
+    "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8",
+    "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE",
+    "standard_analog_output_1": "DOUBLE",
+    "external_force_torque": "VECTOR6D",
+    **dict.fromkeys(_INT_REGISTERS, "INT32"),
+    **dict.fromkeys(_DOUBLE_REGISTERS, "DOUBLE"),
+}
+
+# Groups of digital outputs and their first bit in the word of all.
+_DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
+
+InputValue = float | int | Sequence[float]
+
+
+class Ports:
+    """Digital and analogue outputs and the speed slider.
+
+    Attributes
+    ----------
+    digital_inputs, digital_outputs : int
+        Bits 0-7 standard, 8-15 configurable, 16-17 tool.
+    analog_outputs : list of 2 floats
+        As written, 0 to 1 of the range.
+    speed_slider : float
+        Above 0 to 1.
+    """
+
+    def __init__(self) -> None:
+        self.digital_inputs = 0
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.speed_slider = 1.0
+
+    def write(self, values: Mapping[str, InputValue]) -> None:
+        """Take the inputs of one package; only what its masks select is written."""
+        if _REGISTERS.issuperset(values):
+            return
+
+        def number(name: str) -> float:
+            value = values.get(name, 0)
+            assert not isinstance(value, Sequence)
+            return value
+
+        for group, first in _DIGITAL.items():
+            mask = int(number(f"{group}_digital_output_mask")) << first
+            bits = int(number(f"{group}_digital_output")) << first
+            self.digital_outputs = (self.digital_outputs & ~mask) | (bits & mask)
+        for channel in range(2):
+            if int(number("standard_analog_output_mask")) >> channel & 1:
+                self.analog_outputs[channel] = number(f"standard_analog_output_{channel}")
+        if int(number("speed_slider_mask")):
+            self.speed_slider = min(1.0, max(0.0, number("speed_slider_fraction")))
+
+
+def write_registers(registers: Registers, values: Mapping[str, InputValue]) -> None:
+    """Write general purpose registers by their RTDE names, and note them as refreshed."""
+    for name, value in values.items():
+        if name in _DOUBLE_REGISTERS:
+            registers.input_double[_DOUBLE_REGISTERS[name]] = float(value)  # type: ignore[arg-type]
+        elif name in _INT_REGISTERS:
+            registers.input_int[_INT_REGISTERS[name]] = int(value)  # type: ignore[arg-type]
+        else:
+            continue
+        registers.refreshed.add(name)
+
+
+# Steps once in a cycle, until it is done.
+Thread = Generator[None, None, None]
+
+# An asynchronous motion's progress word: counters of 7 bits, then a flag, then 15 bits of progress.
+_COUNTER_SPAN = 128
+_RUNNING = 1 << 15
+
+
+class Script:
+    """Registers and threads of a running program.
+
+    Attributes
+    ----------
+    offset : int
+        Added to all register numbers: 0 or 24.
+    threads : dict of str to generator
+        Running threads by name.
+    watchdog_s : float or None
+        Longest time without a refresh of the command register; None without a watchdog.
+    internal_command : int
+        Set by a thread for the main loop, where no command of the client waits.
+    """
+
+    def __init__(self, registers: Registers, offset: int) -> None:
+        self.offset = offset
+        self.threads: dict[str, Thread] = {}
+        self.watchdog_s: float | None = None
+        self.internal_command = 0
+        self._registers = registers
+        self._progress_writes = 0
+        self._operation = 0
+
+    def run(self, name: str, thread: Thread) -> None:
+        """Start a thread; it takes its first step in this cycle, after the main loop."""
+        self.threads[name] = thread
+
+    def kill(self, name: str) -> bool:
+        """End a thread and say whether it was running."""
+        return self.threads.pop(name, None) is not None
+
+    def step_threads(self) -> None:
+        """Step each thread once and drop those that are done."""
+        for name, thread in list(self.threads.items()):
+            if self.threads.get(name) is not thread:
+                continue  # ended by one that stepped before it
+            try:
+                next(thread)
+            except StopIteration:
+                self.kill(name)
+
+    def integer(self, number: int) -> int:
+        """Return an integer input register."""
+        return self._registers.input_int[number + self.offset]
+
+    def double(self, number: int) -> float:
+        """Return a double input register; raises as `doubles`."""
+        return self.doubles(number, 1)[0]
+
+    def vector(self, number: int) -> Vector:
+        """Return three double input registers; raises as `doubles`."""
+        x, y, z = self.doubles(number, 3)
+        return x, y, z
+
+    def doubles(self, number: int, count: int = 6) -> tuple[float, ...]:
+        """Return double input registers.
+
+        Raises
+        ------
+        ScriptError
+            If one of them is not finite or beyond +-1e6.
+        """
+        first = number + self.offset
+        values = self._registers.input_double[first : first + count]
+        for value in values:
+            if not -LARGEST_FIGURE <= value <= LARGEST_FIGURE:
+                raise ScriptError(
+                    f"input_double_register_{first}...: {values}; accepted are numbers within "
+                    f"+-{LARGEST_FIGURE:g}"
+                )
+        return tuple(values)
+
+    def status(self, value: int) -> None:
+        """Write the state of the command loop."""
+        self._registers.output_int[self.offset] = value
+
+    def answer(self, value: int) -> None:
+        """Write an integer result."""
+        self._registers.output_int[1 + self.offset] = int(value)
+
+    def answer_doubles(self, values: Iterable[float]) -> None:
+        """Write a vector result."""
+        for place, value in enumerate(values):
+            self._registers.output_double[place + self.offset] = value
+
+    def begin_asynchronous(self) -> None:
+        """Tell that an asynchronous operation begins."""
+        self._operation = (self._operation + 1) % _COUNTER_SPAN
+        self._write_progress(_RUNNING)
+
+    def end_asynchronous(self) -> None:
+        """Tell that no asynchronous operation runs."""
+        self._write_progress(0)
+
+    def _write_progress(self, state: int) -> None:
+        self._progress_writes = (self._progress_writes + 1) % _COUNTER_SPAN
+        word = (self._operation << 24) + (self._progress_writes << 16) + state
+        self._registers.output_int[2 + self.offset] = word

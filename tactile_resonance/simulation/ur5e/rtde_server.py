@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RTDE server of the simulated controller (port 30004): Real-Time Data Exchange, protocol version 2.
+
+Packets are big-endian: size of the packet with its header (u16), type (u8), payload. Source: Universal Robots,
+"Real-Time Data Exchange (RTDE) Guide".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from tactile_resonance.simulation.ur5e.controller import UrController
+from tactile_resonance.simulation.ur5e.outputs import READERS, Reader
+from tactile_resonance.simulation.ur5e.reactor import Connection
+
+PROTOCOL_VERSION = 2
+LONGEST_PAYLOAD = 0xFFFF - 3
+
+# type -> struct code and count
+_LAYOUT = {
+    "BOOL": ("?", 1),
+    "UINT8": ("B", 1),
+    "UINT32": ("I", 1),
+    "UINT64": ("Q", 1),
+    "INT32": ("i", 1),
+    "DOUBLE": ("d", 1),
+    "VECTOR3D": ("d", 3),
+    "VECTOR6D": ("d", 6),
+    "VECTOR6INT32": ("i", 6),
+    "VECTOR6UINT32": ("I", 6),
+}
+
+
+class Kind(IntEnum):
+    """Types of packets."""
+
+    PROTOCOL_VERSION = ord("V")
+    CONTROLLER_VERSION = ord("v")
+    TEXT = ord("M")
+    DATA = ord("U")
+    OUTPUTS = ord("O")
+    INPUTS = ord("I")
+    START = ord("S")
+    PAUSE = ord("P")
+
+
+def packet(kind: Kind, payload: bytes) -> bytes:
+    """Return a packet with its header; ValueError where it does not fit into one."""
+    if len(payload) > LONGEST_PAYLOAD:
+        raise ValueError(f"RTDE packet: {len(payload)} bytes, expected at most {LONGEST_PAYLOAD}")
+    return struct.pack(">HB", 3 + len(payload), kind) + payload
+
+
+class PacketReader:
+    """Cuts a stream of bytes into packets."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def add(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield the type and payload of each packet that is complete.
+
+        Raises
+        ------
+        ValueError
+            Where a size is smaller than a header.
+        """
+        self._buffer += data
+        while len(self._buffer) >= 3:
+            size, kind = struct.unpack_from(">HB", self._buffer)
+            if size < 3:
+                raise ValueError(f"RTDE packet: size {size}, expected at least 3")
+            if len(self._buffer) < size:
+                return
+            payload = bytes(self._buffer[3:size])
+            del self._buffer[:size]
+            yield kind, payload
+
+
+class Layout:
+    """How the variables of a recipe lie in a data packet.
+
+    Parameters
+    ----------
+    types : sequence of str
+        RTDE types.
+    """
+
+    def __init__(self, types: Sequence[str]) -> None:
+        self._lengths = [_LAYOUT[name][1] for name in types]
+        codes = "".join(f"{_LAYOUT[name][1]}{_LAYOUT[name][0]}" for name in types)
+        self._struct = struct.Struct(">B" + codes)
+        self._packet = struct.Struct(">HBB" + codes)
+        if self._struct.size > LONGEST_PAYLOAD:
+            raise ValueError(
+                f"RTDE recipe: {self._struct.size} bytes, expected at most {LONGEST_PAYLOAD}"
+            )
+
+    def pack(self, recipe: int, values: Sequence[Any]) -> bytes:
+        """Return a data packet; a vector is a sequence of its length."""
+        flat: list[Any] = []
+        for value, length in zip(values, self._lengths, strict=True):
+            if length == 1:
+                flat.append(value)
+            else:
+                flat += value
+        return self._packet.pack(self._packet.size, Kind.DATA, recipe, *flat)
+
+    def unpack(self, payload: bytes) -> list | None:
+        """Return the values of a data packet; None where its size is not that of the recipe."""
+        if len(payload) != self._struct.size:
+            return None
+        flat = self._struct.unpack(payload)[1:]
+        if len(flat) == len(self._lengths):  # no vectors
+            return list(flat)
+        values: list = []
+        start = 0
+        for length in self._lengths:
+            values.append(flat[start] if length == 1 else list(flat[start : start + length]))
+            start += length
+        return values
+
+
+PORT = 30004
+CYCLE_HZ = 500.0
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    names: tuple[str, ...]
+    layout: Layout
+    readers: tuple[Reader, ...] = ()  # of outputs
+
+
+class RtdeServer:
+    """All RTDE connections of one controller.
+
+    Attributes
+    ----------
+    registers_in_use : bool
+        A fieldbus or another program claims the input registers: every input recipe is refused.
+    packets : int
+        Packages of inputs that have come since the start.
+    """
+
+    def __init__(self, controller: UrController) -> None:
+        self.controller = controller
+        self.registers_in_use = False
+        self.packets = 0
+        self._services: list[_Service] = []
+
+    def serve(self, connection: Connection) -> _Service:
+        """Serve a new connection."""
+        service = _Service(self, connection)
+        self._services.append(service)
+        return service
+
+    @property
+    def connections(self) -> int:
+        """How many clients are connected."""
+        return len(self._services)
+
+    def publish(self, cycle: int) -> None:
+        """Send this cycle's outputs to whom they are due."""
+        known: dict[tuple[str, ...], bytes] = {}  # what several clients ask for is computed once
+        for service in list(self._services):
+            service.publish(cycle, known)
+
+    def repeat(self) -> None:
+        """Send what was sent last again: clients take a silent robot for lost."""
+        for service in list(self._services):
+            service.repeat()
+
+    def sent_ns(self, port: int) -> int:
+        """Time stamp [ns] of the newest outputs that were sent to a client's port; 0: none."""
+        return max((s.sent_ns for s in self._services if s.connection.peer_port == port), default=0)
+
+    def drop(self) -> int:
+        """Abort all connections; returns how many there were."""
+        services = list(self._services)
+        for service in services:
+            service.connection.close(reset=True)
+        return len(services)
+
+    def forget(self, service: _Service) -> None:
+        """Free what a connection held."""
+        self._services.remove(service)
+
+    def claimed(self, name: str, asking: _Service) -> bool:
+        """Whether another connection, or a fieldbus, writes an input."""
+        if self.registers_in_use and "register" in name:
+            return True
+        return any(name in service.inputs for service in self._services if service is not asking)
+
+
+class _Service:
+    """One RTDE connection: its recipes, and whether it is started."""
+
+    def __init__(self, server: RtdeServer, connection: Connection) -> None:
+        self.connection = connection
+        self.inputs: set[str] = set()
+        self._server = server
+        self._reader = PacketReader()
+        self._recipes: dict[int, _Recipe] = {}
+        self._outputs: _Recipe | None = None
+        self._period = 1
+        self._started = False
+        self._newest = b""  # outputs that were sent last
+        self.sent_ns = 0
+        self._answers = {
+            Kind.PROTOCOL_VERSION: self._protocol_version,
+            Kind.CONTROLLER_VERSION: self._controller_version,
+            Kind.OUTPUTS: self._set_up_outputs,
+            Kind.INPUTS: self._set_up_inputs,
+            Kind.START: self._start,
+            Kind.PAUSE: self._pause,
+        }
+
+    def received(self, data: bytes) -> None:
+        """Answer requests and take inputs."""
+        for kind, payload in self._reader.add(data):
+            if kind == Kind.DATA:
+                self._take(payload)
+            elif kind in self._answers:
+                kind = Kind(kind)
+                self.connection.send(packet(kind, self._answers[kind](payload)))
+            elif kind != Kind.TEXT:
+                raise ValueError(f"RTDE packet: type {kind}, expected one of 'VvMUOISP'")
+
+    def closed(self) -> None:
+        """Free the inputs."""
+        self._server.forget(self)
+
+    def publish(self, cycle: int, known: dict[tuple[str, ...], bytes]) -> None:
+        """Send the outputs where they are due; a client that does not read misses them.
+
+        `known` holds packets of this cycle by their variables and is added to.
+        """
+        if self._started and not cycle % self._period:
+            self._send_outputs(known)
+
+    def repeat(self) -> None:
+        """Send the newest outputs again, to whom none were sent yet those of now."""
+        if self._started and self._newest:
+            self.connection.send(self._newest, droppable=True)
+        elif self._started:
+            self._send_outputs({})
+
+    def _send_outputs(self, known: dict[tuple[str, ...], bytes]) -> None:
+        recipe, controller = self._outputs, self._server.controller
+        assert recipe is not None
+        data = known.get(recipe.names)
+        if data is None:
+            values = [read(controller.now) for read in recipe.readers]
+            data = known[recipe.names] = recipe.layout.pack(1, values)
+        self._newest = data
+        if self.connection.send(data, droppable=True):
+            self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
+
+    def _protocol_version(self, payload: bytes) -> bytes:
+        return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
+
+    def _controller_version(self, _: bytes) -> bytes:
+        return struct.pack(">4I", *self._server.controller.config.polyscope)
+
+    def _set_up_outputs(self, payload: bytes) -> bytes:
+        if len(payload) < 8:
+            raise ValueError("RTDE outputs: no frequency")
+        (frequency_hz,) = struct.unpack_from(">d", payload)
+        if not 1.0 <= frequency_hz <= CYCLE_HZ:
+            return b"\x00"
+        self._period = round(CYCLE_HZ / frequency_hz)
+        names = _names(payload[8:])
+        known = self._server.controller.OUTPUT_TYPES
+        types = [known.get(name, "NOT_FOUND") for name in names]
+        if "NOT_FOUND" in types:
+            return b"\x00" + ",".join(types).encode()
+        self._outputs = _Recipe(names, Layout(types), tuple(READERS[name] for name in names))
+        self._newest = b""
+        return b"\x01" + ",".join(types).encode()
+
+    def _set_up_inputs(self, payload: bytes) -> bytes:
+        names = _names(payload)
+        known = self._server.controller.INPUT_TYPES
+        types = [
+            "IN_USE" if self._server.claimed(name, self) else known.get(name, "NOT_FOUND")
+            for name in names
+        ]
+        if "IN_USE" in types or "NOT_FOUND" in types:
+            return b"\x00" + ",".join(types).encode()
+        recipe = len(self._recipes) + 1
+        self._recipes[recipe] = _Recipe(names, Layout(types))
+        self.inputs.update(names)
+        return bytes([recipe]) + ",".join(types).encode()
+
+    def _start(self, _: bytes) -> bytes:
+        self._started = self.connection.patient = self._outputs is not None
+        return bytes([self._started])
+
+    def _pause(self, _: bytes) -> bytes:
+        self._started = self.connection.patient = False
+        return b"\x01"
+
+    def _take(self, payload: bytes) -> None:
+        recipe = self._recipes.get(payload[0]) if payload else None
+        if recipe is None:
+            return
+        self._server.packets += 1
+        values = recipe.layout.unpack(payload)
+        if values is None:  # a real controller takes no packet of the wrong size either
+            return
+        self._server.controller.write_inputs(dict(zip(recipe.names, values, strict=True)))
+
+
+def _names(text: bytes) -> tuple[str, ...]:
+    return tuple(name for name in text.decode("ascii", "replace").split(",") if name)

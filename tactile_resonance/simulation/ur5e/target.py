@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the trajectory generator wants of the joints in each cycle, within the robot's limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from operator import sub
+
+from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, dot, transposed, turn_product
+from tactile_resonance.simulation.ur5e.kinematics import Posture, nearest_inverse
+from tactile_resonance.simulation.ur5e.poses import (
+    IDENTITY,
+    ORIGIN,
+    ZERO,
+    Six,
+    Transform,
+    difference,
+    inverse_transform,
+    largest,
+    pose_from_transform,
+    product,
+    rounded,
+    total,
+    turned,
+)
+
+# The control period of an e-series [s].
+CYCLE_S = 0.002
+
+
+class ScriptError(Exception):
+    """The program did what the controller does not allow; the controller ends it."""
+
+
+class ProtectiveStop(Exception):
+    """A limit of the robot was reached; the controller brakes and waits to be unlocked."""
+
+
+@dataclass(frozen=True)
+class SafetyPlane:
+    """A plane of the safety configuration that the TCP must not pass.
+
+    Attributes
+    ----------
+    point_m : Vector
+        A point of it in the base.
+    normal : Vector
+        Of length 1, to the side where the TCP may be.
+    """
+
+    point_m: Vector
+    normal: Vector
+
+    def beyond(self, place_m: Vector) -> float:
+        """How far a place is on the wrong side [m]; negative on the right one."""
+        (x, y, z), (px, py, pz) = place_m, self.point_m
+        return -dot(self.normal, (x - px, y - py, z - pz))
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of the arm and of its safety configuration.
+
+    Attributes
+    ----------
+    joint_range_rad : float
+        Largest angle to either side; +-360 degrees (UR5e data sheet).
+    joint_speed_rad_s : float
+        180 degrees/s (UR5e data sheet).
+    tool_speed_m_s : float
+        Largest speed of the TCP; a setting of the safety configuration.
+    tool_force_n : float
+        Measured force at the TCP beyond which the robot stops; a setting of the safety
+        configuration.
+    brake_rad_s2 : float
+        Deceleration of stops that no program asks for (assumed).
+    planes : tuple of SafetyPlane
+        The model stops at a plane; a robot slows down before it.
+    """
+
+    joint_range_rad: float = math.tau
+    joint_speed_rad_s: float = math.pi
+    tool_speed_m_s: float = 1.5
+    tool_force_n: float = 150.0
+    brake_rad_s2: float = 10.0
+    planes: tuple[SafetyPlane, ...] = ()
+
+
+class Target:
+    """Target angles and speeds of the joints, set once in a cycle.
+
+    Attributes
+    ----------
+    posture : Posture
+        At the target angles [rad].
+    qd : 6 floats
+        Target speeds [rad/s].
+    pace : float
+        Speed slider: share of the programmed speed, above 0 to 1.
+    commanded : bool
+        Whether the program moved the arm in this cycle.
+    yielded_q : 6 floats
+    yielded_m : Vector
+    yielded_turn : Turn
+        All that force mode has moved the target aside so far, of the joints and of the TCP. A path
+        goes on beside itself by what was yielded since it began.
+    yield_began_q : 6 floats or None
+        `yielded_q` when force mode began; None without it.
+    """
+
+    def __init__(self, q: Six, limits: MotionLimits) -> None:
+        self.limits = limits
+        self._tcp = self._flange_in_tcp = IDENTITY
+        self.pace = 1.0
+        self.posture = Posture(q)
+        self.qd = ZERO
+        self._cycle_qd = ZERO
+        self._accelerated: tuple[Six, Six] = (ZERO, ZERO)  # from and to, in the last whole cycle
+        self.commanded = False
+        self.yielded_q = ZERO
+        self.yielded_m: Vector = ORIGIN
+        self.yielded_turn: Turn = NO_TURN
+        self.yield_began_q: Six | None = None
+
+    @property
+    def tcp(self) -> Transform:
+        """Tool centre point in the flange, as the program set it."""
+        return self._tcp
+
+    @tcp.setter
+    def tcp(self, value: Transform) -> None:
+        self._tcp, self._flange_in_tcp = value, inverse_transform(value)
+
+    @property
+    def q(self) -> Six:
+        """Target angles [rad]."""
+        return self.posture.q
+
+    @property
+    def qdd(self) -> Six:
+        """Target accelerations [rad/s^2]."""
+        return rate(*self._accelerated)
+
+    @property
+    def aside_q(self) -> Six:
+        """How far force mode has moved the joints aside since it began; 0 without it."""
+        return (
+            ZERO if self.yield_began_q is None else difference(self.yielded_q, self.yield_began_q)
+        )
+
+    @property
+    def tool(self) -> Transform:
+        """The target TCP in the base."""
+        return self.posture.tool(self._tcp)
+
+    @property
+    def pose(self) -> Six:
+        """Target pose of the TCP in the base."""
+        return pose_from_transform(self.tool)
+
+    @property
+    def twist(self) -> Six:
+        """Target velocity [m/s] and angular velocity [rad/s] of the TCP in the base."""
+        return self.posture.twist(self.tool[1], self.qd)
+
+    def begin_cycle(self) -> None:
+        """Let one thread of the program move the arm in the cycle that begins."""
+        self._cycle_qd = self.qd
+        self.commanded = False
+
+    def end_cycle(self) -> None:
+        """Brake where nothing moved the arm, and note the acceleration of the cycle."""
+        if not self.commanded:
+            self.brake(self.limits.brake_rad_s2)
+        self._accelerated = self._cycle_qd, self.qd
+
+    def command(self, q: Six, qd: Six) -> None:
+        """Set target angles and speeds for this cycle.
+
+        Raises
+        ------
+        ScriptError
+            Where another thread moved the arm in this cycle.
+        ProtectiveStop
+            Where a joint would pass its range or its speed, as near a singularity.
+        """
+        self._command(Posture(q), qd)
+
+    def command_tool(self, tool: Transform, twist: Six) -> None:
+        """Set the target TCP and its twist for this cycle; raises as `command`."""
+        posture = self._solved(tool)
+        qd = posture.speeds(posture.tool(self._tcp)[1], twist)
+        if qd is None:
+            raise ProtectiveStop("the path leads through a singularity")
+        self._command(posture, qd)
+
+    def stay(self) -> None:
+        """Stand still in this cycle, where the arm stands already; raises as `command`."""
+        self._require_turn()
+        self.commanded, self.qd = True, ZERO
+
+    def shift(self, shift_m: Vector, turn_rad: Vector) -> None:
+        """Move the target TCP aside by a compliance, beside what the program commands."""
+        before = self.tool
+        aside = turned(before, shift_m, turn_rad)
+        posture = self._solved(aside)
+        self._check(posture)
+        self.yielded_q = total(self.yielded_q, difference(posture.q, self.q))
+        x, y, z = self.yielded_m
+        self.yielded_m = (x + shift_m[0], y + shift_m[1], z + shift_m[2])
+        turn = turn_product(aside[0], transposed(before[0]))
+        self.yielded_turn = turn_product(turn, self.yielded_turn)
+        self.posture = posture
+
+    def brake(self, deceleration_rad_s2: float) -> None:
+        """Brake by one cycle, all joints in proportion."""
+        if not any(self.qd):
+            return
+        share = max(0.0, 1.0 - deceleration_rad_s2 * CYCLE_S / largest(self.qd))
+        limit, way_s = self.limits.joint_range_rad, (1 + share) / 2 * CYCLE_S
+        reached = [q + qd * way_s for q, qd in zip(self.q, self.qd, strict=True)]
+        self.posture = Posture(tuple([max(-limit, min(limit, q)) for q in reached]))
+        self.qd = tuple([qd * share for qd in self.qd])
+
+    def hold(self, q: Six) -> None:
+        """Stand still at joint angles."""
+        self.posture, self.qd = Posture(q), ZERO
+
+    def solve(self, tool: Transform, q_near: Six) -> Six | None:
+        """Return the joint angles for a TCP in the base, nearest to `q_near`; None out of reach."""
+        flange = product(tool, self._flange_in_tcp)
+        return nearest_inverse(flange, q_near, self.limits.joint_range_rad)
+
+    def _solved(self, tool: Transform) -> Posture:
+        """Return the posture for a TCP in the base, nearest to the present one."""
+        q = self.solve(tool, self.q)
+        if q is None:
+            raise ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
+        return Posture(q)
+
+    def _command(self, posture: Posture, qd: Six) -> None:
+        self._require_turn()
+        self._check(posture, qd)
+        self.commanded, self.posture, self.qd = True, posture, qd
+
+    def _require_turn(self) -> None:
+        if self.commanded:
+            raise ScriptError("another thread is already controlling the robot")
+
+    def _check(self, posture: Posture, qd: Six = ZERO) -> None:
+        """Refuse a posture out of limits, and speeds: those given and those with which it is reached."""
+        limits = self.limits
+        for plane in limits.planes:
+            here = plane.beyond(self.tool[1])
+            # a TCP found beyond, as after a change of TCP, may only come back
+            if plane.beyond(posture.tool(self._tcp)[1]) > max(0.0, here):
+                raise ProtectiveStop("the tool would pass a safety plane")
+        reached = largest(posture.q)
+        if reached > limits.joint_range_rad:
+            raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")
+        for speeds in (qd, rate(self.posture.q, posture.q)):
+            fastest = largest(speeds)
+            # rounding of a finite difference must not stop a joint that moves at its limit
+            if fastest > limits.joint_speed_rad_s * (1 + 1e-6):
+                joint = [abs(speed) for speed in speeds].index(fastest) + 1
+                raise ProtectiveStop(
+                    f"joint {joint} would turn at {fastest:.2f} rad/s, "
+                    f"above its limit of {limits.joint_speed_rad_s:.2f} rad/s"
+                )
+
+
+def rate(before: Six, now: Six) -> Six:
+    """Return by how much six numbers change in a second, from their change in a cycle."""
+    return tuple([change / CYCLE_S for change in map(sub, now, before)])

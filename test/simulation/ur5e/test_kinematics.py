@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""UR5e: forward and inverse against a product of exponentials made from the drawing's lengths."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from tactile_resonance.simulation.ur5e import kinematics
+from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
+from tactile_resonance.simulation.ur5e.kinematics import Posture
+from tactile_resonance.simulation.ur5e.outputs import (
+    LINK_CENTRE_M,
+    LINK_MASS_KG,
+    gravity_torque,
+    momentum,
+)
+from tactile_resonance.simulation.ur5e.poses import pose_from_transform, transform_from_pose
+
+sys.path.insert(0, str(Path(__file__).parent))
+from matrices import floats, forward, matrix, matrix_from_pose, transform, turn_between
+
+# The arm stretched along -x, all angles 0: axes and points on them, from the maker's lengths.
+UPPER, FORE, HEIGHT, OFFSET, WRIST_2, WRIST_3 = 0.425, 0.3922, 0.1625, 0.1333, 0.0997, 0.0996
+REACH = -(UPPER + FORE)
+SCREWS = [
+    ((0, 0, 1), (0, 0, 0)),
+    ((0, -1, 0), (0, 0, HEIGHT)),
+    ((0, -1, 0), (-UPPER, 0, HEIGHT)),
+    ((0, -1, 0), (REACH, 0, HEIGHT)),
+    ((0, 0, -1), (REACH, -OFFSET, HEIGHT)),
+    ((0, -1, 0), (REACH, -OFFSET, HEIGHT - WRIST_2)),
+]
+HOME = np.eye(4)
+HOME[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+HOME[:3, 3] = (REACH, -OFFSET - WRIST_3, HEIGHT - WRIST_2)
+
+
+def product_of_exponentials(q: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    for angle, (axis, point) in zip(q, SCREWS, strict=True):
+        twist = np.zeros((4, 4))
+        twist[:3, :3] = np.cross(np.eye(3), axis)
+        twist[:3, 3] = -np.cross(axis, point)
+        pose = pose @ expm(twist * angle)
+    return pose @ HOME
+
+
+def inverse(wanted: np.ndarray, *wrist_angle: float) -> list[tuple[float, ...]]:
+    return kinematics.inverse(transform(wanted), *wrist_angle)
+
+
+def nearest_inverse(wanted: np.ndarray, near: np.ndarray):
+    return kinematics.nearest_inverse(transform(wanted), floats(near))
+
+
+@pytest.fixture(scope="module")
+def postures() -> np.ndarray:
+    return np.random.default_rng(7).uniform(-np.pi, np.pi, (300, 6))
+
+
+def test_forward_agrees_with_a_product_of_exponentials(postures):
+    for q in postures:
+        np.testing.assert_allclose(forward(q), product_of_exponentials(q), atol=1e-12)
+
+
+def test_every_inverse_solution_reaches_the_pose_and_one_is_the_posture(postures):
+    counts = set()
+    for q in postures:
+        wanted = product_of_exponentials(q)
+        solutions = inverse(wanted)
+        counts.add(len(solutions))
+        for solution in solutions:
+            np.testing.assert_allclose(forward(np.array(solution)), wanted, atol=1e-9)
+        away = [np.abs(np.exp(1j * np.array(s)) - np.exp(1j * q)).max() for s in solutions]
+        assert min(away) < 1e-6
+    assert 8 in counts
+
+
+def test_nearest_inverse_keeps_whole_turns_within_the_joints_range(postures):
+    rng = np.random.default_rng(8)
+    for q in postures[:100]:
+        turned = q + 2 * np.pi * rng.integers(-1, 2, 6)
+        turned = np.where(np.abs(turned) > 2 * np.pi, q, turned)
+        found = nearest_inverse(forward(turned), turned)
+        np.testing.assert_allclose(found, turned, atol=1e-6)
+
+
+def test_a_path_through_whole_turns_stays_continuous():
+    q = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.0])
+    for angle in np.arange(0.0, 6.2, 0.01):
+        wanted = q.copy()
+        wanted[5] = angle
+        found = nearest_inverse(forward(wanted), np.where(np.arange(6) == 5, angle - 0.01, q))
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+
+
+def test_parallel_wrist_axes_take_the_wrist_angle_given():
+    q = np.array([0.3, -1.2, 1.4, -1.7, 0.0, 0.8])
+    found = nearest_inverse(forward(q), q)
+    np.testing.assert_allclose(found, q, atol=1e-7)
+    np.testing.assert_allclose(forward(found), forward(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("fifth", [0.0, np.pi])
+@pytest.mark.parametrize("off", [0.0, 1e-8, 1e-7, 1e-6, 1e-4])
+def test_wrist_axes_that_are_almost_parallel_lose_no_digits(postures, fifth, off):
+    for q in postures[:100].copy():
+        q[4] = fifth - np.copysign(off, fifth - 1.0)
+        wanted = product_of_exponentials(q)
+        solutions = inverse(wanted, q[5])
+        assert solutions
+        for solution in solutions:
+            np.testing.assert_allclose(forward(np.array(solution)), wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("position", [(1.2, 0, 0.3), (0, 0, 1.3), (0.05, 0.0, 0.3)])
+def test_out_of_reach_has_no_solution(position):
+    flange = np.eye(4)
+    flange[:3, 3] = position
+    assert inverse(flange) == []
+    assert nearest_inverse(flange, np.zeros(6)) is None
+
+
+def test_the_nearest_solution_is_the_nearest_of_all_eight(postures):
+    rng = np.random.default_rng(9)
+    for q in postures:
+        # at a joint's turning point two solutions meet: the one that is tried first may be the wrong one
+        bent = q.copy()
+        bent[rng.choice([2, 4])] *= rng.choice([1.0, 1e-2, 1e-4, 0.0])
+        near = bent + rng.standard_normal(6) * rng.choice([1e-5, 1e-3, 0.1, 1.0])
+        wanted = product_of_exponentials(bent)
+        ways = [
+            np.abs(np.remainder(np.array(each) - near + np.pi, 2 * np.pi) - np.pi).sum()
+            for each in inverse(wanted, near[5])
+        ]
+        found = nearest_inverse(wanted, near)
+        np.testing.assert_allclose(forward(found), wanted, atol=1e-9)
+        assert np.abs(found - near).sum() == pytest.approx(min(ways), abs=1e-9)
+
+
+def test_all_solutions_are_looked_for_only_where_the_arms_own_will_not_do(postures, monkeypatch):
+    searched = []
+
+    def counted(*arguments):
+        searched.append(arguments)
+        return whole_search(*arguments)
+
+    whole_search = kinematics.inverse
+    monkeypatch.setattr(kinematics, "inverse", counted)
+    for q in postures:
+        nearest_inverse(forward(q), q + 1e-3)
+    # a thousandth of a radian from where two solutions meet: hardly ever
+    assert len(searched) < 0.05 * len(postures)
+    nearest_inverse(forward(postures[0]), postures[0] + [0, 0, 3.0, 0, 0, 0])
+    assert len(searched) > 0
+
+
+def test_twist_is_the_derivative_of_a_tool_point(postures):
+    tool = matrix_from_pose([0.02, -0.05, 0.13, 0.4, 0.1, -0.2])
+    for q in postures[:50]:
+        posture = Posture(floats(q))
+        point = floats((matrix(posture.flange) @ tool)[:3, 3])
+        step = 1e-6
+        for shift in step * np.eye(6):
+            ahead, behind = forward(q + shift) @ tool, forward(q - shift) @ tool
+            velocity = (ahead - behind)[:3, 3] / (2 * step)
+            turn = turn_between(behind, ahead) / (2 * step)
+            twist = posture.twist(point, floats(shift / step))
+            np.testing.assert_allclose(twist, [*velocity, *turn], atol=1e-8)
+
+
+def test_speeds_are_the_inverse_of_twist_and_torques_do_the_same_work(postures):
+    rng = np.random.default_rng(10)
+    for q in postures:
+        posture = Posture(floats(q))
+        point = floats(posture.flange[1] + rng.uniform(-0.2, 0.2, 3))
+        qd, wrench = floats(rng.standard_normal(6)), floats(rng.standard_normal(6))
+        twist = posture.twist(point, qd)
+        np.testing.assert_allclose(posture.speeds(point, twist), qd, atol=1e-8)
+        torques = posture.torques(point, wrench)
+        assert np.dot(torques, qd) == pytest.approx(np.dot(wrench, twist), abs=1e-12)
+
+
+@pytest.mark.parametrize(("joint", "angle"), [(2, 0.0), (4, 0.0)])
+def test_at_a_singularity_no_speeds_are_found(joint, angle):
+    q = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.3])
+    q[joint] = angle
+    q[1] = 0.0
+    posture = Posture(floats(q))
+    assert posture.speeds(posture.flange[1], (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)) is None
+
+
+def test_a_frame_that_the_flange_carries_is_the_product(postures):
+    posture = Posture(floats(postures[0]))
+    for pose in ([0.02, -0.05, 0.13, 0.4, 0.1, -0.2], [0.0] * 6, [0.1, 0, 0, 0, np.pi, 0]):
+        wanted = matrix(posture.flange) @ matrix_from_pose(pose)
+        carried = transform_from_pose(pose)
+        for _ in range(2):
+            np.testing.assert_allclose(matrix(posture.tool(carried)), wanted, atol=1e-15)
+
+
+def test_poses_and_transforms_are_inverse_to_each_other(postures):
+    for q in postures[:50]:
+        flange = Posture(floats(q)).flange
+        again = transform_from_pose(pose_from_transform(flange))
+        np.testing.assert_allclose(matrix(again), matrix(flange), atol=1e-12)
+
+
+def test_gravity_torque_is_the_gradient_of_potential_energy(postures):
+    payload = ToolPayload(1.3, (0.01, -0.02, 0.06))
+    gravity = np.array([0.0, 1.0, -9.7])
+
+    def energy(q):
+        frames = [matrix(frame) for frame in Posture(floats(q)).frames()]
+        total = 0.0
+        masses = [*LINK_MASS_KG, payload.mass_kg]
+        centres = [*LINK_CENTRE_M, payload.cog_m]
+        for mass, centre, frame in zip(masses, centres, [*frames[1:], frames[-1]], strict=True):
+            total -= mass * gravity @ (frame @ [*centre, 1.0])[:3]
+        return total
+
+    for q in postures[:20]:
+        slope = [(energy(q + d) - energy(q - d)) / 2e-6 for d in 1e-6 * np.eye(6)]
+        torque = gravity_torque(Posture(floats(q)), floats(gravity), payload)
+        np.testing.assert_allclose(torque, slope, atol=1e-6)
+
+
+def test_momentum_of_an_arm_that_turns_about_its_base():
+    q = np.array([0.0, -0.4, 0.7, -0.3, 1.0, 0.2])
+    posture = Posture(floats(q))
+    first_moment = np.zeros(2)
+    for mass, centre, frame in zip(LINK_MASS_KG, LINK_CENTRE_M, posture.frames()[1:], strict=True):
+        first_moment += mass * (matrix(frame) @ [*centre, 1.0])[:2]
+    expected = 0.5 * np.linalg.norm(first_moment)
+    assert momentum(posture, (0.5, 0, 0, 0, 0, 0), ToolPayload()) == pytest.approx(expected)
