@@ -91,7 +91,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
     """
     np.ones(4_000_000)  # the allocator keeps what a process has once used
     record = setup.play(setup.excitation, IDEAL)()
-    u, y = record.actuator.volts, record.sensor.volts
+    u, y = record.actuator.volts(), record.sensor.volts()
 
     def transform() -> tuple:
         return scipy.fft.rfft(u), scipy.fft.rfft(y)

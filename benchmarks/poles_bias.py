@@ -51,8 +51,8 @@ def tissue_bias(
         for effects in (BenchEffects.none(), BenchEffects()):
             run = bench.start(library[name], seed=0, effects=effects)
             blocks = [run.block(excitation) for _ in range(PERIODS)]
-            records.append([np.stack([b.actuator.volts.ravel() for b in blocks]),
-                            np.stack([b.sensor.volts.ravel() for b in blocks])])  # fmt: skip
+            records.append([np.stack([b.actuator.volts().ravel() for b in blocks]),
+                            np.stack([b.sensor.volts().ravel() for b in blocks])])  # fmt: skip
         mode = run.truth().mode_near(250.0)
         truth = np.array([mode.f0_hz, mode.damping_ratio])
         result[name] = []

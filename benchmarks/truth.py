@@ -169,7 +169,7 @@ def bench_table(count: int) -> list[str]:
         excitation = design_multisine(level_v=LEVEL_V, seed=k)
         block = bench.start(tissue, seed=k, effects=effects).block(Lines.of(excitation), 2)
         for bins, channel in ((u, block.actuator), (y, block.sensor)):
-            bins[k] = plan.transform(channel.volts.reshape(2, -1))
+            bins[k] = plan.transform(channel.volts().reshape(2, -1))
     alone = plan.from_bins(u, y)
     each = np.stack([alone.f0_hz[:, 0], alone.damping_ratio[:, 0]], axis=-1)
     lines = [
@@ -299,7 +299,7 @@ def _poles_of(run: BenchRun, blocks: int, seed: int) -> Poles:
     """Of a record of blocks from rest, with phases of its own."""
     excitation = design_multisine(band_hz=BAND_HZ, level_v=CREEP_LEVEL_V, seed=seed)
     block = run.block(Lines.of(excitation), blocks)
-    u, y = (c.volts.reshape(blocks, -1) for c in (block.actuator, block.sensor))
+    u, y = (c.volts().reshape(blocks, -1) for c in (block.actuator, block.sensor))
     return identify_poles_from_records(
         u,
         y,

@@ -7,6 +7,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from rosgraph_msgs.msg import Clock
 
@@ -14,9 +15,8 @@ from tactile_resonance.clock import ClockLostError, SimulatedClock, time_address
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.record import Channel, Origin, Record
+from tactile_resonance.record import Origin, Record
 from tactile_resonance.simulation.plant.bench_time import BenchTime
-from tactile_resonance.simulation.sensor.acquisition import Block, ChannelSamples
 from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 STEP_NS = 2_000_000
@@ -162,27 +162,14 @@ class BenchPlayer:
         return not self._stop.is_set()
 
 
-def bench_record(block: Block, excitation: Excitation, start_ns: int, frame_id: str) -> Record:
+def bench_record(block: Record, excitation: Excitation, start_ns: int, frame_id: str) -> Record:
     """Record of a block of an excitation that began at a ROS time [ns]."""
-    return Record(
-        actuator=_channel(block.actuator),
-        sensor=_channel(block.sensor),
-        sample_rate_hz=block.sample_rate_hz,
-        samples_per_period=block.samples_per_period,
-        realisation=excitation.realisation,
-        block_index=block.index,
-        origin=Origin(
-            measurement_id=excitation.measurement_id,
-            excitation_id=excitation.excitation_id,
-            time_ns=start_ns + round(block.start_time_s * 1e9),
-            frame_id=frame_id,
-            label=excitation.label,
-            simulated=True,
-        ),
+    origin = Origin(
+        measurement_id=excitation.measurement_id,
+        excitation_id=excitation.excitation_id,
+        time_ns=start_ns + block.origin.time_ns,
+        frame_id=frame_id,
+        label=excitation.label,
+        simulated=True,
     )
-
-
-def _channel(samples: ChannelSamples) -> Channel:
-    if samples.counts is None:
-        return Channel(samples.volts, saturated=samples.saturated)
-    return Channel(samples.counts, samples.scale_v, 0.0, samples.saturated)
+    return replace(block, realisation=excitation.realisation, origin=origin)

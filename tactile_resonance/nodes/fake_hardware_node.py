@@ -27,7 +27,6 @@ from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects
 from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import truth_of
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactSoFar
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
@@ -189,7 +188,7 @@ class FakeHardwareNode(ManagedNode):
                 since_s=request.hold_time_s or tip.since_s,
                 **(HERTZ if request.force_n or request.hold_time_s else {}),
             ).coupled(self._bench)
-            truth_to_response(truth_of(coupled, request.frequency_hz), response)
+            truth_to_response(coupled, request.frequency_hz, response)
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
         return response

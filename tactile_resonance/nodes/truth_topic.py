@@ -24,7 +24,7 @@ from tactile_resonance.recording.messages import (
     time_from_message,
 )
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, Truth
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from tactile_resonance.srv import Truth as TruthService
 
@@ -95,20 +95,24 @@ class TruthTopic:
         self._publisher.publish(poles_to_message(truth, origin))
 
 
-def truth_to_response(truth: Truth, response: TruthService.Response) -> None:
-    """Fill the answer of `bench/get_truth`."""
+def truth_to_response(
+    truth: CoupledBimorph, frequency_hz: Sequence[float], response: TruthService.Response
+) -> None:
+    """Fill the answer of `bench/get_truth`, with the response at frequencies (F,) [Hz]."""
     response.success = True
     response.feedthrough = truth.feedthrough
-    if truth.tissue is not None:
-        response.tissue = truth.tissue.name
-        response.force_n = truth.force_n
-        response.contact_radius_m = truth.contact_radius_m
-        response.indentation_m = truth.indentation_m
-        response.relaxation_modulus_1s_pa = truth.tissue.relaxation_modulus_1s_pa
     fill_complex(response, "pole_", truth.poles_rad_s, "_rad_s")
     fill_complex(response, "residue_", truth.residues_rad_s, "_rad_s")
     fill(response.f0_hz, [mode.f0_hz for mode in truth.modes])
     fill(response.damping_ratio, [mode.damping_ratio for mode in truth.modes])
-    fill_complex(response, "response_", truth.response)
-    if truth.contact_stiffness_n_per_m is not None:
-        fill_complex(response, "stiffness_", truth.contact_stiffness_n_per_m, "_n_per_m")
+    frequency = np.asarray(frequency_hz, dtype=float)
+    fill_complex(response, "response_", truth.frequency_response(frequency))
+    contact = truth.contact
+    if contact is not None:
+        response.tissue = contact.tissue.name
+        response.force_n = contact.force_n
+        response.contact_radius_m = contact.contact_radius_m
+        response.indentation_m = contact.indentation_m
+        response.relaxation_modulus_1s_pa = contact.tissue.relaxation_modulus_1s_pa
+        stiffness = contact.dynamic_stiffness(2j * np.pi * frequency)
+        fill_complex(response, "stiffness_", stiffness, "_n_per_m")

@@ -14,7 +14,6 @@ from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.truth_topic import TruthTopic
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import truth_of
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -34,6 +33,6 @@ def test_truth_of_a_contact_that_changes_is_its_mean():
     np.testing.assert_allclose([over.f0_hz, over.damping_ratio, over.imag_rad_s], means, rtol=1e-12)
     assert over.contact_force_n == pytest.approx(forces.mean())
     assert over.measurement_id == 5
-    modes = truth_of(tip.coupled(bench), ()).modes
+    modes = tip.coupled(bench).modes
     np.testing.assert_allclose(now.f0_hz, [mode.f0_hz for mode in modes])
     assert now.contact_force_n == 0.01

@@ -58,8 +58,8 @@ def measure(scene, phantoms, design, bench, point, attempt):
     band = (scene.sensor.band_low_hz, scene.sensor.band_high_hz)
     u, y = [], []
     for block in running.play(excitation, design.periods):
-        u.append(block.actuator.volts)
-        y.append(block.sensor.volts)
+        u.append(block.actuator.volts())
+        y.append(block.sensor.volts())
         poles = identify_poles_from_records(
             np.array(u),
             np.array(y),

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the simulated acquisition adds to clean signals, and the blocks it hands out."""
+"""What the simulated acquisition adds to clean signals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.fields import require
+from tactile_resonance.record import Channel
 from tactile_resonance.simulation.sensor.linear import FloatArray
 
 
@@ -59,28 +59,6 @@ class BenchEffects:
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelSamples:
-    """Samples of one channel: counts with a scale, or volts.
-
-    Attributes
-    ----------
-    counts : (samples,) int32 array or None
-        None where the channel is not quantised.
-    scale_v : float
-        Volts per count; 0 without counts.
-    volts : (samples,) float array
-        The samples in volts, whichever way they were taken.
-    saturated : bool
-        A sample stands at the end of the converter's range.
-    """
-
-    counts: NDArray[np.int32] | None
-    scale_v: float
-    volts: FloatArray
-    saturated: bool
-
-
-@dataclass(frozen=True, eq=False)
 class SignalParts:
     """What a block is made of, (samples,) arrays in volts.
 
@@ -97,41 +75,7 @@ class SignalParts:
     noise_v: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Simulated samples of both channels over whole periods.
-
-    Attributes
-    ----------
-    realisation : int
-        Counts the excitations of the run, from 0.
-    index : int
-        Index of the first period within the realisation, from 0.
-    start_time_s : float
-        Time of the first sample since the start of the run.
-    sample_rate_hz : float
-    samples_per_period : int
-    actuator, sensor : ChannelSamples
-    parts : SignalParts or None
-        Where the run keeps them.
-    """
-
-    realisation: int
-    index: int
-    start_time_s: float
-    sample_rate_hz: float
-    samples_per_period: int
-    actuator: ChannelSamples
-    sensor: ChannelSamples
-    parts: SignalParts | None
-
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return self.sensor.volts.size
-
-
-def convert(volts: FloatArray, scale_v: float, bits: int) -> ChannelSamples:
+def convert(volts: FloatArray, scale_v: float, bits: int) -> Channel:
     """Quantise volts to signed counts, clipped to the range of the converter.
 
     Within range the error is at most half a count.
@@ -139,38 +83,4 @@ def convert(volts: FloatArray, scale_v: float, bits: int) -> ChannelSamples:
     lowest, highest = -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
     counts = np.clip(np.rint(volts * (1 / scale_v)), lowest, highest).astype(np.int32)
     saturated = bool(counts.size) and bool(counts.min() == lowest or counts.max() == highest)
-    return ChannelSamples(counts, scale_v, counts.astype(float) * scale_v, saturated)
-
-
-def join(blocks: list[Block]) -> Block:
-    """Join consecutive blocks of one realisation into one."""
-    require(len(blocks) > 0, "blocks", len(blocks), "one block or more")
-    first = blocks[0]
-    if len(blocks) == 1:
-        return first
-    parts = [block.parts for block in blocks if block.parts is not None]
-    joined_parts = None
-    if parts:
-        joined_parts = SignalParts(
-            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SignalParts))
-        )
-    return Block(
-        first.realisation,
-        first.index,
-        first.start_time_s,
-        first.sample_rate_hz,
-        first.samples_per_period,
-        _join_channel([block.actuator for block in blocks]),
-        _join_channel([block.sensor for block in blocks]),
-        joined_parts,
-    )
-
-
-def _join_channel(channels: list[ChannelSamples]) -> ChannelSamples:
-    counts = [channel.counts for channel in channels if channel.counts is not None]
-    return ChannelSamples(
-        np.concatenate(counts) if counts else None,
-        channels[0].scale_v,
-        np.concatenate([channel.volts for channel in channels]),
-        any(channel.saturated for channel in channels),
-    )
+    return Channel(counts, scale_v, saturated=saturated)

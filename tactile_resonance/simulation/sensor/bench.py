@@ -10,19 +10,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import require
+from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
-from tactile_resonance.simulation.sensor.acquisition import (
-    BenchEffects,
-    Block,
-    ChannelSamples,
-    SignalParts,
-    convert,
-    join,
-)
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, Truth, couple, truth_of
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects, SignalParts, convert
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.sensor.linear import (
     FloatArray,
     Lines,
@@ -77,6 +70,11 @@ class BenchRun:
 
     The state of the sensor carries over from block to block and from excitation to excitation.
     Playing the same excitation again continues its periods; another one starts a new realisation.
+
+    Attributes
+    ----------
+    parts : SignalParts or None
+        What the newest block is made of, where the run keeps it.
     """
 
     def __init__(
@@ -96,6 +94,7 @@ class BenchRun:
         self._coupled_at = coupled_at
         self._acquisition = sensor.acquisition
         self._keep_parts = keep_parts
+        self.parts: SignalParts | None = None
         skew = effects.channel_skew_s
         direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
         late_s = max(0.0, skew)
@@ -123,13 +122,13 @@ class BenchRun:
         """What a converter would not tell [V]: no free decay is computed below it; 0: all are."""
         return NEGLIGIBLE_COUNTS * self._acquisition.sensor_scale_v * self.effects.quantisation
 
-    def truth(self, frequency_hz: ArrayLike = (), *, time_s: float = 0.0) -> Truth:
-        """Return the exact linear behaviour, with the response at `frequency_hz` [Hz].
+    def truth(self, time_s: float = 0.0) -> CoupledBimorph:
+        """Return the exact linear sensor; on the contact at `time_s` since the start, where it changes.
 
-        Of the contact at `time_s` since the start, where it changes.
+        At drives of 1 V rms and below estimates are to be compared with it; above, the best linear
+        approximation of the nonlinear sensor differs.
         """
-        coupled = self.coupled if self._coupled_at is None else self._coupled_at(time_s)
-        return truth_of(coupled, frequency_hz)
+        return self.coupled if self._coupled_at is None else self._coupled_at(time_s)
 
     def effort(self, excitation: PeriodicExcitation | Lines) -> Effort:
         """Return what an excitation from rest takes; computed without playing it."""
@@ -149,11 +148,26 @@ class BenchRun:
             omitted_v=float(np.minimum(size, floor).sum()),
         )
 
-    def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Block:
-        """Return the next periods of an excitation as one block."""
+    def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Record:
+        """Return the next periods of an excitation as one block; its origin's time counts from the start."""
         require(periods >= 1, "periods", periods, "1 or above")
         lines = self._take_up(excitation)
-        return join([self._make_period(lines) for _ in range(periods)])
+        index, start_s = self._index, self._samples / lines.sample_rate_hz
+        made = [self._make_period(lines) for _ in range(periods)]
+        if self._keep_parts:
+            self.parts = SignalParts(
+                *map(np.concatenate, zip(*(kept for *_, kept in made), strict=True))
+            )
+        drive, sensed = (np.concatenate([period[k] for period in made]) for k in (0, 1))
+        return Record(
+            actuator=self._channel(drive, self._acquisition.actuator_scale_v),
+            sensor=self._channel(sensed, self._acquisition.sensor_scale_v),
+            sample_rate_hz=lines.sample_rate_hz,
+            samples_per_period=lines.samples_per_period,
+            realisation=self._realisation,
+            block_index=index,
+            origin=Origin(time_ns=round(1e9 * start_s), simulated=True),
+        )
 
     def play(
         self,
@@ -161,7 +175,7 @@ class BenchRun:
         periods: int,
         *,
         periods_per_block: int = 1,
-    ) -> Iterator[Block]:
+    ) -> Iterator[Record]:
         """Yield the next periods of an excitation block by block; each is made when asked for."""
         require(periods_per_block >= 1, "periods_per_block", periods_per_block, "1 or above")
         whole = periods >= 1 and periods % periods_per_block == 0
@@ -193,7 +207,10 @@ class BenchRun:
             self._index = 0
         return self._lines
 
-    def _make_period(self, lines: Lines) -> Block:
+    def _make_period(
+        self, lines: Lines
+    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...] | None]:
+        """Drive and sensor voltage over one period; where they are kept, the fields of `SignalParts`."""
         samples = lines.samples_per_period
         drive, clean = self._drive.play(lines), self._sensor.play(lines)
         linear = clean if self._linear is None else self._linear.play(lines)
@@ -201,38 +218,21 @@ class BenchRun:
         sensor_rms = self._acquisition.noise_rms_v(lines.sample_rate_hz)
         noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, samples)
         disturbance = self._disturbance(lines.sample_rate_hz, samples)
-        parts = None
-        if self._keep_parts:
-            zero = np.zeros(samples)
-            parts = SignalParts(
-                actuator_v=drive,
-                actuator_noise_v=zero if drive_noise is None else drive_noise,
-                linear_v=linear,
-                distortion_v=clean - linear,
-                disturbance_v=zero if disturbance is None else disturbance,
-                noise_v=zero if noise is None else noise,
-            )
-        for added in (disturbance, noise):
-            clean = clean if added is None else clean + added
-        drive = drive if drive_noise is None else drive + drive_noise
-        block = Block(
-            realisation=self._realisation,
-            index=self._index,
-            start_time_s=self._samples / lines.sample_rate_hz,
-            sample_rate_hz=lines.sample_rate_hz,
-            samples_per_period=lines.samples_per_period,
-            actuator=self._channel(drive, self._acquisition.actuator_scale_v),
-            sensor=self._channel(clean, self._acquisition.sensor_scale_v),
-            parts=parts,
-        )
         self._index += 1
         self._samples += samples
-        return block
+        kept = None
+        if self._keep_parts:
+            added = (drive_noise, disturbance, noise)
+            first, second, third = (np.zeros(samples) if a is None else a for a in added)
+            kept = (drive, first, linear, clean - linear, second, third)
+        for part in (disturbance, noise):
+            clean = clean if part is None else clean + part
+        return drive if drive_noise is None else drive + drive_noise, clean, kept
 
-    def _channel(self, volts: FloatArray, scale_v: float) -> ChannelSamples:
+    def _channel(self, volts: FloatArray, scale_v: float) -> Channel:
         if self.effects.quantisation:
             return convert(volts, scale_v, self._acquisition.adc_bits)
-        return ChannelSamples(None, 0.0, volts, False)
+        return Channel(volts)
 
     def _noise(self, channel: int, rms_v: float, samples: int) -> FloatArray | None:
         """Return noise that depends on seed, realisation, period and channel only."""
@@ -264,7 +264,7 @@ class SimulatedBench:
     >>> bench = SimulatedBench.from_configuration()
     >>> run = bench.start(read_tissues()["gel10"], seed=1)  # doctest: +SKIP
     >>> for block in run.play(excitation, periods=8):       # doctest: +SKIP
-    ...     block.actuator.volts, block.sensor.volts
+    ...     block.actuator.volts(), block.sensor.volts()
     """
 
     sensor: SensorParameters
@@ -315,7 +315,7 @@ class SimulatedBench:
             into blocks.
         effects : BenchEffects
         keep_parts : bool
-            Keep clean signal, distortion, disturbance and noise apart in every block.
+            Keep clean signal, distortion, disturbance and noise of the newest block apart, in `BenchRun.parts`.
         """
         coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
         return BenchRun(self.sensor, coupled, seed, effects, keep_parts)

@@ -62,7 +62,7 @@ def records_at_levels(
             )
             run = bench.start(tissue, seed=seed + m, effects=BenchEffects(nonlinearity=True))
             block = run.block(excitation, periods)
-            channels.append([block.actuator.volts, block.sensor.volts])
+            channels.append([block.actuator.volts(), block.sensor.volts()])
         u, y = np.moveaxis(np.array(channels), 1, 0).reshape(2, realisations, periods, -1)
         records[level_v] = (u, y, excitation.harmonics, excitation.sample_rate_hz)
     return records
@@ -103,7 +103,7 @@ def repeated_records(
                 run = bench.start(tissue, force_n=force_n, seed=int(rng.integers(2**62)))
                 block = run.block(excitation, periods + 1)
                 for target, channel in ((u, block.actuator), (y, block.sensor)):
-                    target[i, j, k] = channel.volts.reshape(periods + 1, n)[1:]
+                    target[i, j, k] = channel.volts().reshape(periods + 1, n)[1:]
     return u, y, excitation.harmonics, excitation.sample_rate_hz
 
 

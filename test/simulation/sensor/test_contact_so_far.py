@@ -60,11 +60,11 @@ def test_a_run_on_it_is_that_of_each_contact(bench, library, multisine):
     found = following.play(excitation, 2)
     so_far.extend(period_s, [ContactState(0.01, start.contact_radius_m, start.indentation_m)] * 3)
     one_count_v = expected[0].sensor.scale_v  # where rounding decides
-    first = next(found).sensor.volts
-    np.testing.assert_allclose(first, expected[0].sensor.volts, rtol=0, atol=1.01 * one_count_v)
+    first = next(found).sensor.volts()
+    np.testing.assert_allclose(first, expected[0].sensor.volts(), rtol=0, atol=1.01 * one_count_v)
     so_far.extend(period_s, [state_under(bench, gel, 0.012)] * 3)
-    change = next(found).sensor.volts - expected[1].sensor.volts
-    assert np.abs(change).max() > 1e-3 * np.abs(expected[1].sensor.volts).max()
+    change = next(found).sensor.volts() - expected[1].sensor.volts()
+    assert np.abs(change).max() > 1e-3 * np.abs(expected[1].sensor.volts()).max()
 
 
 def test_parts_are_as_fine_as_the_sensor_follows():

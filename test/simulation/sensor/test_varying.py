@@ -120,7 +120,7 @@ def test_contact_at_rest_is_the_exact_response(bench, library, sensor, multisine
             run.skip(lines, 1)
         pairs = [(r.block(lines, 2), r.block(silence(50e3, 799))) for r in (found, expected)]
         for one, other in zip(*pairs, strict=True):
-            np.testing.assert_allclose(one.sensor.volts, other.sensor.volts, atol=1e-12)
+            np.testing.assert_allclose(one.sensor.volts(), other.sensor.volts(), atol=1e-12)
 
 
 def test_state_carried_to_another_contact_and_back_is_the_same(sensor, library, bench):
@@ -144,8 +144,8 @@ def test_truth_of_a_run_follows_the_contact(bench, library):
     run = bench.start_varying(partial(history.coupled_at, bench.sensor))
     early, late = (run.truth(time_s=t) for t in (0.0, 3.2))
     assert late.mode_near(250).f0_hz - early.mode_near(250).f0_hz == pytest.approx(-0.73, abs=0.03)
-    assert late.contact_radius_m > early.contact_radius_m
-    assert late.force_n == early.force_n == 0.01
+    assert late.contact.contact_radius_m > early.contact.contact_radius_m
+    assert late.contact.force_n == early.contact.force_n == 0.01
 
 
 def test_bad_histories_are_refused_by_name(bench, library):
