@@ -10,6 +10,8 @@ import pytest
 
 import tactile_resonance as tr
 from tactile_resonance import front
+from tactile_resonance.recording.store import RecordStore
+from test.recording import stores
 
 
 def test_examples_run():
@@ -57,6 +59,25 @@ def test_a_file_goes_to_its_poles(tmp_path):
     of_frf = tr.identify_poles(tr.estimate_frf(recording), band_hz=(200, 300))
     assert np.all(np.abs(of_frf.main.estimate - [f0_hz, damping]) < 5 * of_frf.main.std)
     assert of_frf.main.std[0] > poles.main.std[0]
+
+
+def test_a_folder_of_stored_records_is_read_as_it_was_measured(tmp_path):
+    """Samples and lines come back; one of several measurements is named, and so many periods are used."""
+    store = RecordStore(tmp_path)
+    planned, records = stores.write(store, 7, realisations=2, periods=4)
+    recording = tr.read_record(tmp_path)
+    assert recording.sample_rate_hz == planned[0].sample_rate_hz
+    np.testing.assert_array_equal(recording.excited_harmonics, planned[0].harmonics)
+    for channel, found in (("actuator", recording.u), ("sensor", recording.y)):
+        volts = np.reshape([getattr(record, channel).volts() for record in records], found.shape)
+        np.testing.assert_array_equal(found, volts)
+    assert recording.u.shape == (2, 4, stores.SAMPLES)
+    assert tr.read_record(tmp_path, periods=3).u.shape == (2, 3, stores.SAMPLES)
+    _, others = stores.write(store, 9)
+    with pytest.raises(ValueError, match="measurement_id: not given, .* holds 7, 9"):
+        tr.read_record(tmp_path)
+    chosen = tr.read_record(tmp_path, 9)
+    np.testing.assert_array_equal(chosen.y[0, 0], others[0].sensor.volts())
 
 
 def test_something_else_than_a_recording_is_refused():

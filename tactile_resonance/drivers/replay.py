@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,33 +18,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.recording.store import (
-    StoredMeasurement,
-    list_measurements,
-    read_measurement,
-)
-
-
-class SourceEntry(Protocol):
-    """One measurement that can be read."""
-
-    @property
-    def measurement_id(self) -> int:
-        """Its id."""
-        ...
-
-
-class MeasurementSource(Protocol):
-    """Measurements in the order in which they were taken."""
-
-    @property
-    def entries(self) -> Sequence[SourceEntry]:
-        """All of them."""
-        ...
-
-    def read(self, entry: Any) -> StoredMeasurement:
-        """One of `entries`; ValueError where it is damaged."""
-        ...
+from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, list_measurements
 
 
 class ReplayDevice:
@@ -60,8 +33,8 @@ class ReplayDevice:
         and delay stay unknown, and its blocks carry the time of the replay.
     speed : float
         Signal time over real time; 0: as fast as possible.
-    source : MeasurementSource, optional
-        Where the measurements are where `path` is neither: the run of a scan, for example.
+    entries : sequence of StoredEntry, optional
+        The measurements where `path` is neither: the run of a scan, for example.
 
     Raises
     ------
@@ -72,7 +45,7 @@ class ReplayDevice:
     """
 
     def __init__(
-        self, path: Path, speed: float = 1.0, source: MeasurementSource | None = None
+        self, path: Path, speed: float = 1.0, entries: Sequence[StoredEntry] | None = None
     ) -> None:
         if not speed >= 0:
             raise ValueError(f"speed: {speed}, expected 0 (as fast as possible) or above")
@@ -89,20 +62,17 @@ class ReplayDevice:
         self._index = 0
         self._stopped = threading.Event()
         self._closed = False
-        self._read: Callable[[Any], StoredMeasurement] = read_measurement
-        self._entries: Sequence[SourceEntry] = ()
-        if source is not None:
-            self._entries, self._read = source.entries, source.read
-            if not self._entries:
-                raise ValueError(f"{path}: no measurement in it, expected a run with one")
-        elif path.is_dir():
-            self._entries, problems = list_measurements(path)
-            if not self._entries:
-                raise ValueError(
-                    f"{path}: no measurement in it, expected a folder of records {problems[:3]}"
-                )
-        else:
+        self._entries: Sequence[StoredEntry] = ()
+        if entries is None and not path.is_dir():
             self._file = _measurement_of_file(read_recording(path), path.name)
+            return
+        problems: list[str] = []
+        if entries is None:
+            entries, problems = list_measurements(path)
+        if not entries:
+            accepted = "a folder of records, or a run with one"
+            raise ValueError(f"{path}: no measurement in it, expected {accepted} {problems[:3]}")
+        self._entries = entries
 
     def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
         """The realisations recorded, each with as many periods; see `AcquisitionDevice.plan`.
@@ -236,7 +206,7 @@ class ReplayDevice:
                 if entry.measurement_id == measurement_id:
                     # out of turn: the turn of the others stays what it is
                     self._next_after = self._next
-                    measurement = self._read(entry)
+                    measurement = entry.read()
                     if measurement.records and _is_silent(measurement) != (asked.level_v == 0):
                         raise DeviceError(
                             f"replay: measurement {measurement_id} is silent, or the goal is: one of them"
@@ -249,7 +219,7 @@ class ReplayDevice:
                     )
             raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
         for position in range(self._next, len(self._entries)):
-            measurement = self._read(self._entries[position])
+            measurement = self._entries[position].read()
             if measurement.records and _is_silent(measurement) == (asked.level_v == 0):
                 self._next_after = position + 1
                 return measurement
@@ -299,4 +269,4 @@ def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:
             )
             for period in range(periods)
         ]
-    return StoredMeasurement(0, tuple(excitations), tuple(records), (), ())
+    return StoredMeasurement(0, tuple(excitations), tuple(records))

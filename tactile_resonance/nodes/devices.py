@@ -18,7 +18,7 @@ from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.recording.store import RecordStore
 
 if TYPE_CHECKING:
-    from tactile_resonance.drivers.replay import MeasurementSource
+    from tactile_resonance.recording.store import StoredEntry
 
 PARAMETERS = (
     Parameter(
@@ -77,7 +77,7 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         # only here: it takes a node a tenth of a second more to start
         from tactile_resonance.drivers.replay import ReplayDevice
 
-        return ReplayDevice(path, speed, _source_of(path))
+        return ReplayDevice(path, speed, _entries_of(path))
     if device == "nidaqmx":
         return NiDaqDevice(read_nidaq_config(path))
     raise ValueError(f"device: {device!r}, accepted are bench, replay, nidaqmx")
@@ -99,18 +99,18 @@ def _is_run(path: Path) -> bool:
     return (path / "run.json").is_file()
 
 
-def _source_of(path: Path) -> MeasurementSource | None:
+def _entries_of(path: Path) -> list[StoredEntry] | None:
     """The measurements of a scan's run; None for a folder that the device reads without them."""
     if not _is_run(path):
         return None
     try:
         # only here: everything else works without the library for recordings
-        from tactile_resonance.scan.recorded import RunSource
+        from tactile_resonance.scan.recorded import run_entries
     except ImportError as error:
         raise ValueError(
             f"device: replay of a run: {error.name} not found; pip install rosbags"
         ) from error
-    return RunSource(path)
+    return run_entries(path)
 
 
 def open_store(

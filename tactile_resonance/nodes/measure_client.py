@@ -14,8 +14,9 @@ from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, Recording
+from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.run_directory import PointRecording
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
@@ -54,7 +55,7 @@ class MeasureClient:
         label: str,
         seed: int,
         enough: Callable[[msg.Poles, int], bool],
-        recording: Recording,
+        recording: PointRecording,
         check: Check,
         poll: Poll,
         held: Callable[[], None],

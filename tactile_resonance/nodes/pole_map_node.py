@@ -27,14 +27,9 @@ from tactile_resonance.scan.map_messages import (
     surface_message,
 )
 from tactile_resonance.scan.messages import to_cdr
-from tactile_resonance.scan.point_result import PointKind, PointOutcome, from_message
-from tactile_resonance.scan.pole_map import (
-    EllipseScale,
-    MapPoint,
-    PoleMap,
-    accepted_point,
-    map_point,
-)
+from tactile_resonance.scan.point_outcome import with_poles
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, from_message
+from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
@@ -183,20 +178,29 @@ class PoleMapNode(ManagedNode):
         result = from_message(message)
         if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
             return
-        now = self._map.without(result.position_m, result.frame_id)
+        now = self._map.without(result)
         if result.outcome is not PointOutcome.SKIPPED and message.poles:
-            point = self._point(message.poles[0], result.contact_age_s)
+            point = self._point(message.poles[0], result)
             if point is not None:
-                now = now.with_point(accepted_point(result, point))
+                now = now.with_point(point)
         self._set(now)
 
-    def _point(self, message: msg.Poles, age_s: float = math.nan) -> MapPoint | None:
-        """Where poles lie on the map; None where they do not, with the reason in the diagnostics."""
+    def _point(self, message: msg.Poles, result: PointResult | None = None) -> MapPoint | None:
+        """Where poles lie on the map; None where they do not, with the reason in the diagnostics.
+
+        Without the result of a scan the place of the tip distinguishes them.
+        """
         try:
             poles, origin = poles_from_message(message)
             (level,) = values(self, "unknown_level")
-            point = map_point(poles, origin, self._classes, level, self._nominal, age_s)
             frame_id = origin.contact.frame_id
+            if result is None:
+                x_m, y_m, z_m = origin.contact.position_m or (math.nan,) * 3
+                result = PointResult(0, x_m=x_m, y_m=y_m, z_m=z_m, frame_id=frame_id)
+            result = with_poles(
+                result, poles, origin, self._classes, level, self._nominal, result.contact_age_s
+            )
+            point = MapPoint.of_tip(result, origin)
             if not self._frame_id:
                 self._frame_id = frame_id
             if frame_id == self._moved_frame:

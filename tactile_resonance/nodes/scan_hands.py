@@ -30,12 +30,12 @@ from tactile_resonance.scan.hands import (
     NodeAway,
     PointDisturbed,
     PointFailed,
-    Recording,
     ScanEnded,
     Stopped,
     Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
@@ -166,7 +166,7 @@ class NodeHands:
         label: str,
         seed: int,
         enough: Callable[[Measured, int], bool],
-        recording: Recording,
+        recording: PointRecording,
         check: Check,
     ) -> Measured:
         """Measure until it is enough or the design's end; all messages go into the recording."""

@@ -17,8 +17,8 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
-from tactile_resonance.scan.hands import Recording
 from tactile_resonance.scan.point_file import offered_qos
+from tactile_resonance.scan.run_directory import PointRecording
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ScanRecorder:
         self.poles: queue.SimpleQueue[msg.Poles] = queue.SimpleQueue()
         self.force_reason = ""
         self._lock = threading.Lock()
-        self._recording: Recording | None = None
+        self._recording: PointRecording | None = None
         self._measurement_id = 0
         self._counts: Counter[str] = Counter()
         self._played: set[int] = set()  # excitation ids of the records that came
@@ -73,7 +73,7 @@ class ScanRecorder:
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
-    def record_into(self, recording: Recording, measurement_id: int) -> None:
+    def record_into(self, recording: PointRecording, measurement_id: int) -> None:
         """Write what comes from now on there; of measurements only this one."""
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from tactile_resonance.recording.stored_file import read_stored, sync_folder, wr
 _MEASUREMENT = re.compile(r"(\d+)-(\d+)")
 _EXCITATION = re.compile(r"excitation-(\d+)\.npz")
 _RECORD = re.compile(r"record-(\d+)-(\d+)\.npz")
+_MOST_LISTED = 20
 _SAMPLE_BYTES = 8  # at most: floating point; counts take less
 _FILE_BYTES = 16384  # fields beside the samples, and what the file system rounds up to
 
@@ -69,7 +70,7 @@ class RecordStore:
                 f"record_folder: {self.folder} has {free / 1e6:.0f} MB free, the measurement may "
                 f"take {planned / 1e6:.0f} MB"
             )
-        number = max((entry.number for entry in entries), default=0) + 1
+        number = 1 + (int(entries[-1].path.name.split("-")[0]) if entries else 0)
         path = self.folder / f"{number:06d}-{key}"
         path.mkdir()
         sync_folder(self.folder)
@@ -93,15 +94,6 @@ class RecordStore:
 
 
 @dataclass(frozen=True)
-class StoredEntry:
-    """Where one measurement is: its number in the store, id and folder."""
-
-    number: int
-    measurement_id: int
-    folder: Path
-
-
-@dataclass(frozen=True)
 class StoredMeasurement:
     """What is readable of one measurement.
 
@@ -112,8 +104,6 @@ class StoredMeasurement:
         By realisation.
     records : tuple of Record
         By realisation and block.
-    gaps : tuple of (realisation, block)
-        Blocks that should lie before a recorded one and do not; an early end is no gap.
     problems : tuple of str
         Damaged and foreign files, by name.
     """
@@ -121,36 +111,85 @@ class StoredMeasurement:
     measurement_id: int
     excitations: tuple[Excitation, ...]
     records: tuple[Record, ...]
-    gaps: tuple[tuple[int, int], ...]
-    problems: tuple[str, ...]
+    problems: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        measurement_id: int,
+        excitations: Iterable[Excitation],
+        records: Iterable[Record],
+        problems: Iterable[str],
+    ) -> StoredMeasurement:
+        """From excitations and records in any order; of those of one place the last counts."""
+        played = {excitation.realisation: excitation for excitation in excitations}
+        taken = {(record.realisation, record.block_index): record for record in records}
+        in_order = tuple(played[m] for m in sorted(played)), tuple(taken[at] for at in sorted(taken))
+        return cls(measurement_id, *in_order, tuple(problems))
+
+    @property
+    def gaps(self) -> tuple[tuple[int, int], ...]:
+        """(realisation, block) of what is missing before the last record; an early end is no gap."""
+        if not self.records:
+            return ()
+        planned = {excitation.realisation: excitation for excitation in self.excitations}
+        seen = {(record.realisation, record.block_index) for record in self.records}
+        last = self.records[-1]
+        expected = []
+        for realisation in range(last.realisation + 1):
+            blocks = 1 + max((b for m, b in seen if m == realisation), default=-1)
+            if realisation < last.realisation and realisation in planned:
+                n = planned[realisation].samples_per_period
+                periods = max(1, last.actuator.samples.size // n)  # in each block
+                blocks = max(blocks, -(-planned[realisation].periods // periods))
+            expected += [(realisation, block) for block in range(blocks)]
+        return tuple(place for place in expected if place not in seen)
 
 
 @dataclass(frozen=True)
-class StoreContent:
-    """All measurements of a store, in the order they were begun, and what could not be read."""
+class StoredEntry:
+    """One measurement of a store or a run: its id, folder or file, and the function that reads it."""
 
-    measurements: tuple[StoredMeasurement, ...]
-    problems: tuple[str, ...]
+    measurement_id: int
+    path: Path
+    reader: Callable[[StoredEntry], StoredMeasurement]
+
+    def read(self) -> StoredMeasurement:
+        """Everything readable of it; ValueError where nothing is, OSError where it cannot be listed."""
+        return self.reader(self)
+
+
+def choose(entries: Sequence[StoredEntry], measurement_id: int | None, where: Path) -> StoredEntry:
+    """The entry of an id, or the only one where none is named; ValueError that lists what is there."""
+    by_id = {entry.measurement_id: entry for entry in entries}
+    ids = ", ".join(str(key) for key in list(by_id)[:_MOST_LISTED]) or "none"
+    if len(by_id) > _MOST_LISTED:
+        ids += f" and {len(by_id) - _MOST_LISTED} more"
+    if measurement_id is None and len(entries) == 1:
+        return entries[0]
+    if measurement_id not in by_id:
+        asked = "not given" if measurement_id is None else measurement_id
+        raise ValueError(f"measurement_id: {asked}, {where} holds {ids}")
+    return by_id[measurement_id]
 
 
 def list_measurements(folder: Path) -> tuple[list[StoredEntry], list[str]]:
     """Measurements of a store in order, and what else lies there; OSError if unreadable."""
-    entries, problems = [], []
-    for path in sorted(folder.iterdir()):
+    found, problems = [], []
+    for path in folder.iterdir():
         match = _MEASUREMENT.fullmatch(path.name)
         if match and path.is_dir():
-            entries.append(StoredEntry(int(match[1]), int(match[2]), path))
+            found.append((int(match[1]), int(match[2]), path))
         else:
             problems.append(f"{path.name}: not a measurement of a store")
-    return sorted(entries, key=lambda entry: (entry.number, entry.measurement_id)), problems
+    return [StoredEntry(key, path, _read) for _, key, path in sorted(found)], sorted(problems)
 
 
-def read_measurement(entry: StoredEntry) -> StoredMeasurement:
-    """Everything readable of one measurement; OSError if its folder cannot be listed."""
+def _read(entry: StoredEntry) -> StoredMeasurement:
     excitations: list[Excitation] = []
     records: list[Record] = []
     problems: list[str] = []
-    for path in sorted(entry.folder.iterdir()):
+    for path in sorted(entry.path.iterdir()):
         if path.name.endswith(".npz.part"):
             continue  # being written when its writer was killed; nobody has seen it
         try:
@@ -167,24 +206,8 @@ def read_measurement(entry: StoredEntry) -> StoredMeasurement:
             else:
                 raise ValueError(f"{path.name}: neither excitation nor record")
         except ValueError as error:
-            problems.append(f"{entry.folder.name}/{error}")
-    excitations.sort(key=lambda excitation: excitation.realisation)
-    records.sort(key=lambda record: (record.realisation, record.block_index))
-    return StoredMeasurement(
-        entry.measurement_id,
-        tuple(excitations),
-        tuple(records),
-        tuple(gaps_of(excitations, records)),
-        tuple(problems),
-    )
-
-
-def read_store(folder: Path) -> StoreContent:
-    """Everything readable of a store, all in memory; see `read_measurement` for one of many."""
-    entries, problems = list_measurements(folder)
-    measurements = tuple(read_measurement(entry) for entry in entries)
-    named = [problem for measurement in measurements for problem in measurement.problems]
-    return StoreContent(measurements, (*problems, *named))
+            problems.append(f"{entry.path.name}/{error}")
+    return StoredMeasurement.of(entry.measurement_id, excitations, records, problems)
 
 
 def _planned_bytes(excitation: Excitation) -> int:
@@ -195,21 +218,3 @@ def _planned_bytes(excitation: Excitation) -> int:
 def _check_name(path: Path, found: tuple[int, ...], named: tuple[int, ...]) -> None:
     if found != named:
         raise ValueError(f"{path.name}: holds what belongs to {found}, its name says {named}")
-
-
-def gaps_of(excitations: list[Excitation], records: list[Record]) -> list[tuple[int, int]]:
-    """(realisation, block) of what is missing before the last record."""
-    if not records:
-        return []
-    planned = {excitation.realisation: excitation for excitation in excitations}
-    seen = {(record.realisation, record.block_index) for record in records}
-    last = records[-1]
-    expected = []
-    for realisation in range(last.realisation + 1):
-        blocks = 1 + max((b for m, b in seen if m == realisation), default=-1)
-        if realisation < last.realisation and realisation in planned:
-            n = planned[realisation].samples_per_period
-            periods = max(1, last.actuator.samples.size // n)  # in each block
-            blocks = max(blocks, -(-planned[realisation].periods // periods))
-        expected += [(realisation, block) for block in range(blocks)]
-    return [place for place in expected if place not in seen]

@@ -12,14 +12,7 @@ import numpy.typing as npt
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.recording import Recording, make_recording
-from tactile_resonance.recording.store import (
-    StoredEntry,
-    StoredMeasurement,
-    list_measurements,
-    read_measurement,
-)
-
-_MOST_LISTED = 20
+from tactile_resonance.recording.store import StoredMeasurement, choose, list_measurements
 
 
 def read_store_recording(
@@ -48,7 +41,12 @@ def read_store_recording(
     OSError
         If the folder cannot be listed.
     """
-    return recording_of(read_measurement(_choose(folder, measurement_id)), periods)
+    entries, problems = list_measurements(folder)
+    if not entries:
+        raise ValueError(
+            f"{folder}: no measurement in it, expected a folder of records {problems[:3]}"
+        )
+    return recording_of(choose(entries, measurement_id, folder).read(), periods)
 
 
 def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> Recording:
@@ -122,22 +120,3 @@ def _same_lines(one: Excitation, other: Excitation) -> bool:
         and one.samples_per_period == other.samples_per_period
         and np.array_equal(one.harmonics, other.harmonics)
     )
-
-
-def _choose(folder: Path, measurement_id: int | None) -> StoredEntry:
-    entries, problems = list_measurements(folder)
-    ids = ", ".join(str(entry.measurement_id) for entry in entries[:_MOST_LISTED])
-    if len(entries) > _MOST_LISTED:
-        ids += f" and {len(entries) - _MOST_LISTED} more"
-    if not entries:
-        raise ValueError(
-            f"{folder}: no measurement in it, expected a folder of records {problems[:3]}"
-        )
-    if measurement_id is None and len(entries) == 1:
-        return entries[0]
-    if measurement_id is None:
-        raise ValueError(f"measurement_id: not given, {folder} holds {ids}")
-    for entry in entries:
-        if entry.measurement_id == measurement_id:
-            return entry
-    raise ValueError(f"measurement_id: {measurement_id}, {folder} holds {ids}")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import tokenize
 import zipfile
@@ -16,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.files import write_whole
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 
@@ -50,15 +52,9 @@ def write_stored(path: Path, value: Excitation | Record) -> None:
     _flatten("", value, content)
     # a damaged zip directory can lose a field without an error
     content["fields"] = np.array(sorted(content))
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            np.savez(file, **content)  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    np.savez(buffer, **content)  # type: ignore[arg-type]
+    write_whole(path, buffer.getvalue())
     sync_folder(path.parent)
 
 

@@ -99,7 +99,7 @@ def _draw_plane(axes: Axes, pole_map: PoleMap, probability: float) -> None:
     """Poles by tissue class."""
     groups = pole_map.classes() or ("",)
     for k, name in enumerate(groups):
-        points = [p for p in pole_map.estimated if p.tissue_class == name]
+        points = [p.result for p in pole_map.estimated if p.result.tissue_class == name]
         x = np.array([p.estimate for p in points])
         axes.plot(*x.T, _MARKS[k % len(_MARKS)], color=f"C{k}", ms=4, label=name or "poles")
         for p in points:

@@ -13,7 +13,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
-from tactile_resonance.scan.run_directory import PointRecording, ReferenceRecording
+from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 
@@ -21,7 +21,6 @@ ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
 # A point that lost its node is repeated when the node is back, so often at most: it may be what ends the node.
 ATTEMPTS_WITHOUT_NODE = 24
 NODE_BACK_WITHIN_S = 120.0
-Recording = PointRecording | ReferenceRecording
 Check = Callable[[], None]
 
 
@@ -171,7 +170,7 @@ class Hands(Protocol):
         label: str,
         seed: int,
         enough: Callable[[Measured, int], bool],
-        recording: Recording,
+        recording: PointRecording,
         check: Check,
     ) -> Measured:
         """Measure; every message of it, and its id, goes into the recording.

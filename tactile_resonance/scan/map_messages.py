@@ -26,6 +26,7 @@ POINT = np.dtype(
     + [(name, "<f4") for name in ("damping_std", "force_n", "tissue_probability")]
     + [("tissue_class", "u1"), ("status", "u1"), ("_", "V2")]
 )
+_STATUS = {status.value: number for status, number in POLES_STATUS.items()}
 _BAR_STEPS = 32
 _SURFACE_ALPHA = 0.35  # points and ellipses, of the same colours, stand out
 # In sizes of the map: widths of lines, of the bar and the gap beside it, of the legend's texts.
@@ -49,14 +50,15 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Message) ->
     """
     points = pole_map.estimated
     table = np.zeros(len(points), POINT)
-    for row, p in zip(table, points, strict=True):
-        row["x"], row["y"], row["z"] = p.position_m
-        row["f0_hz"], row["damping_ratio"] = p.estimate
-        row["f0_std_hz"], row["damping_std"] = p.std
-        row["force_n"], row["tissue_probability"] = p.force_n, p.tissue_probability
-        known = p.tissue_class in names
-        row["tissue_class"] = names.index(p.tissue_class) if known else NO_CLASS
-        row["status"] = POLES_STATUS[p.status]
+    for row, point in zip(table, points, strict=True):
+        found = point.result
+        row["x"], row["y"], row["z"] = point.position_m
+        row["f0_hz"], row["damping_ratio"] = found.estimate
+        row["f0_std_hz"], row["damping_std"] = found.std
+        row["force_n"], row["tissue_probability"] = found.force_n, found.tissue_probability
+        known = found.tissue_class in names
+        row["tissue_class"] = names.index(found.tissue_class) if known else NO_CLASS
+        row["status"] = _STATUS.get(found.poles_status, 0)
     return _cloud(table, header)
 
 
@@ -81,7 +83,7 @@ def marker_message(
         ellipses.scale.x = _LINE * pole_map.size_m
         lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
         ellipses.points = _points(lines.reshape(-1, 3))
-        own = shares([point.estimate[0] for point in pole_map.with_ellipse], pole_map.f0_hz)
+        own = shares([point.result.f0_hz for point in pole_map.with_ellipse], pole_map.f0_hz)
         for rgb in colours(own):
             ellipses.colors += [_colour(rgb)] * (lines[0].size // 3)
     if pole_map.failures:
@@ -156,7 +158,7 @@ def legend_lines(
     ]
     for name in pole_map.classes():
         number = names.index(name) if name in names else NO_CLASS
-        count = sum(point.tissue_class == name for point in pole_map.estimated)
+        count = sum(point.result.tissue_class == name for point in pole_map.estimated)
         lines.append(f"class {number}, {name}: {count}")
     if pole_map.simulated:
         lines.append("simulated, not measured")

@@ -46,7 +46,11 @@ def offered_qos(depth: int, *, reliable: bool = True, latched: bool = False) -> 
         depth,
         QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
         QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
-        *(_FOREVER, _FOREVER, QosLiveliness.AUTOMATIC, _FOREVER, False),
+        deadline=_FOREVER,
+        lifespan=_FOREVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_FOREVER,
+        avoid_ros_namespace_conventions=False,
     )
 
 
@@ -110,9 +114,6 @@ class PointFileWriter:
         self._writer = Writer(self._folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self._connections: dict[str, Connection] = {}
-        self._counts: dict[str, int] = {}
-        self._qos: dict[str, Qos | None] = {}
-        self._start_ns, self._end_ns = 2**63 - 1, 0
         self._open = True
 
     def write(
@@ -156,13 +157,9 @@ class PointFileWriter:
                 offered_qos_profiles=[] if qos is None else [qos],
             )
             self._connections[topic] = connection
-            self._counts[topic] = 0
-            self._qos[topic] = qos
         if connection.msgtype != type_name:
             raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
         self._writer.write(connection, time_ns, cdr)
-        self._counts[topic] += 1
-        self._start_ns, self._end_ns = min(self._start_ns, time_ns), max(self._end_ns, time_ns)
 
     def finish(self) -> FileContent:
         """Complete the file and give it its name, durably.
@@ -187,14 +184,7 @@ class PointFileWriter:
         written.rename(self._target)
         sync_folder(self._target.parent)
         shutil.rmtree(self._folder, ignore_errors=True)
-        topics = tuple(
-            TopicContent(
-                *(topic, connection.msgtype, connection.digest),
-                *(self._qos[topic], self._counts[topic]),
-            )
-            for topic, connection in self._connections.items()
-        )
-        return FileContent(self._target.name, self._start_ns, self._end_ns, topics)
+        return read_content(self._target)
 
     def abandon(self) -> None:
         """Leave nothing behind; does nothing after `finish`."""
@@ -219,13 +209,14 @@ def read_content(path: Path) -> FileContent:
                 extension = connection.ext
                 assert isinstance(extension, ConnectionExtRosbag2)
                 qos = next(iter(extension.offered_qos_profiles), None)
-                topics.append(
-                    TopicContent(
-                        *(connection.topic, connection.msgtype),
-                        hash_of(connection.msgtype, connection.msgdef),
-                        *(qos, connection.msgcount),
-                    )
+                content = TopicContent(
+                    connection.topic,
+                    connection.msgtype,
+                    hash_of(connection.msgtype, connection.msgdef),
+                    qos,
+                    connection.msgcount,
                 )
+                topics.append(content)
             return FileContent(path.name, reader.start_time, reader.end_time - 1, tuple(topics))
     except _DAMAGE as error:
         raise _damaged(path, error) from error
@@ -287,24 +278,16 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
         In any order; listed by the time of their first message. A topic must have one type, of one
         definition, in all of them.
     """
-    content = {"rosbag2_bagfile_information": bag_metadata(files)}
-    text = yaml.dump(content, Dumper=_DUMPER, sort_keys=False, allow_unicode=True)
-    write_whole(folder / "metadata.yaml", text.encode())
-    sync_folder(folder)
-
-
-def bag_metadata(files: Sequence[FileContent]) -> dict[str, Any]:
-    """The content of ``metadata.yaml`` below its only key."""
     files = sorted(files, key=lambda file: (file.start_ns, file.name))
     start_ns = min((file.start_ns for file in files), default=0)
     end_ns = max((file.end_ns for file in files), default=0)
-    return {
+    content = {
         "version": BAG_VERSION,
         "storage_identifier": "mcap",
         "duration": {"nanoseconds": end_ns - start_ns},
         "starting_time": {"nanoseconds_since_epoch": start_ns},
         "message_count": sum(file.count for file in files),
-        "topics_with_message_count": [_topic(topic) for topic in _topics(files)],
+        "topics_with_message_count": [_topic(topic) for topic in _merged_topics(files)],
         "compression_format": "",
         "compression_mode": "",
         "relative_file_paths": [file.name for file in files],
@@ -320,9 +303,17 @@ def bag_metadata(files: Sequence[FileContent]) -> dict[str, Any]:
         "custom_data": None,
         "ros_distro": "rosbags",
     }
+    text = yaml.dump(
+        {"rosbag2_bagfile_information": content},
+        Dumper=_DUMPER,
+        sort_keys=False,
+        allow_unicode=True,
+    )
+    write_whole(folder / "metadata.yaml", text.encode())
+    sync_folder(folder)
 
 
-def _topics(files: Sequence[FileContent]) -> list[TopicContent]:
+def _merged_topics(files: Sequence[FileContent]) -> list[TopicContent]:
     """Topics of all files together, by name."""
     merged: dict[str, TopicContent] = {}
     for file in files:

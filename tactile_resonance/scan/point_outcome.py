@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
+from tactile_resonance.poles.result import Poles
+from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.point_result import NAN, PointOutcome, PointResult
-from tactile_resonance.scan.pole_map import MapPoint, map_point
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.tissue.classify import TissueClass, classify
+from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
 
 
 def air_point(index: int) -> ScanPoint:
@@ -33,14 +36,11 @@ def measured_result(
     time_ns: int,
     duration_s: float,
     air: AirReference | None = None,
-    notes: str = "",
 ) -> PointResult:
     """Result of a point that was measured; `FAILED` where there is no pole.
 
     Parameters
     ----------
-    measured : Measured
-        Its origin must state where the tip was.
     decision : Decision
         That ended the measurement.
     air : AirReference or None
@@ -50,42 +50,71 @@ def measured_result(
     duration_s : float
         From the move to the point until the tip was free again [s].
     """
-    poles, origin = measured.poles, measured.origin
-    found = map_point(
+    poles = measured.poles
+    outcome = PointOutcome.DONE if poles.main.found else PointOutcome.FAILED
+    result = unmeasured_result(
+        point, attempt, scene, outcome, poles.message, time_ns=time_ns, duration_s=duration_s
+    )
+    result = with_poles(
+        result,
         poles,
-        origin,
+        measured.origin,
         scene.tissue_classes,
         nominal=scene.nominal_contact,
         age_s=measured.contact_age_s,
     )
-    mode = poles.main
-    std = found.std
-    relative = {} if air is None else asdict(relative_to_air(found.estimate, found.covariance, air))
-    blank = unmeasured_result(
-        point,
-        attempt,
-        scene,
-        PointOutcome.FAILED if found.failed else PointOutcome.DONE,
-        poles.message,
-        time_ns=time_ns,
-        duration_s=duration_s,
-        notes=notes,
-    )
+    if air is not None:
+        relative = relative_to_air(result.estimate, result.covariance, air)
+        result = replace(result, **asdict(relative))
     return replace(
-        blank,
-        force_n=origin.contact.force_n,
-        force_std_n=origin.contact.force_std_n,
-        force_rms_n=origin.contact.spread.rms_n,
-        force_min_n=origin.contact.spread.min_n,
-        force_max_n=origin.contact.spread.max_n,
-        contact_age_s=measured.contact_age_s,
-        f0_hz=float(found.estimate[0]),
-        f0_std_hz=float(std[0]),
-        damping_ratio=float(found.estimate[1]),
-        damping_ratio_std=float(std[1]),
-        f0_damping_covariance_hz=float(found.covariance[0, 1]),
-        **_nominal(found),
-        **relative,
+        result,
+        blocks=decision.blocks,
+        blocks_saved=decision.blocks_saved,
+        verdict=decision.verdict.value,
+        saved_s=decision.saved_s,
+    )
+
+
+def with_poles(
+    result: PointResult,
+    poles: Poles,
+    origin: Origin,
+    classes: Sequence[TissueClass] = (),
+    unknown_level: float = 0.01,
+    nominal: NominalContact | None = None,
+    age_s: float = NAN,
+) -> PointResult:
+    """The result with what poles say of its point; of several modes the one with the highest peak.
+
+    Parameters
+    ----------
+    result : PointResult
+    poles : Poles
+    origin : Origin
+        Of the poles, with the force.
+    classes : sequence of TissueClass
+        Empty: no tissue is called.
+    unknown_level : float
+        See `classify`.
+    nominal : NominalContact or None
+        To which the classes refer.
+    age_s : float
+        Of the contact in the middle of the measurement [s]; NaN where unknown.
+    """
+    contact, mode = origin.contact, poles.main
+    result = replace(
+        result,
+        force_n=contact.force_n,
+        force_std_n=contact.force_std_n,
+        force_rms_n=contact.spread.rms_n,
+        force_min_n=contact.spread.min_n,
+        force_max_n=contact.spread.max_n,
+        contact_age_s=age_s,
+        f0_hz=float(mode.estimate[0]),
+        f0_std_hz=float(mode.std[0]),
+        damping_ratio=float(mode.estimate[1]),
+        damping_ratio_std=float(mode.std[1]),
+        f0_damping_covariance_hz=float(mode.covariance[0, 1]),
         f0_drift_hz_per_s=float(mode.drift[0]),
         f0_drift_std_hz_per_s=float(mode.drift_std[0]),
         damping_drift_per_s=float(mode.drift[1]),
@@ -95,31 +124,31 @@ def measured_result(
         cost=float(poles.cost),
         expected_cost=float(poles.expected_cost),
         poles_status=poles.status.value,
-        tissue_class=found.tissue_class,
-        tissue_probability=found.tissue_probability,
-        tissue_reason=found.tissue_reason,
-        blocks=decision.blocks,
-        blocks_saved=decision.blocks_saved,
-        verdict=decision.verdict.value,
-        saved_s=decision.saved_s,
         measurement_id=origin.measurement_id,
         simulated=origin.simulated,
     )
-
-
-def _nominal(found: MapPoint) -> dict[str, Any]:
-    """Fields of the pole at the nominal force and age; none where it could not be referred to them."""
-    at = found.for_tissue
-    if at is None or not at.referred:
-        return {}
-    std = np.sqrt(np.diag(at.covariance))
-    return {
-        "nominal_f0_hz": float(at.compared[0]),
-        "nominal_f0_std_hz": float(std[0]),
-        "nominal_damping_ratio": float(at.compared[1]),
-        "nominal_damping_ratio_std": float(std[1]),
-        "nominal_f0_damping_covariance_hz": float(at.covariance[0, 1]),
-    }
+    if not (classes and mode.found):
+        return result
+    pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
+    at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
+    call = classify(at.compared, at.covariance, classes, unknown_level)
+    known = bool(np.all(np.isfinite(at.compared)))
+    if at.referred:
+        std = np.sqrt(np.diag(at.covariance))
+        result = replace(
+            result,
+            nominal_f0_hz=float(at.compared[0]),
+            nominal_f0_std_hz=float(std[0]),
+            nominal_damping_ratio=float(at.compared[1]),
+            nominal_damping_ratio_std=float(std[1]),
+            nominal_f0_damping_covariance_hz=float(at.covariance[0, 1]),
+        )
+    return replace(
+        result,
+        tissue_class=call.name,
+        tissue_probability=call.probability,
+        tissue_reason="; ".join(filter(None, [call.reason if known else "", at.note])),
+    )
 
 
 def unmeasured_result(
@@ -131,20 +160,23 @@ def unmeasured_result(
     *,
     time_ns: int,
     duration_s: float,
-    notes: str = "",
 ) -> PointResult:
     """Result of an attempt without poles that count: it failed, was skipped or is discarded."""
     x_m, y_m, z_m = point.position_m
     normal_x, normal_y, normal_z = point.normal
     return PointResult(
-        point.index,
-        attempt,
-        point.label,
-        outcome,
-        reason,
-        *(x_m, y_m, z_m, normal_x, normal_y, normal_z),
+        index=point.index,
+        attempt=attempt,
+        label=point.label,
+        outcome=outcome,
+        reason=reason,
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
+        normal_x=normal_x,
+        normal_y=normal_y,
+        normal_z=normal_z,
         duration_s=duration_s,
-        notes=notes,
         time_ns=time_ns,
         frame_id=scene.frame_id,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import Enum, IntEnum
@@ -106,14 +107,29 @@ class PointResult:
     frame_id: str = ""
 
     @property
+    def failed(self) -> bool:
+        """Whether there is no pole."""
+        return self.outcome is not PointOutcome.DONE or math.isnan(self.f0_hz)
+
+    @property
     def position_m(self) -> npt.NDArray[np.float64]:
         """(3,) point on the surface [m]."""
         return np.array([self.x_m, self.y_m, self.z_m])
 
     @property
+    def normal(self) -> npt.NDArray[np.float64]:
+        """(3,) outward unit normal of the surface."""
+        return np.array([self.normal_x, self.normal_y, self.normal_z])
+
+    @property
     def estimate(self) -> npt.NDArray[np.float64]:
         """(2,) f0 [Hz] and damping ratio; NaN where not estimated."""
         return np.array([self.f0_hz, self.damping_ratio])
+
+    @property
+    def std(self) -> npt.NDArray[np.float64]:
+        """(2,) of f0 [Hz] and damping ratio; NaN where unknown."""
+        return np.array([self.f0_std_hz, self.damping_ratio_std])
 
     @property
     def covariance(self) -> npt.NDArray[np.float64]:

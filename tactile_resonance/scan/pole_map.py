@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,17 +12,10 @@ from scipy.interpolate import griddata
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
-from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
-from tactile_resonance.tissue.nominal_contact import (
-    ContactLoad,
-    NominalContact,
-    PoleForTissue,
-    refer_to_nominal,
-)
+from tactile_resonance.tissue.classify import UNKNOWN
 
 LOW_RGB = (64, 105, 255)
 HIGH_RGB = (255, 210, 50)
@@ -58,160 +50,38 @@ class MapPoint:
 
     Attributes
     ----------
+    result : PointResult
+        What was found; its position and frame distinguish the place from others.
     position_m : (3,) float
-        Of the tip [m].
+        Where it is shown [m].
     normal : (3,) float
-        Outward normal: the tip's +z.
-    estimate : (2,) float
-        f0 [Hz] and damping ratio; NaN where the point failed.
-    covariance : (2, 2) float
-        Of the estimate, total where known, else from noise; NaN where neither is.
-    force_n : float
-    tissue_class : str
-        Empty where no classes are given.
-    tissue_probability : float
-    tissue_reason : str
-        Why it is unknown, and what was taken for granted.
-    for_tissue : PoleForTissue or None
-        What the classes were compared with; None where no tissue was called.
-    status : PolesStatus
-    reason : str
-        Why there is no estimate, or why it is to be used with care.
-    label : str
-    measurement_id : int
-    simulated : bool
-    place_m : (3,) float, optional
-        What identifies the place, a point as it was planned; None: `position_m` does.
-    place_frame : str
-        Frame of `place_m`: the same numbers in another one are another place.
+        Outward normal there.
     """
 
+    result: PointResult
     position_m: FloatArray
     normal: FloatArray
-    estimate: FloatArray
-    covariance: FloatArray
-    force_n: float = float("nan")
-    tissue_class: str = ""
-    tissue_probability: float = float("nan")
-    tissue_reason: str = ""
-    for_tissue: PoleForTissue | None = None
-    status: PolesStatus = PolesStatus.OK
-    reason: str = ""
-    label: str = ""
-    measurement_id: int = 0
-    simulated: bool = False
-    place_m: FloatArray | None = None
-    place_frame: str = ""
 
-    @property
-    def place(self) -> FloatArray:
-        """(3,) that distinguishes it from other points [m]."""
-        return self.position_m if self.place_m is None else self.place_m
+    @classmethod
+    def planned(cls, result: PointResult) -> MapPoint:
+        """Shown where the point was planned."""
+        return cls(result, result.position_m, result.normal)
 
-    @property
-    def failed(self) -> bool:
-        """Whether there is no pole."""
-        return bool(np.isnan(self.estimate[0]))
-
-    @property
-    def std(self) -> FloatArray:
-        """(2,) of f0 [Hz] and damping ratio."""
-        return np.sqrt(np.diag(self.covariance))
+    @classmethod
+    def of_tip(cls, result: PointResult, origin: Origin) -> MapPoint:
+        """Shown where the tip was, along its +z; ``ValueError`` where that is not known."""
+        contact = origin.contact
+        if contact.position_m is None:
+            raise ValueError(
+                f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
+            )
+        normal = Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2]
+        return cls(result, np.array(contact.position_m), normal)
 
     def seen_from(self, origin_m: FloatArray, rotation: Rotation) -> MapPoint:
-        """The same in a frame whose origin (3,) and rotation in the present one are given."""
+        """The same shown in a frame whose origin (3,) and rotation in the present one are given."""
         place = rotation.inv().apply(self.position_m - origin_m)
         return replace(self, position_m=place, normal=rotation.inv().apply(self.normal))
-
-
-def map_point(
-    poles: Poles,
-    origin: Origin,
-    classes: Sequence[TissueClass] = (),
-    unknown_level: float = 0.01,
-    nominal: NominalContact | None = None,
-    age_s: float = float("nan"),
-) -> MapPoint:
-    """Point of identified poles; of several modes the one with the highest peak.
-
-    Parameters
-    ----------
-    poles : Poles
-    origin : Origin
-        Of the poles; with the force and the place of the tip.
-    classes : sequence of TissueClass
-        Empty: no tissue is called.
-    unknown_level : float
-        See `classify`.
-    nominal : NominalContact or None
-        To which the classes refer.
-    age_s : float
-        Of the contact in the middle of the measurement [s]; NaN where unknown.
-
-    Raises
-    ------
-    ValueError
-        If it is not known where the tip was.
-    """
-    contact = origin.contact
-    if contact.position_m is None:
-        raise ValueError(
-            f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
-        )
-    mode = poles.main
-    name, probability, reason, referred = "", float("nan"), "", None
-    if classes and mode.found:
-        pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
-        referred = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
-        call = classify(referred.compared, referred.covariance, classes, unknown_level)
-        name, probability = call.name, call.probability
-        known = bool(np.all(np.isfinite(referred.compared)))
-        reason = "; ".join(filter(None, [call.reason if known else "", referred.note]))
-    return MapPoint(
-        position_m=np.array(contact.position_m),
-        normal=Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2],
-        estimate=mode.estimate,
-        covariance=mode.covariance,
-        force_n=contact.force_n,
-        tissue_class=name,
-        tissue_probability=probability,
-        tissue_reason=reason,
-        for_tissue=referred,
-        status=poles.status,
-        reason=poles.message,
-        label=origin.label,
-        measurement_id=origin.measurement_id,
-        simulated=origin.simulated,
-    )
-
-
-def accepted_point(result: PointResult, point: MapPoint) -> MapPoint:
-    """Point of a result and of the poles that came with it; without a pole where the result says it failed."""
-    point = replace(point, place_m=result.position_m, place_frame=result.frame_id)
-    if result.outcome is PointOutcome.DONE:
-        return point
-    return replace(point, estimate=np.full(2, np.nan), reason=result.reason)
-
-
-def point_of_result(result: PointResult) -> MapPoint:
-    """Point of a finished scan point, from a run."""
-    failed = result.outcome is not PointOutcome.DONE or np.isnan(result.f0_hz)
-    names = {status.value: status for status in PolesStatus}
-    return MapPoint(
-        position_m=result.position_m,
-        normal=np.array([result.normal_x, result.normal_y, result.normal_z]),
-        estimate=np.full(2, np.nan) if failed else result.estimate,
-        covariance=result.covariance,
-        force_n=result.force_n,
-        tissue_class=result.tissue_class,
-        tissue_probability=result.tissue_probability,
-        tissue_reason=result.tissue_reason,
-        status=PolesStatus.FAILED if failed else names.get(result.poles_status, PolesStatus.OK),
-        reason=result.reason,
-        label=result.label,
-        measurement_id=result.measurement_id,
-        simulated=result.simulated,
-    )
 
 
 @dataclass(frozen=True)
@@ -246,41 +116,44 @@ class PoleMap:
 
     def with_point(self, point: MapPoint) -> PoleMap:
         """The same with one point more; it replaces what its own measurement or place had before."""
-        rest = self.without(point.place, point.place_frame).points
-        own = point.measurement_id  # 0: it came to no measurement
-        kept = (p for p in rest if not own or p.measurement_id != own)
+        rest = self.without(point.result).points
+        own = point.result.measurement_id  # 0: it came to no measurement
+        kept = (p for p in rest if not own or p.result.measurement_id != own)
         return replace(self, points=(*kept, point))
 
     def with_result(self, result: PointResult) -> PoleMap:
         """The same after one attempt at a point of a scan; one in free air or discarded changes nothing."""
         if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
             return self
-        now = self.without(result.position_m)
-        return now if result.outcome is PointOutcome.SKIPPED else now.with_point(point_of_result(result))
+        now = self.without(result)
+        skipped = result.outcome is PointOutcome.SKIPPED
+        return now if skipped else now.with_point(MapPoint.planned(result))
 
-    def without(self, place_m: FloatArray, frame: str = "") -> PoleMap:
-        """The same with nothing at a place (3,) [m]."""
+    def without(self, result: PointResult) -> PoleMap:
+        """The same with nothing at the place of a result."""
+        place_m, frame = result.position_m, result.frame_id
         kept = (
             p
             for p in self.points
-            if p.place_frame != frame or np.linalg.norm(p.place - place_m) > SAME_PLACE_M
+            if p.result.frame_id != frame
+            or np.linalg.norm(p.result.position_m - place_m) > SAME_PLACE_M
         )
         return replace(self, points=tuple(kept))
 
     @cached_property
     def estimated(self) -> tuple[MapPoint, ...]:
         """Points with a pole."""
-        return tuple(point for point in self.points if not point.failed)
+        return tuple(point for point in self.points if not point.result.failed)
 
     @cached_property
     def failures(self) -> tuple[MapPoint, ...]:
         """Points without."""
-        return tuple(point for point in self.points if point.failed)
+        return tuple(point for point in self.points if point.result.failed)
 
     @cached_property
     def f0_hz(self) -> FloatArray:
         """(n,) of the points with a pole [Hz]."""
-        return np.array([point.estimate[0] for point in self.estimated])
+        return np.array([point.result.f0_hz for point in self.estimated])
 
     @cached_property
     def positions_m(self) -> FloatArray:
@@ -303,16 +176,16 @@ class PoleMap:
     @property
     def simulated(self) -> bool:
         """Whether any point is from a simulation."""
-        return any(point.simulated for point in self.points)
+        return any(point.result.simulated for point in self.points)
 
     def classes(self) -> tuple[str, ...]:
         """Tissue classes that were called, by name, `UNKNOWN` last."""
-        names = {point.tissue_class for point in self.estimated if point.tissue_class}
+        names = {point.result.tissue_class for point in self.estimated} - {""}
         return tuple(sorted(names, key=lambda name: (name == UNKNOWN, name)))
 
     def ellipse_scale(self, probability: float = 0.95) -> EllipseScale:
         """Scale at which nine of ten ellipses stay within 0.4 of the spacing, rounded to 1, 2 or 5."""
-        stds = np.array([p.std for p in self.estimated if np.all(np.isfinite(p.std))])
+        stds = np.array([p.result.std for p in self.with_ellipse])
         if not len(stds):
             return EllipseScale(self.spacing_m, self.spacing_m)
         largest = _radius(probability) * np.quantile(stds, 0.9, axis=0)
@@ -334,7 +207,7 @@ class PoleMap:
         stretch = np.array([scale.m_per_hz, scale.m_per_damping])
         lines = []
         for point in self.with_ellipse:
-            covariance = point.covariance * np.outer(stretch, stretch)
+            covariance = point.result.covariance * np.outer(stretch, stretch)
             values, vectors = np.linalg.eigh(covariance)
             flat = vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
             loop = point.position_m + flat.T @ tangent_axes(point.normal)  # (segments + 1, 3)
@@ -344,7 +217,7 @@ class PoleMap:
     @cached_property
     def with_ellipse(self) -> tuple[MapPoint, ...]:
         """Points with a pole and its covariance."""
-        return tuple(p for p in self.estimated if np.all(np.isfinite(p.covariance)))
+        return tuple(p for p in self.estimated if np.all(np.isfinite(p.result.covariance)))
 
     def krige(self) -> KrigedSurface | None:
         """Natural frequency over x, y; None where too few points have a covariance."""
@@ -354,7 +227,7 @@ class PoleMap:
         xy = np.array([p.position_m[:2] for p in points])
         if np.linalg.matrix_rank(xy - xy.mean(axis=0), tol=SAME_PLACE_M) < 2:
             return None  # on one line: nothing is known beside it
-        return krige(xy, [p.estimate[0] for p in points], [p.std[0] for p in points])
+        return krige(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
 
     def surface(self, cells: int = 40) -> MapSurface | None:
         """Kriged natural frequency on a grid over the points, `cells` along its longer side."""

@@ -197,14 +197,14 @@ class RunDirectory:
         # damaged files keep their names: their attempt is not given twice
         taken = list((self.path / RECORDING).glob(f"point-{index:05d}-*.mcap"))
         attempt = 1 + max((int(path.stem.rsplit("-", 1)[1]) for path in taken), default=-1)
-        return PointRecording(self, index, attempt)
+        return PointRecording(self, f"point-{index:05d}-{attempt:02d}", index, attempt)
 
-    def begin_reference(self, name: str) -> ReferenceRecording:
+    def begin_reference(self, name: str) -> PointRecording:
         """Begin a recording that belongs to no point, such as ``air-before``."""
         if not _REFERENCE.fullmatch(name):
             raise ValueError(f"name: got {name!r}; accepted are a to z, 0 to 9, - and _")
         number = len(list((self.path / RECORDING).glob("reference-*.mcap")))
-        return ReferenceRecording(self, f"reference-{number:02d}-{name}")
+        return PointRecording(self, f"reference-{number:02d}-{name}")
 
     def _add(self, file: FileContent, result: PointResult | None) -> None:
         self.content = self.content.with_file(file, result)
@@ -216,18 +216,24 @@ class RunDirectory:
         write_whole(self.path / "results.csv", as_csv(self.content.latest).encode())
 
 
-class _FileRecording:
-    """Receives the messages of one file; a context that abandons what was not finished.
+class PointRecording:
+    """Receives the messages of one attempt at a point, or of a reference.
+
+    A context that abandons what was not finished.
 
     Attributes
     ----------
+    index : int or None
+        Of the point; None: a reference.
     attempt : int
     measurement_id : int
         Of the measurement that is recorded; 0: none was begun.
     """
 
-    def __init__(self, run: RunDirectory, stem: str, attempt: int = 0) -> None:
-        self._run, self.attempt = run, attempt
+    def __init__(
+        self, run: RunDirectory, stem: str, index: int | None = None, attempt: int = 0
+    ) -> None:
+        self._run, self.index, self.attempt = run, index, attempt
         self.measurement_id = 0
         self._poles: bytes | memoryview = b""
         self._writer = PointFileWriter(run.path / HIDDEN, run.path / RECORDING / f"{stem}.mcap")
@@ -257,35 +263,8 @@ class _FileRecording:
         poles = types.deserialize_cdr(self._poles, POLES_TYPE) if self._poles else None
         return serialised(result, poles)
 
-    def _keep(self, result: PointResult, of_point: PointResult | None) -> bytes:
-        cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
-        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
-        self._run._add(self._writer.finish(), of_point)
-        return cdr
-
-
-class ReferenceRecording(_FileRecording):
-    """Receives the messages of one reference."""
-
     def finish(self, result: PointResult) -> bytes:
-        """Keep it with its result, durably; returns `message_of` it."""
-        return self._keep(result, None)
-
-
-class PointRecording(_FileRecording):
-    """Receives the messages of one attempt at a point.
-
-    Attributes
-    ----------
-    index : int
-    """
-
-    def __init__(self, run: RunDirectory, index: int, attempt: int) -> None:
-        super().__init__(run, f"point-{index:05d}-{attempt:02d}", attempt)
-        self.index = index
-
-    def finish(self, result: PointResult) -> bytes:
-        """Keep the point with its result, durably: after this no interruption loses it.
+        """Keep all with the result, durably: after this no interruption loses it.
 
         Returns
         -------
@@ -297,12 +276,13 @@ class PointRecording(_FileRecording):
         ValueError
             If the result is of another point or attempt.
         """
-        if (result.index, result.attempt) != (self.index, self.attempt):
-            got = (result.index, result.attempt)
-            raise ValueError(
-                f"result: got point and attempt {got}; accepted is {(self.index, self.attempt)}"
-            )
-        return self._keep(result, result)
+        got, own = (result.index, result.attempt), (self.index, self.attempt)
+        if self.index is not None and got != own:
+            raise ValueError(f"result: got point and attempt {got}; accepted is {own}")
+        cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
+        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
+        self._run._add(self._writer.finish(), None if self.index is None else result)
+        return cdr
 
 
 def expected_bytes(points: int, design: MeasurementDesign) -> int:

@@ -24,7 +24,6 @@ from tactile_resonance.scan.hands import (
     Measured,
     PointDisturbed,
     PointFailed,
-    Recording,
     ScanEnded,
 )
 from tactile_resonance.scan.plan import Plan
@@ -39,7 +38,7 @@ from tactile_resonance.scan.references import (
     read_reference,
     sensor_health,
 )
-from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, Output, ScanScene
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
@@ -327,7 +326,7 @@ class ScanRunner:
     def _unmeasured(
         self,
         point: ScanPoint,
-        recording: Recording,
+        recording: PointRecording,
         outcome: PointOutcome,
         reason: str,
         duration_s: float = NAN,
@@ -345,7 +344,7 @@ class ScanRunner:
         kind = PointKind.AIR if point.index >= len(self._plan.points) else PointKind.TISSUE
         return replace(result, kind=kind, measurement_id=recording.measurement_id)
 
-    def _discard(self, point: ScanPoint, recording: Recording, reason: str) -> None:
+    def _discard(self, point: ScanPoint, recording: PointRecording, reason: str) -> None:
         """Tell that nothing is kept of an attempt."""
         result = self._unmeasured(point, recording, PointOutcome.DISCARDED, reason)
         self._publish(recording.message_of(result))

@@ -18,7 +18,7 @@ from tactile_resonance.nodes.messages import pose_to_message, record_to_message
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, STREAM
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.record import Contact
-from tactile_resonance.recording.store import read_store
+from test.recording.stores import read_store
 
 TOPICS = {
     "excitation": (msg.Excitation, EXCITATIONS),
@@ -154,7 +154,7 @@ def test_kill_leaves_every_published_record_on_disk(domain, tmp_path):
         node.wait()
         client.until_silent("record")  # what was on its way
     content = read_store(records)
-    assert content.problems == ()
+    assert content.problems == []
     last = content.measurements[-1]
     assert last.gaps == ()
     assert last.excitations[0].label == "to be killed"

@@ -11,8 +11,8 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rosbags.highlevel import AnyReader
 
 from benchmarks.two_machines import TwoMachines, not_permitted, on_two_machines
-from tactile_resonance.recording.store import read_store
 from tactile_resonance.scan.run_content import read_run
+from test.recording.stores import read_store
 
 
 def test_a_scan_over_the_network_loses_no_record(tmp_path):
@@ -33,7 +33,7 @@ def test_a_scan_over_the_network_loses_no_record(tmp_path):
                 ids.add(int(reader.deserialize(cdr, connection.msgtype).measurement_id))
     # every record of the scan that was published gave an FRF over there, whose poles came back
     stored = read_store(tmp_path / "records")
-    assert stored.problems == ()
+    assert stored.problems == []
     published = sum(len(m.records) for m in stored.measurements if m.measurement_id in ids)
     assert counts["/record"] == counts["/frf"] == counts["/poles"] == published >= 16
     # none was lost, and its point measured again: beside these only what was measured before the scan

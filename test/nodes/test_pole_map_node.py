@@ -101,7 +101,7 @@ class Bench:
         self.until(
             lambda: (
                 self.map_node._left_out
-                or last in {p.measurement_id for p in self.map_node._map.points}
+                or last in {p.result.measurement_id for p in self.map_node._map.points}
             )
         )
 
@@ -484,8 +484,8 @@ def test_a_point_that_is_repeated_replaces_its_former_result(scanned, outcome, f
     # the tip comes down a millimetre beside: it is the same point
     scanned.publisher.publish(point_result(3, 0.0, f0_hz, outcome, off=0.001))
     scanned.publisher.publish(point_result(4, 0.1, 260.0))
-    scanned.until(lambda: 260.0 in [p.estimate[0] for p in scanned.map_node._map.points])
-    found = [point.estimate[0] for point in scanned.map_node._map.estimated]
+    scanned.until(lambda: 260.0 in [p.result.f0_hz for p in scanned.map_node._map.points])
+    found = [point.result.f0_hz for point in scanned.map_node._map.estimated]
     assert found == [*left, 260.0]
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements for stores in tests."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tactile_resonance.contact.force_spread import ForceSpread
@@ -13,6 +15,7 @@ from tactile_resonance.record import (
     Origin,
     Record,
 )
+from tactile_resonance.recording.store import list_measurements
 
 SAMPLES = 40
 
@@ -86,6 +89,21 @@ def write(store, measurement_id=7, realisations=2, periods=3):
             records.append(record(excitation, block))
             store.add_record(records[-1])
     return planned, records
+
+
+class Content(NamedTuple):
+    """All measurements of a store, in the order they were begun, and what could not be read."""
+
+    measurements: list
+    problems: list
+
+
+def read_store(folder):
+    """Everything readable of a store."""
+    entries, problems = list_measurements(folder)
+    measurements = [entry.read() for entry in entries]
+    named = [problem for measurement in measurements for problem in measurement.problems]
+    return Content(measurements, problems + named)
 
 
 def assert_same(found, expected):

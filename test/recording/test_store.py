@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 
 from tactile_resonance.record import Channel, Contact, Origin, Record
-from tactile_resonance.recording.store import RecordStore, read_store
+from tactile_resonance.recording.store import RecordStore
 from tactile_resonance.recording.store_recording import read_store_recording
 from tactile_resonance.recording.stored_file import read_stored, write_stored
 
 sys.path.insert(0, str(Path(__file__).parent))
 import stores
-from stores import assert_same
+from stores import assert_same, read_store
 
 
 def test_everything_comes_back_to_the_bit(tmp_path):
     store = RecordStore(tmp_path / "not" / "yet" / "there")
     written = [stores.write(store, key) for key in (9, 7)]
     content = read_store(store.folder)
-    assert content.problems == ()
+    assert content.problems == []
     # in the order they were measured, whatever their ids
     assert [m.measurement_id for m in content.measurements] == [9, 7]
     for measurement, (excitations, records) in zip(content.measurements, written, strict=True):
@@ -270,7 +270,7 @@ def test_kill_leaves_every_block_that_was_told(tmp_path, said):
     told = [int(line), *(int(rest) for rest in writer.stdout.read().split())]
     writer.wait()
     content = read_store(tmp_path)
-    assert content.problems == ()
+    assert content.problems == []
     (measurement,) = content.measurements
     assert measurement.gaps == ()
     # the last one may be whole on disk without having been told

@@ -13,19 +13,14 @@ from scipy.stats import chi2
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.recording.messages import POLES_STATUS
 from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
+from tactile_resonance.scan.map_messages import POINT, cloud_message, header_message
 from tactile_resonance.scan.plan import tip_orientation
-from tactile_resonance.scan.point_outcome import air_point, measured_result
+from tactile_resonance.scan.point_outcome import air_point, measured_result, with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
-from tactile_resonance.scan.pole_map import (
-    EllipseScale,
-    MapPoint,
-    PoleMap,
-    accepted_point,
-    map_point,
-    point_of_result,
-)
+from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
 from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
 
@@ -64,14 +59,13 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
     result = measured_result(
-        *(
-            air_point(3),
-            0,
-            scene(),
-            Measured(modes, origin()),
-            Decision(Verdict.MOST_BLOCKS, "", 8),
-        ),
-        **{"time_ns": 1, "duration_s": 1.0},
+        air_point(3),
+        0,
+        scene(),
+        Measured(modes, origin()),
+        Decision(Verdict.MOST_BLOCKS, "", 8),
+        time_ns=1,
+        duration_s=1.0,
     )
     assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
     assert result.f0_drift_std_hz_per_s == pytest.approx(0.2)
@@ -84,14 +78,25 @@ def test_how_the_force_moved_stands_in_the_result():
     there = origin()
     there = replace(there, contact=replace(there.contact, spread=ForceSpread(3e-4, 0.009, 0.011)))
     result = measured_result(
-        *(air_point(3), 0, scene(), Measured(poles((250.0,)), there)),
+        air_point(3),
+        0,
+        scene(),
+        Measured(poles((250.0,)), there),
         Decision(Verdict.MOST_BLOCKS, "", 8),
-        **{"time_ns": 1, "duration_s": 1.0},
+        time_ns=1,
+        duration_s=1.0,
     )
     assert (result.force_rms_n, result.force_min_n, result.force_max_n) == (3e-4, 0.009, 0.011)
     header, row = as_csv([result]).splitlines()
     at = header.split(",").index("force_rms_n")
     assert row.split(",")[at : at + 3] == ["0.0003", "0.009", "0.011"]
+
+
+def map_point(poles, origin, *classes, **given):
+    """Point of poles that belong to no scan: where the tip was is its place."""
+    x_m, y_m, z_m = origin.contact.position_m or (np.nan,) * 3
+    result = PointResult(0, x_m=x_m, y_m=y_m, z_m=z_m, reason=poles.message)
+    return MapPoint.of_tip(with_poles(result, poles, origin, *classes, **given), origin)
 
 
 def origin(x=0.0, y=0.0, z=0.0, key=1, normal=(0.0, 0.0, 1.0)):
@@ -112,17 +117,19 @@ def grid_map(count=5, spacing=0.004, f0=lambda x, y: 250 + 300 * x, **values):
 
 def test_a_point_takes_the_strongest_mode_and_the_fullest_covariance():
     two = poles((240.0, 260.0), residues=(1.0, -3.0j))
-    assert map_point(two, origin()).estimate[0] == 260.0
+    assert map_point(two, origin()).result.f0_hz == 260.0
     total = 4 * np.tile(COVARIANCE, (1, 1, 1))
-    np.testing.assert_array_equal(map_point(poles(total=total), origin()).covariance, total[0])
+    found = map_point(poles(total=total), origin()).result
+    np.testing.assert_allclose(found.covariance, total[0], rtol=1e-14)
     unknown = np.full((1, 2, 2), np.nan)
-    np.testing.assert_array_equal(map_point(poles(total=unknown), origin()).covariance, COVARIANCE)
+    found = map_point(poles(total=unknown), origin()).result
+    np.testing.assert_allclose(found.covariance, COVARIANCE, rtol=1e-14)
 
 
 def test_tissue_is_called_where_there_are_classes():
-    called = [map_point(poles((f0,)), origin(), (SOFT, FIRM)).tissue_class for f0 in (250.2, 262.0)]
-    assert called == ["soft", UNKNOWN]
-    assert map_point(poles(), origin()).tissue_class == ""
+    points = [map_point(poles((f0,)), origin(), (SOFT, FIRM)) for f0 in (250.2, 262.0)]
+    assert [point.result.tissue_class for point in points] == ["soft", UNKNOWN]
+    assert map_point(poles(), origin()).result.tissue_class == ""
 
 
 def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown():
@@ -135,20 +142,20 @@ def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown(
         contact = replace(origin().contact, force_n=force_n, force_std_n=force_std_n)
         return replace(origin(), contact=contact)
 
-    plain = map_point(poles((253.0,)), pressed(0.013), (SOFT, FIRM))
+    plain = map_point(poles((253.0,)), pressed(0.013), (SOFT, FIRM)).result
     assert plain.tissue_class == UNKNOWN
     assert "farther from" in plain.tissue_reason
     assert "force and age of contact are not accounted for" in plain.tissue_reason
-    found = map_point(poles((253.0,)), pressed(0.013), **given)
+    found = map_point(poles((253.0,)), pressed(0.013), **given).result
     assert (found.tissue_class, found.tissue_reason) == ("soft", "")
-    assert found.for_tissue.compared[0] == pytest.approx(250.0)
+    assert found.nominal_f0_hz == pytest.approx(250.0)
     np.testing.assert_array_equal(found.estimate, [253.0, 0.03])
-    np.testing.assert_array_equal(found.covariance, COVARIANCE)
-    assert found.for_tissue.covariance[0, 0] > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
+    np.testing.assert_allclose(found.covariance, COVARIANCE, rtol=1e-14)
+    assert found.nominal_f0_std_hz**2 > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
     # a force that is known to 1 mN only makes 1 Hz
-    unsure = [map_point(poles((252.0,)), pressed(0.01, std), **given) for std in (1e-4, 1e-3)]
+    unsure = [map_point(poles((252.0,)), pressed(0.01, std), **given).result for std in (1e-4, 1e-3)]
     assert [point.tissue_class for point in unsure] == [UNKNOWN, "soft"]
-    unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given)
+    unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given).result
     assert unknown.tissue_class == UNKNOWN
     assert np.isnan(unknown.tissue_probability)
     assert unknown.tissue_reason.startswith("the force is unknown")
@@ -161,29 +168,30 @@ def test_each_place_once_whatever_comes():
     repeated = map_point(poles((251.0,)), origin(y=0.00005, key=8))
     elsewhere = map_point(poles((252.0,)), origin(x=0.004, key=9))
     found = PoleMap().with_point(block_1).with_point(block_2)
-    assert [p.estimate[0] for p in found.points] == [250.5]
+    assert [p.result.f0_hz for p in found.points] == [250.5]
     found = found.with_point(repeated).with_point(elsewhere)
-    assert [p.estimate[0] for p in found.points] == [251.0, 252.0]
+    assert [p.result.f0_hz for p in found.points] == [251.0, 252.0]
 
 
 def test_the_same_numbers_in_two_frames_are_two_places():
     shown = PoleMap()
     for key, frame in enumerate(("table", "phantom", "phantom"), 1):
         point = map_point(poles((250.0 + key,)), origin(x=0.1 * key, key=key))
-        result = PointResult(key, x_m=0.0, y_m=0.0, z_m=0.0, frame_id=frame)
-        shown = shown.with_point(accepted_point(result, point))
+        result = replace(point.result, x_m=0.0, y_m=0.0, z_m=0.0, frame_id=frame)
+        shown = shown.with_point(replace(point, result=result))
     assert shown.f0_hz.tolist() == [251.0, 253.0]
-    assert shown.without(np.zeros(3), "phantom").f0_hz.tolist() == [251.0]
+    assert shown.without(result).f0_hz.tolist() == [251.0]
 
 
 def test_no_pose_is_refused_and_no_pole_is_a_failure():
     with pytest.raises(ValueError, match="tip_pose of measurement 3: got none"):
         map_point(poles(), Origin(measurement_id=3))
     failed = map_point(Poles(status=PolesStatus.NO_RESONANCE, message="none in band"), origin())
-    found = grid_map(2).with_point(replace(failed, measurement_id=99, position_m=np.ones(3)))
-    assert failed.failed
+    elsewhere = replace(failed.result, measurement_id=99, x_m=1.0)
+    found = grid_map(2).with_point(MapPoint.planned(elsewhere))
+    assert failed.result.failed
     assert (len(found.estimated), len(found.failures)) == (4, 1)
-    assert found.failures[0].reason == "none in band"
+    assert found.failures[0].result.reason == "none in band"
     assert np.isfinite(found.f0_hz).all()
 
 
@@ -214,12 +222,19 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
         assert f"{value:.0e}"[0] in "125"
         assert float(f"{value:.0e}") == pytest.approx(value)
     # one point that is far less certain does not make the others invisible
-    wild = replace(found.points[0], covariance=1e4 * COVARIANCE)
+    sure = found.points[0].result
+    unsure = replace(
+        sure,
+        f0_std_hz=100 * sure.f0_std_hz,
+        damping_ratio_std=100 * sure.damping_ratio_std,
+        f0_damping_covariance_hz=1e4 * sure.f0_damping_covariance_hz,
+    )
+    wild = replace(found.points[0], result=unsure)
     assert PoleMap((wild, *found.points[1:])).ellipse_scale() == scale
     # and one point alone, or none with a covariance, has a scale too
     assert PoleMap(found.points[:1]).ellipse_scale().m_per_hz > 0
     bare = MapPoint(
-        np.zeros(3), np.array([0, 0, 1.0]), np.array([250, 0.03]), np.full((2, 2), np.nan)
+        PointResult(0, f0_hz=250.0, damping_ratio=0.03), np.zeros(3), np.array([0, 0, 1.0])
     )
     assert PoleMap((bare,)).ellipse_scale().m_per_hz > 0
     assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
@@ -228,7 +243,7 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
 def test_what_is_drawn_refers_to_the_size_seen_from_above():
     row = PoleMap(tuple(p for p in grid_map().points if p.position_m[1] == 0))
     assert row.size_m == pytest.approx(0.016)
-    in_air = replace(row.points[0], position_m=np.array([0.0, 0.0, 0.06]), measurement_id=99)
+    in_air = map_point(poles(), origin(0.0, 0.0, 0.06, key=99))
     assert row.with_point(in_air).size_m == pytest.approx(0.016)
     assert PoleMap(row.points[:2]).size_m == pytest.approx(4 * 0.004)
     assert PoleMap(row.points[:1]).size_m == pytest.approx(4 * 0.005)
@@ -244,7 +259,7 @@ def test_a_point_is_seen_from_another_frame():
     again = there.seen_from(place, turn)
     np.testing.assert_allclose(again.position_m, here.position_m, atol=1e-15)
     np.testing.assert_allclose(again.normal, here.normal, atol=1e-15)
-    np.testing.assert_array_equal(again.estimate, here.estimate)
+    assert again.result is here.result
 
 
 def test_surface_follows_the_points_and_their_plane():
@@ -283,10 +298,14 @@ def test_a_run_s_results_make_the_same_point():
         f0_damping_covariance_hz=COVARIANCE[0, 1],
         poles_status="model error",
     )
-    again = point_of_result(result)
-    np.testing.assert_allclose(again.covariance, point.covariance)
-    np.testing.assert_allclose(again.position_m, point.position_m)
-    assert again.status is PolesStatus.MODEL_ERROR
-    failed = point_of_result(replace(result, outcome=PointOutcome.FAILED, reason="contact lost"))
-    assert failed.failed
-    assert failed.reason == "contact lost"
+    again = PoleMap().with_result(result)
+    (found,) = again.estimated
+    np.testing.assert_allclose(found.result.covariance, point.result.covariance)
+    np.testing.assert_allclose(found.position_m, point.position_m)
+    cloud = cloud_message(again, (), header_message("table", 1))
+    (row,) = np.frombuffer(cloud.data.tobytes(), POINT)
+    assert row["status"] == POLES_STATUS[PolesStatus.MODEL_ERROR]
+    (failed,) = again.with_result(
+        replace(result, outcome=PointOutcome.FAILED, reason="contact lost")
+    ).failures
+    assert failed.result.reason == "contact lost"

@@ -98,7 +98,7 @@ def test_of_two_modes_the_main_one_ends_the_measurement_and_is_on_the_map(tmp_pa
         assert result.f0_std_hz == pytest.approx(SPREAD_HZ / np.sqrt(blocks))
         assert (result.pole_real_rad_s, result.pole_imag_rad_s) == (-50.0, 1600.0)
     np.testing.assert_array_equal(pole_map_of(run).f0_hz, 254.0)
-    std_hz = [point.std[0] for point in pole_map_of(run).points]
+    std_hz = [point.result.f0_std_hz for point in pole_map_of(run).points]
     np.testing.assert_allclose(std_hz, SPREAD_HZ / np.sqrt(blocks))
     measured = [p.poles.main for p in told if p.poles is not None]
     assert {mode.f0_hz for mode in measured} == {254.0}

@@ -68,7 +68,7 @@ def test_the_inclusion_is_found_where_it_lies(run_folder):
     pole_map = pole_map_of(read_run(run_folder))
     called = {
         tuple(np.round(1e3 * p.position_m[:2]).astype(int)) for p in pole_map.points
-        if p.tissue_class == "inclusion"
+        if p.result.tissue_class == "inclusion"
     }  # fmt: skip
     # the ball is 12 mm wide and round: from 6 mm on beside its middle the poles are those of 11 % gelatine too
     middle = np.array([2.0, -1.0])
