@@ -27,6 +27,7 @@ from benchmarks.poles_methods import (
 )
 from benchmarks.poles_plant import BAND_HZ, Plant, judge
 from benchmarks.poles_realisations import grid_table
+from benchmarks.poles_reidentify import reidentify_table
 from tactile_resonance.poles.identify import identify_spectra
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
@@ -39,7 +40,7 @@ CHUNK = 1000
 MARGIN_HZ = 30.0
 
 
-PARTS = ("methods", "bias", "grid", "realisations")
+PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 
 
 def run(output: Path, quick: bool, part: str | None = None) -> str:
@@ -51,7 +52,7 @@ def run(output: Path, quick: bool, part: str | None = None) -> str:
         Folder, made if need be.
     quick : bool
         A thinned Monte Carlo: 500 runs a cell instead of 20 000, of realisations instead of 3000.
-    part : {"methods", "bias", "grid", "realisations"}, optional
+    part : {"methods", "bias", "grid", "realisations", "reidentify"}, optional
         Renew this table alone, the others stay as they are in `output`. All when absent.
     """
     output.mkdir(parents=True, exist_ok=True)
@@ -78,6 +79,8 @@ def _measured(part: str, output: Path, quick: bool) -> list[str]:
         return _bias_table()
     if part == "realisations":
         return grid_table(500 if quick else 3000)
+    if part == "reidentify":
+        return reidentify_table(20_000) if quick else reidentify_table()
     runs = 500 if quick else 20000
     cells = [
         measure_cell(Plant(zeta, snr, periods), runs)

@@ -65,6 +65,7 @@ def _parser() -> OneLineParser:
         check_robot,
         demo,
         figures,
+        reidentify,
         report,
         scan,
         simulate_cell,
@@ -77,7 +78,7 @@ def _parser() -> OneLineParser:
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(demo, analyze, report, figures, benchmark),
+        *(demo, analyze, reidentify, report, figures, benchmark),
         *(scan, calibrate_table, simulate_ur, simulate_cell, check_robot),
     ):
         command.add_parser(commands)

@@ -14,7 +14,7 @@ NAMES = (
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""
-PARTS = ("methods", "bias", "grid", "realisations")
+PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 """Tables of `poles`, each of which can be renewed alone."""
 
 

@@ -76,6 +76,26 @@ def read_run(path: Path) -> RunContent:
     ValueError
         If it is no run.
     """
+    run = read_plan(path)
+    problems = []
+    for file in sorted((run.path / RECORDING).iterdir()):
+        if file.suffix in (".yaml", ".part"):
+            continue
+        try:
+            run = run.with_file(*_read_file(file, len(run.points)))
+        except ValueError as error:
+            problems.append(str(error))
+    return replace(run, problems=tuple(problems))
+
+
+def read_plan(path: Path) -> RunContent:
+    """The scene and the plan of a run alone, as if nothing were finished.
+
+    Raises
+    ------
+    ValueError
+        If it is no run.
+    """
     path = Path(path)
     try:
         content = json.loads((path / "run.json").read_text(encoding="utf-8"))
@@ -89,16 +109,7 @@ def read_run(path: Path) -> RunContent:
         facts = content["facts"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
-    run = RunContent(path, scene, facts, points)
-    problems = []
-    for file in sorted((path / RECORDING).iterdir()):
-        if file.suffix in (".yaml", ".part"):
-            continue
-        try:
-            run = run.with_file(*_read_file(file, len(points)))
-        except ValueError as error:
-            problems.append(str(error))
-    return replace(run, problems=tuple(problems))
+    return RunContent(path, scene, facts, points)
 
 
 def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bins of the band of every point of a run, kept beside its recording: what poles are identified from again.
+
+``RUN/bins.npz`` follows from the recording and is made when it is first asked for: transforming the records
+takes a hundred times as long as the fit. Its arrays ``points_0``, ``points_1`` ... hold one row a point, one
+array for each kind of record: index, attempt, measurement_id, x_m, y_m, z_m, and u and y, (M, K) bins in single
+precision. ``kinds`` says in JSON what the rows of each have in common, which files all were made of, and what
+was left out.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.frf.band_bins import BandBins, band_bins
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.recording.store_recording import recording_of
+from tactile_resonance.rows_file import Rows, RowsWriter
+from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.recorded import file_of, measurements_of_file
+from tactile_resonance.scan.run_content import RECORDING, read_run
+
+NAME = "bins.npz"
+FORMAT = "tactile_resonance bins 1"
+PLACE = ("index", "attempt", "measurement_id", "x_m", "y_m", "z_m")
+_PLACES = [("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")] + [
+    (name, "<f8") for name in PLACE[3:]
+]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What the records of some points have in common; see `BandBins`."""
+
+    first_bin: int
+    realisations: int
+    count: int
+    harmonics: tuple[int, ...]
+    sample_rate_hz: float
+    samples_per_period: int
+    periods: int
+
+    @classmethod
+    def of(cls, bins: BandBins) -> Kind:
+        """Of the bins of a point."""
+        realisations, count = bins.u.shape
+        return cls(
+            int(bins.first_bin),
+            realisations,
+            count,
+            tuple(bins.harmonics.tolist()),
+            float(bins.sample_rate_hz),
+            int(bins.samples_per_period),
+            int(bins.periods),
+        )
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the row of a point."""
+        shape = (self.realisations, self.count)
+        return np.dtype([*_PLACES, ("u", "<c8", shape), ("y", "<c8", shape)])
+
+    def bins(self, row: npt.NDArray) -> BandBins:
+        """Of one point."""
+        return BandBins(
+            self.first_bin,
+            row["u"].astype(complex),
+            row["y"].astype(complex),
+            np.array(self.harmonics, np.int64),
+            self.sample_rate_hz,
+            self.samples_per_period,
+            self.periods,
+        )
+
+
+@dataclass(frozen=True)
+class KeptBins:
+    """The points of a run by the kinds of their records.
+
+    Attributes
+    ----------
+    run : Path
+    band_hz : (low, high)
+    kinds : tuple of (Kind, Rows)
+    left_out : tuple of str
+        Points without bins, and why.
+    """
+
+    run: Path
+    band_hz: tuple[float, float]
+    kinds: tuple[tuple[Kind, Rows], ...]
+    left_out: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """Points."""
+        return sum(rows.count for _, rows in self.kinds)
+
+
+def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
+    """What is kept of a run; None where nothing is, or not of this band, or the recording has changed since.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read.
+    """
+    path = run / NAME
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path) as arrays:
+            content = json.loads(str(arrays["kinds"]))
+        low_hz, high_hz = content["band_hz"]
+        if content["format"] != FORMAT or content["files"] != _files(run):
+            return None
+        kinds = [
+            Kind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
+        ]
+        rows = [Rows.of(path, f"points_{k}") for k in range(len(kinds))]
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):  # damaged: it is made again
+        return None
+    within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
+    pairs = tuple(zip(kinds, rows, strict=True))
+    return KeptBins(run, (low_hz, high_hz), pairs, tuple(content["left_out"])) if within else None
+
+
+def bins_of_point(
+    run: Path, result: PointResult, band_hz: tuple[float, float]
+) -> tuple[Kind, npt.NDArray] | str:
+    """Kind and row (1,) of a point of a run, from its records; why there is none as text."""
+    name = f"point {result.index}"
+    if not result.measurement_id:
+        return f"{name}: {result.outcome.name.lower()}, nothing was measured"
+    try:
+        for measurement in measurements_of_file(file_of(run, result)):
+            if measurement.measurement_id == result.measurement_id:
+                recording = recording_of(measurement)
+                break
+        else:
+            return f"{name}: no record of measurement {result.measurement_id}"
+        record, harmonics = Spectrum.of(recording.u, recording.y), recording.excited_harmonics
+        rate_hz = recording.sample_rate_hz
+        if harmonics is None:
+            harmonics = find_excited_harmonics(record)
+        bins = band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
+    except ValueError as error:
+        return f"{name}: {error}"
+    if bins is None:
+        return f"{name}: no excited line in {band_hz[0]:g}-{band_hz[1]:g} Hz"
+    kind = Kind.of(bins)
+    row = np.zeros(1, kind.dtype)
+    for field in PLACE:
+        row[field] = getattr(result, field)
+    row["u"], row["y"] = bins.u, bins.y
+    return kind, row
+
+
+def keep_bins(
+    run: Path,
+    band_hz: tuple[float, float],
+    of_points: Callable[[Path, list[PointResult], tuple[float, float]], Iterator],
+) -> KeptBins:
+    """Make ``bins.npz`` of a run, of the latest attempt at each finished point.
+
+    Parameters
+    ----------
+    run : Path
+    band_hz : (low, high)
+    of_points : callable
+        What `bins_of_point` gives for each of some results, in whatever processes.
+
+    Raises
+    ------
+    ValueError
+        If it is no run.
+    OSError
+        If the folder cannot be written.
+    """
+    files, content = _files(run), read_run(run)
+    kinds: dict[Kind, str] = {}
+    left_out = list(content.problems)
+    with RowsWriter(run / NAME) as writer:
+        for found in of_points(run, list(content.latest), band_hz):
+            if isinstance(found, str):
+                left_out.append(found)
+                continue
+            kind, row = found
+            writer.append(kinds.setdefault(kind, f"points_{len(kinds)}"), row)
+        finish(writer, list(kinds), band_hz, files, left_out)
+    kept = kept_bins(run, band_hz)
+    assert kept is not None
+    return kept
+
+
+def finish(
+    writer: RowsWriter,
+    kinds: list[Kind],
+    band_hz: tuple[float, float],
+    files: dict[str, int],
+    left_out: list[str],
+) -> None:
+    """Complete a file of bins whose rows ``points_0`` ... are written."""
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "band_hz": list(band_hz),
+        "kinds": [asdict(kind) for kind in kinds],
+        "files": files,
+        "left_out": left_out,
+    }
+    writer.finish(kinds=np.array(json.dumps(content)))
+
+
+def _files(run: Path) -> dict[str, int]:
+    """Sizes of the finished files of a recording by their names."""
+    return {file.name: file.stat().st_size for file in sorted((run / RECORDING).glob("*.mcap"))}

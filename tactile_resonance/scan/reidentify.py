@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles of all points of one or several runs, again, with another model or band.
+
+Points of one kind are fitted together, some thousand at a time, in as many processes as there are cores. What
+such a fit is not sure of is then fitted alone, as `analyse` does, which also looks for tones, for modes that
+change and for disturbances of the generator.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.fields import read_dataclass, read_yaml, section
+from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_records import identify_poles_from_bins
+from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.result import STATUSES, Poles, PolesBatch, PolesStatus
+from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.rows_file import RowsWriter
+from tactile_resonance.scan.kept_bins import (
+    PLACE,
+    KeptBins,
+    Kind,
+    bins_of_point,
+    keep_bins,
+    kept_bins,
+)
+from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.run_content import read_plan
+from tactile_resonance.scan.scene import SensorUse
+
+BYTES_AT_ONCE = 8_000_000
+"""Of the bins that a process takes together."""
+STATUS = "poles_status"
+# What one process is given beforehand, so that none waits for work.
+_AHEAD = 2
+# A fit of these found nothing that another one could explain.
+_SURE = (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
+_MODE = (
+    "f0_hz",
+    "f0_std_hz",
+    "damping_ratio",
+    "damping_ratio_std",
+    "f0_damping_covariance_hz",
+    "pole_real_rad_s",
+    "pole_imag_rad_s",
+)
+_STATUSES = [status.value for status in STATUSES]
+
+Task = TypeVar("Task")
+Found = TypeVar("Found")
+
+
+def scene_band(run: Path) -> tuple[float, float]:
+    """Band (low, high) [Hz] that a run was scanned for.
+
+    Raises
+    ------
+    ValueError
+        If its scene cannot be read.
+    """
+    path = run / "scene.yaml"
+    where = f"{path}:"
+    content = read_yaml(path)
+    sensor = section(content, "sensor", where) if "sensor" in content else {}
+    use = read_dataclass(SensorUse, sensor, f"{where} sensor")
+    return use.band_low_hz, use.band_high_hz
+
+
+def row_type(structure: ModelStructure) -> np.dtype:
+    """Of the result of a point: the mode with the highest peak, then others with ``_2``, ``_3`` ... behind."""
+    modes = [
+        name if place == 0 else f"{name}_{place + 1}"
+        for place in range(max(structure.order // 2, 1))
+        for name in _MODE
+    ]
+    return np.dtype(
+        [("run", "<i4"), ("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")]
+        + [(name, "<f8") for name in (*PLACE[3:], *modes, "cost", "expected_cost")]
+        + [(STATUS, "<u1")]
+    )
+
+
+def reidentify(
+    runs: Sequence[Path],
+    csv: Path,
+    npz: Path,
+    band_hz: tuple[float, float] | None = None,
+    structure: ModelStructure | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, of: None,
+) -> tuple[Counter[str], list[str]]:
+    """Poles of every finished point of some runs, into two files that are there whole or not at all.
+
+    Parameters
+    ----------
+    runs : sequence of Path
+    csv, npz : Path
+        Replaced. One row a point; the second holds a structured array ``points``, whose ``run`` counts in
+        ``runs`` and whose ``poles_status`` counts in ``poles_statuses``.
+    band_hz : (low, high), optional
+        Of each run's scene when absent.
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+    progress : callable
+        Told what is done, how many points are, and of how many.
+
+    Returns
+    -------
+    counts : Counter
+        Points by status.
+    left_out : list of str
+        Points without a record, damaged files.
+
+    Raises
+    ------
+    ValueError
+        If a folder is no run, or the model does not suit a band; before any point is read.
+    OSError
+        If a file cannot be read or written, or a process was ended from outside.
+    """
+    structure = structure or ModelStructure()
+    for run in runs:
+        read_plan(run)
+    bands = [band_hz or scene_band(run) for run in runs]
+    dtype, counts, left_out = row_type(structure), Counter[str](), []
+    part = csv.with_name(csv.name + ".part")
+    with _Processes() as processes:
+        kept = []
+        for run, band in zip(runs, bands, strict=True):
+            kept.append(kept_bins(run, band) or _keep(processes, run, band, progress))
+            left_out += [f"{run}: {text}" for text in kept[-1].left_out]
+            for kind, _ in kept[-1].kinds:
+                _plan(kind, band, structure)  # raises what does not suit
+        total, done = sum(of_run.count for of_run in kept), 0
+        jobs = (job for k, run in enumerate(kept) for job in _jobs(k, run, bands[k], structure))
+        try:
+            with RowsWriter(npz) as writer, part.open("w", encoding="utf-8") as text:
+                text.write(",".join(dtype.names or ()) + "\n")
+                writer.append("points", np.zeros(0, dtype))
+                for rows, lines in processes.in_order(_identified, jobs):
+                    writer.append("points", rows)
+                    text.write(lines)
+                    codes = np.bincount(rows[STATUS], minlength=len(STATUSES))
+                    counts.update(dict(zip(_STATUSES, codes.tolist(), strict=True)))
+                    done += rows.size
+                    progress("poles", done, total)
+                text.flush()
+                os.fsync(text.fileno())
+                writer.finish(
+                    runs=np.array([str(run) for run in runs]),
+                    poles_statuses=np.array(_STATUSES),
+                    bands_hz=np.array(bands),
+                )
+                part.replace(csv)
+        finally:
+            part.unlink(missing_ok=True)
+    return +counts, left_out
+
+
+def _keep(
+    processes: _Processes,
+    run: Path,
+    band_hz: tuple[float, float],
+    progress: Callable[[str, int, int], None],
+) -> KeptBins:
+    def of_points(run: Path, results: list[PointResult], band_hz: tuple[float, float]) -> Iterator:
+        jobs = ((run, result, band_hz) for result in results)
+        for k, found in enumerate(processes.in_order(_bins_of_point, jobs)):
+            progress(f"bins of {run.name}", k + 1, len(results))
+            yield found
+
+    return keep_bins(run, band_hz, of_points)
+
+
+def _bins_of_point(job: tuple) -> tuple[Kind, npt.NDArray] | str:
+    return bins_of_point(*job)
+
+
+def _jobs(
+    run: int, kept: KeptBins, band_hz: tuple[float, float], structure: ModelStructure
+) -> Iterator[tuple]:
+    for kind, rows in kept.kinds:
+        size = max(1, BYTES_AT_ONCE // rows.dtype.itemsize)
+        for start in range(0, rows.count, size):
+            stop = min(start + size, rows.count)
+            yield run, str(kept.run), kind, rows, start, stop, band_hz, structure
+
+
+@lru_cache(maxsize=32)
+def _plan(kind: Kind, band_hz: tuple[float, float], structure: ModelStructure) -> JointPlan:
+    return (JointPlan if kind.realisations == 1 else PoleEstimator)(
+        kind.sample_rate_hz,
+        kind.samples_per_period,
+        kind.periods,
+        np.array(kind.harmonics, np.int64),
+        band_hz,
+        structure,
+    )
+
+
+def _identified(job: tuple) -> tuple[npt.NDArray, str]:
+    """(n,) results of some points of one kind, and their lines of the table."""
+    run, name_of_run, kind, source, start, stop, band_hz, structure = job
+    points = source.read(start, stop)
+    plan = _plan(kind, band_hz, structure)
+    first = plan.bins[0] - kind.first_bin
+    here = slice(first, first + plan.bins.size)
+    u, y = (points[name][..., here].astype(complex) for name in ("u", "y"))  # (n, M, K)
+    batch = plan.from_bins(u[:, 0], y[:, 0]) if kind.realisations == 1 else plan.from_bins(u, y)
+    rows = np.zeros(points.size, row_type(structure))
+    _fill_nan(rows)
+    rows["run"] = run
+    for name in PLACE:
+        rows[name] = points[name]
+    _fill(rows, batch)
+    for k in np.flatnonzero(_unsure(batch, kind)):
+        _fill_one(
+            rows[k : k + 1], identify_poles_from_bins(kind.bins(points[k]), band_hz, structure)
+        )
+    return rows, _as_csv(rows, name_of_run)
+
+
+def _unsure(batch: PolesBatch, kind: Kind) -> npt.NDArray[np.bool_]:
+    """(n,) points whose fit shows that something is not as the model says."""
+    sure = np.isin(batch.status_code, [STATUSES.index(status) for status in _SURE])
+    if kind.realisations == 1:  # others have distortion, which no line has as much of as the next
+        sure &= batch.variance_model == "flat"
+    return ~sure
+
+
+def _fill(rows: npt.NDArray, batch: PolesBatch) -> None:
+    """Results of a batch (n,); modes as `Poles.main` and `Poles.best_covariance` choose them."""
+    with np.errstate(all="ignore"):
+        peak = np.abs(batch.residues) / np.abs(batch.poles_rad_s.real)
+    there = np.isfinite(batch.poles_rad_s) & batch.significant
+    order = _main_first(np.where(there, peak, -np.inf))
+
+    def taken(values: npt.NDArray, there: npt.NDArray) -> npt.NDArray:
+        wide = (..., *[None] * (values.ndim - 2))
+        return np.take_along_axis(np.where(there[wide], values, np.nan), order[wide], axis=1)
+
+    total = batch.total_covariance
+    known = np.isfinite(total).all(axis=(2, 3), keepdims=True)
+    covariance = taken(np.where(known, total, batch.covariance), there)
+    values = (batch.f0_hz, batch.damping_ratio, batch.poles_rad_s)
+    f0_hz, damping_ratio, poles_rad_s = (taken(x, there) for x in values)
+    _fill_modes(rows, f0_hz, damping_ratio, poles_rad_s, covariance)
+    for name in ("cost", "expected_cost"):
+        rows[name] = getattr(batch, name)
+    rows[STATUS] = batch.status_code
+
+
+def _fill_one(row: npt.NDArray, poles: Poles) -> None:
+    peak = np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)
+    order = _main_first(peak[None])[0]
+    _fill_nan(row, PLACE)
+    values = (poles.f0_hz, poles.damping_ratio, poles.poles_rad_s, poles.best_covariance)
+    f0_hz, damping_ratio, poles_rad_s, covariance = (x[None, order] for x in values)
+    _fill_modes(row, f0_hz, damping_ratio, poles_rad_s, covariance)
+    for name in ("cost", "expected_cost"):
+        row[name] = getattr(poles, name)
+    row[STATUS] = STATUSES.index(poles.status)
+
+
+def _fill_nan(rows: npt.NDArray, but: tuple[str, ...] = ()) -> None:
+    for name in set(rows.dtype.names or ()) - set(but):
+        if rows.dtype[name].kind == "f":
+            rows[name] = np.nan
+
+
+def _main_first(peak: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """(n, places) order of modes: the highest peak, then the others as they are, those without one last."""
+    places = np.tile(np.arange(peak.shape[1]), (len(peak), 1))
+    if peak.shape[1] == 0:
+        return places
+    rank = np.where(places == np.argmax(peak, axis=1)[:, None], -1, places)
+    return np.argsort(np.where(np.isneginf(peak), peak.shape[1] + places, rank), axis=1)
+
+
+def _fill_modes(
+    rows: npt.NDArray,
+    f0_hz: npt.NDArray,
+    damping_ratio: npt.NDArray,
+    poles_rad_s: npt.NDArray,
+    covariance: npt.NDArray,
+) -> None:
+    """From arrays (n, places)."""
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+    columns = (
+        *(f0_hz, std[..., 0], damping_ratio, std[..., 1], covariance[..., 0, 1]),
+        *(poles_rad_s.real, poles_rad_s.imag),
+    )
+    for name, values in zip(_MODE, columns, strict=True):
+        for place in range(values.shape[1]):
+            rows[name if place == 0 else f"{name}_{place + 1}"] = values[:, place]
+
+
+def _as_csv(rows: npt.NDArray, run: str) -> str:
+    """Lines of a table; numbers with all their digits. The run is the first column, the status the last one."""
+    if any(mark in run for mark in ',"\n\r'):
+        run = '"{}"'.format(run.replace('"', '""'))
+    numbers = ",".join(["%r"] * (len(rows.dtype.names or ()) - 2))
+    line = f"{run.replace('%', '%%')},{numbers},%s\n"
+    return "".join([line % (*row[1:-1], _STATUSES[row[-1]]) for row in rows.tolist()])
+
+
+class _Processes:
+    """One a core, which end with the context whatever happens."""
+
+    def __init__(self) -> None:
+        self._count = len(os.sched_getaffinity(0))
+        self._pool = ProcessPoolExecutor(self._count, initializer=_begin_process)
+
+    def __enter__(self) -> _Processes:
+        return self
+
+    def __exit__(self, kind: Any, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def in_order(self, function: Callable[[Task], Found], jobs: Iterable[Task]) -> Iterator[Found]:
+        """What a function gives for each of some jobs, few of which are under way at a time."""
+        waiting: deque[Future[Found]] = deque()
+        try:
+            for job in jobs:
+                waiting.append(self._pool.submit(function, job))
+                if len(waiting) > _AHEAD * self._count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        except BrokenProcessPool as error:
+            raise OSError(
+                "a process of the fit was ended from outside, as for want of memory"
+            ) from error
+
+
+def _begin_process() -> None:
+    # an interrupt reaches the whole group; the parent ends its processes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)

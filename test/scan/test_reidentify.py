@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles of all points of runs again: those of `analyze`, whole files or none, and in pieces of bounded size."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.cli import main
+from tactile_resonance.multisine import design_multisine
+from tactile_resonance.rows_file import Rows, RowsWriter
+from tactile_resonance.scan import reidentify as module
+from tactile_resonance.scan.messages import make_message, to_cdr
+from tactile_resonance.scan.recorded import EXCITATION, RECORD
+from tactile_resonance.scan.run_directory import RunDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from run_tables import START_NS, plan, result
+
+N, RATE_HZ, PERIODS = 2000, 5000.0, 4
+SCENE = "name: x\nsensor: {band_low_hz: 210.0, band_high_hz: 290.0}\n"
+
+
+def measurement(key, realisations=1, modes=((250.0, 0.02),), hum_v=0.0):
+    """Messages of one measurement: topic, type, message."""
+    rng = np.random.default_rng(key)
+    for m in range(realisations):
+        played = design_multisine(
+            sample_rate_hz=RATE_HZ,
+            samples_per_period=N,
+            band_hz=(150.0, 350.0),
+            periods=PERIODS,
+            realisations=realisations,
+            realisation=m,
+            seed=key,
+        )
+        arrays = {name: getattr(played, name) for name in ("harmonics", "amplitude_v", "phase_rad")}
+        arrays["harmonics"] = arrays["harmonics"].astype(np.uint32)
+        yield (
+            "/excitation",
+            EXCITATION,
+            make_message(
+                EXCITATION,
+                measurement_id=key,
+                grid=1,
+                realisation=m,
+                realisations=realisations,
+                periods=PERIODS,
+                sample_rate_hz=RATE_HZ,
+                samples_per_period=N,
+                seed=key,
+                **arrays,
+            ),
+        )
+        s = 2j * np.pi * np.fft.rfftfreq(N, 1 / RATE_HZ)
+        g = 0.1
+        for f0_hz, zeta in modes:
+            w0 = 2 * np.pi * f0_hz
+            g = g + 2 * zeta * w0**2 / (s**2 + 2 * zeta * w0 * s + w0**2)
+        u = np.tile(played.period(), PERIODS)
+        y = np.tile(np.fft.irfft(g * np.fft.rfft(played.period()), N), PERIODS)
+        y = y + 1e-3 * rng.standard_normal(y.size)
+        y = y + hum_v * np.cos(2 * np.pi * 251.4 * np.arange(y.size) / RATE_HZ)
+        for block in range(PERIODS):
+            here = slice(block * N, (block + 1) * N)
+            yield (
+                "/record",
+                RECORD,
+                make_message(
+                    RECORD,
+                    measurement_id=key,
+                    realisation=m,
+                    block_index=block,
+                    sample_rate_hz=RATE_HZ,
+                    samples_per_period=N,
+                    actuator_v=u[here],
+                    sensor_v=y[here],
+                    final=block == PERIODS - 1 and m == realisations - 1,
+                ),
+            )
+
+
+def make_run(folder, measurements, scene=SCENE):
+    """A run of one measurement a point; None: none was taken there."""
+    with RunDirectory.create(folder, scene, plan(len(measurements)), {}) as run:
+        for index, messages in enumerate(measurements):
+            with run.begin_point(index) as recording:
+                for k, (topic, name, message) in enumerate(messages or ()):
+                    recording.write(topic, name, START_NS + k, to_cdr(message))
+                key = 100 + index if messages else 0
+                recording.finish(result(index, measurement_id=key))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    kinds = [
+        {},
+        {},
+        {"realisations": 2},
+        {"hum_v": 0.05},
+        {"modes": ((240.0, 0.02), (262.0, 0.03))},
+        None,
+    ]
+    first = make_run(
+        folder / "first",
+        [
+            None if kind is None else list(measurement(100 + k, **kind))
+            for k, kind in enumerate(kinds)
+        ],
+    )
+    return first, make_run(folder / "second, too", [list(measurement(100 + k)) for k in range(2)])
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def analyzed(run, key, output, *options):
+    """Poles that `analyze` gives of a measurement, the largest peak first; its content."""
+    arguments = ["analyze", str(run), "--measurement", str(key), "--json", str(output), *options]
+    assert main(arguments) == 0
+    return json.loads(output.read_text())
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
+    output = tmp_path / "again"
+    model = ["--order", str(order), "--band", "205", "295"]
+    assert main(["reidentify", str(runs[0]), "--output", str(output), *model]) == 0
+    printed = capsys.readouterr().out
+    rows = table(tmp_path / "again.csv")
+    assert [int(row["index"]) for row in rows] == [0, 1, 3, 4, 2]  # by the kind of their records
+    assert "left out" in printed
+    assert "point 5: done, nothing was measured" in printed
+    statuses = [row["poles_status"] for row in rows]
+    for status in set(statuses):
+        assert f"{status}: {statuses.count(status)}\n" in printed
+    for row in rows:
+        found = analyzed(runs[0], row["measurement_id"], tmp_path / "out.json", *model)
+        assert row["poles_status"] == found["status"]
+        f0_hz = [row[name] for name in row if name.startswith("f0_hz")]
+        there = [float(text) for text in f0_hz if text != "nan"]
+        assert sorted(there) == pytest.approx([pole["f0_hz"] for pole in found["poles"]], rel=1e-6)
+        main_mode = int(np.argmin([abs(pole["f0_hz"] - there[0]) for pole in found["poles"]]))
+        pole = found["poles"][main_mode]
+        # bins are kept in single precision: rounding moves nothing by a hundredth of its deviation
+        best = pole["total_covariance"] or pole["covariance"]
+        for name, of_pole, std in (
+            ("f0_hz", pole["f0_hz"], np.sqrt(best[0][0])),
+            ("damping_ratio", pole["damping_ratio"], np.sqrt(best[1][1])),
+            (
+                "pole_real_rad_s",
+                pole["real_rad_s"],
+                2 * np.pi * pole["f0_hz"] * np.sqrt(best[1][1]),
+            ),
+        ):
+            assert float(row[name]) == pytest.approx(of_pole, abs=0.01 * std)
+        assert float(row["f0_std_hz"]) == pytest.approx(np.sqrt(best[0][0]), rel=2e-3)
+        assert float(row["damping_ratio_std"]) == pytest.approx(np.sqrt(best[1][1]), rel=2e-3)
+        cross = best[0][1] / np.sqrt(best[0][0] * best[1][1])
+        scale = float(row["f0_std_hz"]) * float(row["damping_ratio_std"])
+        assert float(row["f0_damping_covariance_hz"]) / scale == pytest.approx(cross, abs=2e-3)
+        assert float(row["cost"]) == pytest.approx(found["cost"], rel=2e-3)
+
+
+def test_the_npz_holds_the_same_and_several_runs_go_into_one(runs, tmp_path):
+    output = tmp_path / "both"
+    assert main(["reidentify", *map(str, runs), "--output", str(output)]) == 0
+    rows = table(tmp_path / "both.csv")
+    with np.load(tmp_path / "both.npz") as arrays:
+        points, names = arrays["points"], arrays["runs"]
+        statuses, bands = arrays["poles_statuses"], arrays["bands_hz"]
+    np.testing.assert_array_equal(bands, [[210, 290]] * 2)  # those of the scenes
+    assert [row["run"] for row in rows] == names[points["run"]].tolist()
+    assert [row["poles_status"] for row in rows] == statuses[points["poles_status"]].tolist()
+    for name in set(points.dtype.names) - {"run", "poles_status"}:
+        np.testing.assert_array_equal(points[name], [float(row[name]) for row in rows])
+    assert [row["run"] for row in rows].count(str(runs[1])) == 2
+
+
+def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown(tmp_path, capsys):
+    run = make_run(tmp_path / "run", [list(measurement(100)), list(measurement(101))])
+    command = ["reidentify", str(run)]
+
+    def made():
+        assert main(command) == 0
+        return "bins of run: 2 of 2" in capsys.readouterr().out
+
+    assert made()
+    assert not made()
+    command += ["--band", "220", "280"]  # within
+    assert not made()
+    command[-2:] = ["200", "300"]
+    assert made()
+    assert not made()
+    (run / "bins.npz").write_bytes((run / "bins.npz").read_bytes()[:-100])
+    assert made()
+    with RunDirectory.open(run) as again, again.begin_point(0) as recording:
+        for k, (topic, name, message) in enumerate(measurement(102)):
+            recording.write(topic, name, START_NS + k, to_cdr(message))
+        recording.finish(result(0, 1, measurement_id=102))
+    assert made()
+    assert [row["measurement_id"] for row in table(run / "reidentified.csv")] == ["102", "101"]
+
+
+def test_what_it_refuses(runs, tmp_path, capsys):
+    cases = {
+        "cannot be read as a run": [str(tmp_path)],
+        "nowhere cannot be read as a run": [str(tmp_path / "nowhere")],
+        "output: not given": [str(run) for run in runs],
+        "output: ": [str(runs[0]), "--output", str(tmp_path / "no" / "folder")],
+        "band: 300 200": [str(runs[0]), "--band", "300", "200"],
+        "order: 0": [str(runs[0]), "--order", "0"],
+        "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
+    }
+    for text, arguments in cases.items():
+        assert main(["reidentify", *arguments]) == 1
+        told = capsys.readouterr().err
+        assert text in told
+        assert told.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_pieces_bound_what_is_held_at_a_time(runs, tmp_path, monkeypatch):
+    """Whatever the pieces, the result is the same, and none reads more bytes than it may."""
+    assert main(["reidentify", str(runs[1]), "--output", str(tmp_path / "one")]) == 0
+    read, whole = [], Rows.read
+    monkeypatch.setattr(module, "BYTES_AT_ONCE", 1)
+    monkeypatch.setattr(
+        module._Processes, "in_order", lambda self, function, jobs: map(function, jobs)
+    )
+    monkeypatch.setattr(
+        Rows,
+        "read",
+        lambda self, start, stop: read.append(stop - start) or whole(self, start, stop),
+    )
+    assert main(["reidentify", str(runs[1]), "--output", str(tmp_path / "two")]) == 0
+    assert read == [1, 1]
+    one, two = table(tmp_path / "one.csv"), table(tmp_path / "two.csv")
+    for a, b in zip(one, two, strict=True):
+        assert float(a["f0_hz"]) == pytest.approx(float(b["f0_hz"]), rel=1e-9)
+
+
+def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
+    for name in ("out.csv", "out.npz"):
+        (tmp_path / name).write_text("before")
+    run = make_run(tmp_path / "run", [list(measurement(100 + k)) for k in range(12)])
+    command = [sys.executable, "-m", "tactile_resonance.cli", "reidentify", str(run)]
+    process = subprocess.Popen(
+        [*command, "--output", str(tmp_path / "out")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    assert "bins of run" in process.stdout.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told == "tactile_resonance: interrupted\n"
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:  # none of its processes stays
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("a process is left")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.csv", "out.npz", "run"]
+    assert (tmp_path / "out.csv").read_text() == "before"
+    assert not (run / "bins.npz").exists()
+    assert not list(run.glob("*.part"))
+
+
+def test_rows_come_back_in_pieces_and_an_unfinished_file_is_none(tmp_path):
+    path = tmp_path / "rows.npz"
+    rows = np.zeros(10, [("a", "<i4"), ("b", "<c8", (2, 3))])
+    rows["a"], rows["b"] = np.arange(10), 1j
+    with RowsWriter(path) as writer:
+        writer.append("x", rows[:4])
+        writer.append("x", rows[4:])
+    assert not list(tmp_path.iterdir())
+    with RowsWriter(path) as writer:
+        writer.append("x", rows[:4])
+        writer.append("x", rows[4:])
+        writer.finish(more=np.array("text"))
+    assert zipfile.ZipFile(path).testzip() is None
+    with np.load(path) as arrays:
+        np.testing.assert_array_equal(arrays["x"], rows)
+        assert arrays["more"] == "text"
+    kept = Rows.of(path, "x")
+    assert kept.count == 10
+    np.testing.assert_array_equal(kept.read(3, 7), rows[3:7])
+    with pytest.raises(ValueError, match="rows: 8 to 12, .* holds 10"):
+        kept.read(8, 12)
+    with pytest.raises(ValueError, match="damaged or foreign"):
+        Rows.of(path, "y")
