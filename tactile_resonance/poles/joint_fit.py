@@ -190,7 +190,10 @@ def _fit(
     asked = suspect | (batch == 1) | asks(layout, level.cost, level.expected, residual)
     asked = np.flatnonzero(asked & _may_return(solution))
     if asked.size:
-        lacking[asked] = lacking_terms(layout, data.rows(asked), theta[asked], inverse[asked])
+        part = data if asked.size == batch else data.rows(asked)
+        lacking[asked] = lacking_terms(
+            layout, part, theta[asked], inverse[asked], solution.cost[asked]
+        )
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
         suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * mean_power(

@@ -190,6 +190,16 @@ class JointLayout:
         x = self.variable.of_frequency(frequency_hz)
         return Directions.on_lines(frequency_hz, x, self.structure.numerator_order)
 
+    @cached_property
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Bases of A, B and C on the excited bins."""
+        problem = self.problem
+        of_a, of_c = (
+            np.ascontiguousarray(basis[problem.undriven :])
+            for basis in (problem.denominator, problem.transient)
+        )
+        return of_a, np.ascontiguousarray(problem.numerator), of_c
+
     def model_of(self, theta: FloatArray) -> RationalModel:
         """The model of coefficients (batch, n)."""
         a, b, _ = self.problem.sizes

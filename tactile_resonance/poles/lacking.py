@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.likelihood import falls
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ FALSE_ALARM = 2e-4
 WIDEST = 1 / 8
 # Distance of the modes tried, in half widths.
 GRID = 1.5
-# Part of a direction's power that the fit must leave for it to be tried.
-LEAST_LEFT = 1e-8
 # Points of a batch are asked where the cost is so many standard deviations above its expectation or,
 # where there is no cost, the residuals are this smooth (as a normal score): of clean ones 3 in a hundred.
 COST_ASKS, SMOOTHNESS_ASKS = 2.0, 1.5
@@ -50,20 +48,15 @@ class Directions:
     ----------
     poles_rad_s : (N,) complex
         Of the modes that are tried.
-    modes : (2 K, 2 N) float
-        Their responses for residues 1 and j; weights as floats times this are ``Re sum weight phi``.
-    mode_products : (K, 3 N) float
-        See `_products`.
+    modes : (N, 2, 2, K) float
+        Their responses for residues 1 and j, real and imaginary parts.
     numerator : (K, 2) complex
         The next two polynomials of the numerator.
-    numerator_products : (K, 3) float
     """
 
     poles_rad_s: ComplexArray
     modes: FloatArray
-    mode_products: FloatArray
     numerator: ComplexArray
-    numerator_products: FloatArray
 
     @classmethod
     def on_lines(
@@ -91,15 +84,10 @@ class Directions:
         above, below = 1 / (s - pole), 1 / (s - pole.conj())
         phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
         phi *= np.abs(pole.real)[:, None]
-        flat = phi.reshape(x.size, -1)
+        phi = phi.transpose(1, 2, 0)
+        modes = np.ascontiguousarray(np.stack([phi.real, phi.imag], axis=2))
         more = PolynomialBasis.on_lines(x, numerator_order + 2).values[:, numerator_order + 1 :]
-        return cls(
-            pole,
-            np.stack([flat.real, -flat.imag], axis=1).reshape(2 * x.size, -1),
-            _products(phi),
-            more,
-            _products(more[:, None]),
-        )
+        return cls(pole, modes, np.ascontiguousarray(more))
 
 
 @np.errstate(invalid="ignore")
@@ -124,7 +112,11 @@ def asks(
 
 @np.errstate(all="ignore")
 def lacking_terms(
-    layout: JointLayout, data: BinData, theta: FloatArray, inverse: FloatArray | None = None
+    layout: JointLayout,
+    data: BinData,
+    theta: FloatArray,
+    inverse: FloatArray,
+    cost: FloatArray,
 ) -> FloatArray:
     """What the model of fitted points lacks.
 
@@ -135,8 +127,10 @@ def lacking_terms(
         Of one record each.
     theta : (batch, n) float
         The fit.
-    inverse : (batch, n, n) float, optional
-        Of its normal matrices, where at hand.
+    inverse : (batch, n, n) float
+        Of its normal matrices.
+    cost : (batch,) float
+        Of all bins.
 
     Returns
     -------
@@ -151,83 +145,22 @@ def lacking_terms(
     exceeded by chance with ``(1 - R)^(dof - 1)``.
     """
     problem, directions = layout.problem, layout.directions
-    costs, _, normal = moments(problem.tables, data.arrays, theta[:, None])
-    cost = costs.sum(axis=-1)
-    if inverse is None:
-        inverse = invert(normal[:, 0].sum(axis=1))[0]
-    alpha, beta, gamma = problem.split(theta)
-    driven = slice(problem.undriven, None)
-    denominator, transient = problem.denominator[driven], problem.transient[driven]
-    one_over_a = 1 / (alpha @ denominator.T)  # (batch, K)
-    response = (beta @ problem.numerator.T) * one_over_a
-    u = data.u_driven[:, 0]
-    model = response * u + (gamma @ transient.T) * one_over_a
-    error = data.y_driven[:, 0] - model
-    weight = 1 / data.residual_variance(response)[:, 0]  # (batch, K)
-    slope = np.conj(error) * u * weight  # what a response more takes off half the cost
-    if data.variance_u is not None:
-        by_g = data.variance_u[:, 0] * np.conj(response)
-        if data.covariance_yu is not None:
-            by_g = by_g - np.conj(data.covariance_yu[:, 0])
-        slope = slope + by_g * np.abs(error * weight) ** 2
-    scaled = np.conj(one_over_a) * u * weight
-    blocks = [
-        (-np.conj(model) * scaled)[:, None] * denominator[:, :-1].conj().T,
-        (np.conj(u) * scaled)[:, None] * problem.numerator.conj().T,
-        scaled[:, None] * transient.conj().T,
-    ]
-    of_fit = np.ascontiguousarray(np.concatenate(blocks, axis=1))  # (batch, n, K)
-    power = weight * (u.real**2 + u.imag**2)
-    terms = one_over_a[..., None] * directions.numerator  # (batch, K, 2)
-    by_terms = np.real(slope[:, None] @ terms)[:, 0]
-    own = (np.abs(one_over_a) ** 2 * power) @ directions.numerator_products
-    falls = [_fall(inverse, by_terms, own, np.real(of_fit @ terms))]
-    if directions.poles_rad_s.size:
-        by_modes = np.ascontiguousarray(slope).view(float) @ directions.modes
-        crossed = of_fit.view(float).reshape(-1, directions.modes.shape[0]) @ directions.modes
-        crossed = crossed.reshape(*theta.shape, -1)
-        falls.append(_fall(inverse, by_modes, power @ directions.mode_products, crossed))
-    fall = np.concatenate(falls, axis=1)  # (batch, 1 + N)
-    dof = data.y.shape[-1] - theta.shape[1] / 2
-    chance = (dof - 1) * np.log1p(-fall / cost[:, None])
+    fall = falls(
+        data.arrays,
+        problem.tables.undriven.last.shape[0],
+        layout.driven_bases,
+        theta,
+        inverse,
+        directions.numerator,
+        directions.modes,
+    )
+    dof = data.undriven + data.driven - theta.shape[1] / 2
+    chance = (dof - 1) * np.log1p(-fall / cost[:, None])  # (batch, 1 + N)
     chance[:, 1:] += np.log(max(directions.poles_rad_s.size, 1))
-    best = np.argmin(np.nan_to_num(chance), axis=1)[:, None]
-    fall, chance = (np.take_along_axis(v, best, axis=1) for v in (fall, chance))
-    chi_square = 2 * fall * (dof - 1) / (cost[:, None] - fall)
+    best = np.argmin(np.nan_to_num(chance), axis=1)
+    rows = np.arange(best.size)
+    fall, chance = fall[rows, best], chance[rows, best]
+    chi_square = 2 * fall * (dof - 1) / (cost - fall)
     f0_hz = np.append(np.nan, np.abs(directions.poles_rad_s) / (2 * np.pi))[best]
-    found = np.concatenate([chi_square, np.where(best > 0, 4.0, 2.0), f0_hz], axis=1)
-    return np.where(chance < np.log(FALSE_ALARM), found, np.nan)
-
-
-def _products(pairs: ComplexArray) -> FloatArray:
-    """(K, 3 N) ``Re conj(phi_i) phi_j`` of each pair of (K, N, 2): 00, 01, 11."""
-    first, second = pairs[..., 0], pairs[..., 1]
-    products = [np.abs(first) ** 2, np.real(first.conj() * second), np.abs(second) ** 2]
-    return np.stack(products, axis=-1).reshape(pairs.shape[0], -1)
-
-
-def _fall(
-    inverse: FloatArray, score: FloatArray, own: FloatArray, crossed: FloatArray
-) -> FloatArray:
-    """(batch, N) what the cost falls by along pairs of directions.
-
-    Parameters
-    ----------
-    inverse : (batch, n, n) float
-        Of the normal matrix of the fit.
-    score : (batch, 2 N) float
-    own : (batch, 3 N) float
-        Products of the two of a pair with each other, as `_products`.
-    crossed : (batch, n, 2 N) float
-        Products with the fit's own directions.
-    """
-    taken = inverse @ crossed
-    first, second = slice(0, None, 2), slice(1, None, 2)
-    left = [
-        own[:, k::3] - np.einsum("bnk,bnk->bk", crossed[..., i], taken[..., j])
-        for k, (i, j) in enumerate(((first, first), (first, second), (second, second)))
-    ]
-    determinant = left[0] * left[2] - left[1] ** 2
-    a, b = score[:, first], score[:, second]
-    fall = (left[2] * a**2 - 2 * left[1] * a * b + left[0] * b**2) / determinant
-    return np.where(determinant > LEAST_LEFT * own[:, ::3] * own[:, 2::3], fall, 0.0)
+    found = np.stack([chi_square, np.where(best > 0, 4.0, 2.0), f0_hz], axis=1)
+    return np.where((chance < np.log(FALSE_ALARM))[:, None], found, np.nan)

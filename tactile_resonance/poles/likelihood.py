@@ -89,6 +89,8 @@ ROWS = 28
 EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 
 TINY = float(np.finfo(float).tiny)
+# Part of a direction's power that a fit must leave for it to be tried.
+LEAST_LEFT = 1e-8
 MOST_DAMPING = 1e10
 LEAST_DAMPING = 1e-3
 
@@ -872,3 +874,117 @@ def invert(matrices):
         if not good:
             inverse[:] = np.nan
     return inverses, conditions
+
+
+@njit(**OPTIONS)
+def _fall(pair, own, slope, power, inverse, score, crossed):
+    """What the cost falls by along a pair of directions; see `falls`."""
+    n, bins = own.shape[0], power.size
+    p_00 = p_01 = p_11 = 0.0
+    for k in range(bins):
+        re_0, im_0, re_1, im_1 = pair[0, 0, k], pair[0, 1, k], pair[1, 0, k], pair[1, 1, k]
+        p_00 += power[k] * (re_0 * re_0 + im_0 * im_0)
+        p_01 += power[k] * (re_0 * re_1 + im_0 * im_1)
+        p_11 += power[k] * (re_1 * re_1 + im_1 * im_1)
+    for r in range(2):
+        total = 0.0
+        for k in range(bins):
+            total += slope[0, k] * pair[r, 0, k] - slope[1, k] * pair[r, 1, k]
+        score[r] = total
+        for i in range(n):
+            total = 0.0
+            for k in range(bins):
+                total += own[i, 0, k] * pair[r, 0, k] - own[i, 1, k] * pair[r, 1, k]
+            crossed[r, i] = total
+    left_00, left_01, left_11 = p_00, p_01, p_11
+    for i in range(n):
+        for j in range(n):
+            left_00 -= crossed[0, i] * inverse[i, j] * crossed[0, j]
+            left_01 -= crossed[0, i] * inverse[i, j] * crossed[1, j]
+            left_11 -= crossed[1, i] * inverse[i, j] * crossed[1, j]
+    determinant = left_00 * left_11 - left_01 * left_01
+    if not determinant > LEAST_LEFT * p_00 * p_11:
+        return 0.0
+    a, b = score
+    return (left_11 * a * a - 2 * left_01 * a * b + left_00 * b * b) / determinant
+
+
+@_entry
+@njit(**OPTIONS)
+def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
+    """What the cost of fitted points of one record falls by with directions of the response added.
+
+    Parameters
+    ----------
+    data : Arrays
+    undriven_blocks : int
+    bases : tuple of (K, terms) complex
+        Of A, B and C on driven bins.
+    theta : (points, n) float
+    inverse : (points, n, n) float
+        Of the normal matrices.
+    numerator : (K, 2) complex
+        A pair of directions over A.
+    modes : (N, 2, 2, K) float
+        Pairs of directions, real and imaginary parts.
+
+    Returns
+    -------
+    (points, 1 + N) float
+        0 where the fit has taken a direction up already.
+    """
+    basis_a, basis_b, basis_c = bases
+    y, u, _, variance_y, variance_u, covariance = data
+    points, n = theta.shape
+    bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
+    own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
+    pair, score, crossed = np.empty((2, 2, bins)), np.empty(2), np.empty((2, n))
+    flat = np.zeros((ROWS, BLOCK))
+    out = np.empty((points, 1 + modes.shape[0]))
+    for point in range(points):
+        at = theta[point]
+        for k in range(bins):
+            block, place = k // BLOCK, k % BLOCK
+            if place == 0:
+                _fill(variance_y[point, 0], block, ROW_VY, 1, flat)
+                _fill(variance_u[point, 0], block, ROW_VU, 1, flat)
+                _fill(covariance[point, 0], block, ROW_COV, 2, flat)
+            here = undriven_blocks + block
+            its_y = complex(y[point, 0, here, 0, place], y[point, 0, here, 1, place])
+            its_u = complex(u[point, 0, here, 0, place], u[point, 0, here, 1, place])
+            of_a, g, decay = basis_a[k, a], 0j, 0j
+            for i in range(a):
+                of_a += at[i] * basis_a[k, i]
+            for i in range(b):
+                g += at[a + i] * basis_b[k, i]
+            for i in range(basis_c.shape[1]):
+                decay += at[a + b + i] * basis_c[k, i]
+            of_a = 1 / of_a
+            g *= of_a
+            model = g * its_u + decay * of_a
+            error = its_y - model
+            common = complex(flat[ROW_COV, place], -flat[ROW_COV + 1, place])
+            by_g = flat[ROW_VU, place] * g.conjugate() - common
+            w = 1 / (flat[ROW_VY, place] + ((by_g - common) * g).real)
+            squared = error.real * error.real + error.imag * error.imag
+            # what a response more takes off half the cost
+            of_slope = error.conjugate() * its_u * w + by_g * (squared * w * w)
+            slope[0, k], slope[1, k] = of_slope.real, of_slope.imag
+            power[k] = w * (its_u.real * its_u.real + its_u.imag * its_u.imag)
+            scaled = of_a.conjugate() * its_u * w
+            by_a, by_b = -model.conjugate() * scaled, its_u.conjugate() * scaled
+            for i in range(n):
+                if i < a:
+                    value = by_a * basis_a[k, i].conjugate()
+                elif i < a + b:
+                    value = by_b * basis_b[k, i - a].conjugate()
+                else:
+                    value = scaled * basis_c[k, i - a - b].conjugate()
+                own[i, 0, k], own[i, 1, k] = value.real, value.imag
+            for r in range(2):
+                value = of_a * numerator[k, r]
+                pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
+        out[point, 0] = _fall(pair, own, slope, power, inverse[point], score, crossed)
+        for m in range(modes.shape[0]):
+            out[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], score, crossed)
+    return out

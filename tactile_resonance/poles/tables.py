@@ -232,7 +232,11 @@ def compiled() -> int:
     likelihood.undriven_powers(tables, data, theta, BLOCK, 3)
     likelihood.undriven_errors(tables, data, theta)
     likelihood.minimise(tables, data, theta, 2, 1e-2, 1e-14)
-    likelihood.invert(likelihood.moments(tables, data, theta)[2][:, 0, 1])
+    inverse, _ = likelihood.invert(likelihood.moments(tables, data, theta)[2][:, 0, 1])
+    modes = np.ones((1, 2, 2, bins - undriven))
+    two = np.ones((bins - undriven, 2), complex)
+    bases = (two, one[undriven:], one[undriven:])
+    likelihood.falls(data, 1, bases, theta[:, 0, :3], inverse[:, :3, :3], two, modes)
     missing = sum(sum(kernel.stats.cache_misses.values()) for kernel in likelihood.KERNELS)
     if missing:
         logging.getLogger(__name__).warning(

@@ -15,6 +15,7 @@ from benchmarks.poles_plant import (
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.lacking import lacking_terms
+from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
@@ -119,6 +120,9 @@ def test_a_complete_model_lacks_nothing(cell, structure):
     data = BinData.of(
         y[:, None], u[:, None], plan.other_bins.size, of_y, of_u, None, of_y, order=plan.order
     )
-    lacking = lacking_terms(plan, data, np.concatenate(theta, axis=1))
+    theta = np.concatenate(theta, axis=1)
+    cost, _, normal = moments(plan.problem.tables, data.arrays, theta[:, None])
+    inverse, _ = invert(normal[:, 0].sum(axis=1))
+    lacking = lacking_terms(plan, data, theta, inverse, cost.sum(axis=1))
     alarms = np.isfinite(lacking[:, 0]).sum()
     assert stats.binom.sf(alarms - 1, runs, 4e-4) > 0.0005
