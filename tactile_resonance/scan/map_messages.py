@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.recording.messages import POLES_STATUS
-from tactile_resonance.scan.mesh import grid_faces
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
@@ -219,7 +218,10 @@ def _deleted(marker: Message) -> Message:
 
 def _lay(marker: Message, positions_m: FloatArray, share: FloatArray, alpha: float = 1.0) -> None:
     """Triangles between positions (r, c, 3), in the colours of shares (r, c)."""
-    faces = grid_faces(*share.shape).ravel()
+    corner = np.arange(share.size).reshape(share.shape)
+    a, b = corner[:-1, :-1], corner[:-1, 1:]  # of each cell, round about it
+    c, d = corner[1:, 1:], corner[1:, :-1]
+    faces = np.stack([a, b, c, a, c, d], axis=-1).ravel()
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
     corners = _points(positions_m.reshape(-1, 3))
     rgba = [_colour(rgb, alpha) for rgb in colours(share.ravel())]
