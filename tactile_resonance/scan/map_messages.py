@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.recording.messages import POLES_STATUS
+from tactile_resonance.recording.messages import POLES_STATUS, write_header
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
@@ -164,20 +164,10 @@ def legend_lines(
     return lines
 
 
-def header_message(frame_id: str, time_ns: int) -> Message:
-    """Header of everything that shows one state of the map."""
-    return make_message("std_msgs/msg/Header", frame_id=frame_id, stamp=_stamp(time_ns))
-
-
 def restamp(message: Message, time_ns: int) -> None:
     """Set all stamps of a message."""
     for part in getattr(message, "markers", [message]):
-        part.header.stamp = _stamp(time_ns)
-
-
-def _stamp(time_ns: int) -> Message:
-    sec, nanosec = divmod(time_ns, 10**9)
-    return make_message("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        write_header(part.header, time_ns, part.header.frame_id)
 
 
 def _cloud(table: np.ndarray, header: Message) -> Message:
