@@ -20,13 +20,12 @@ from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_n
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.map_messages import (
     cloud_message,
-    header_message,
     legend_message,
     marker_message,
     restamp,
     surface_message,
 )
-from tactile_resonance.scan.messages import to_cdr
+from tactile_resonance.scan.messages import header_message, to_cdr
 from tactile_resonance.scan.point_outcome import with_poles
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, from_message
 from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap

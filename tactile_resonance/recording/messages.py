@@ -46,13 +46,25 @@ POLES_STATUS = {
 ORIGIN = ("measurement_id", "excitation_id", "final", "label", "simulated")
 SPREAD = ("rms_n", "min_n", "max_n")  # of a contact's force
 EXCITATION = (
-    *("measurement_id", "excitation_id", "realisation", "realisations", "periods", "seed"),
-    *("sample_rate_hz", "samples_per_period", "random_phases", "label"),
+    "measurement_id",
+    "excitation_id",
+    "realisation",
+    "realisations",
+    "periods",
+    "seed",
+    "sample_rate_hz",
+    "samples_per_period",
+    "random_phases",
+    "label",
 )
 EXCITATION_ARRAYS = ("harmonics", "amplitude_v", "phase_rad")
 RECORD = (
-    *("realisation", "block_index", "sample_rate_hz", "samples_per_period"),
-    *("channel_delay_s", "anti_alias_filter"),
+    "realisation",
+    "block_index",
+    "sample_rate_hz",
+    "samples_per_period",
+    "channel_delay_s",
+    "anti_alias_filter",
 )
 POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
 POLES_ARRAYS = ("f0_hz", "damping_ratio")
@@ -210,8 +222,12 @@ def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Co
         return Contact(force_n, force_std_n)
     point, turn = message.pose.position, message.pose.orientation
     return Contact(
-        *(force_n, force_std_n, (point.x, point.y, point.z), (turn.x, turn.y, turn.z, turn.w)),
-        *(message.header.frame_id, time_from_message(message.header.stamp)),
+        force_n,
+        force_std_n,
+        (point.x, point.y, point.z),
+        (turn.x, turn.y, turn.z, turn.w),
+        message.header.frame_id,
+        time_from_message(message.header.stamp),
     )
 
 

@@ -17,12 +17,11 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
 from tactile_resonance.scan.map_messages import (
     cloud_message,
-    header_message,
     legend_message,
     marker_message,
     surface_message,
 )
-from tactile_resonance.scan.messages import make_message, to_cdr
+from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages_of_type
 from tactile_resonance.scan.point_result import TYPE, from_message
 from tactile_resonance.scan.pole_map import PoleMap
@@ -113,11 +112,9 @@ def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
         _write(writer, "/tf_static", start_ns, make_message(_TF, transforms=[frame]), _LATCHED)
     for path in files_in_order(run):
         for time_ns, _, message in read_messages_of_type(path, _POSE):
-            place, turn = message.pose.position, message.pose.orientation
-            tip = _transform(
-                *(message.header.frame_id, _TIP_FRAME, time_ns, (place.x, place.y, place.z)),
-                (turn.x, turn.y, turn.z, turn.w),
-            )
+            at, turn = message.pose.position, message.pose.orientation
+            position, quaternion = (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)
+            tip = _transform(message.header.frame_id, _TIP_FRAME, time_ns, position, quaternion)
             _write(writer, "/tf", time_ns, make_message(_TF, transforms=[tip]), _STREAM)
     return frame_id
 

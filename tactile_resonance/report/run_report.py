@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import html
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import Any
 
@@ -51,7 +51,7 @@ _COLUMNS = (
         lambda r: _with_std(r.nominal_damping_ratio, r.nominal_damping_ratio_std, 5),
     ),
     ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
-    ("tissue", lambda r: tissue_of(r)),
+    ("tissue", tissue_of),
     ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
     ("outcome", lambda r: _outcome(r)),
 )
@@ -82,44 +82,32 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
     truths : mapping of int to PointTruth
         What the simulated bench knew, by point; empty for hardware.
     """
-    name = _scene_name(run)
+    name, scene = _scene_name(run), _scene_of(run)
+    simulated = any(result.simulated for result in run.latest)
+    health, sentence = sensor_health(run, scene.drift_limits if scene else DriftLimits())
+    measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
+    notes = run.facts.get("notes") or {"notes": "none"}
+    facts = {key: value for key, value in run.facts.items() if key not in _SHOWN}
+    sections = {
+        "Sensor in free air": _paragraphs([sentence], mark=health is not SensorHealth.STEADY),
+        "Silent record": _bullets(silent_lines(run)),
+        "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),
+        "Surface, found by touch": _touches(run.facts.get("surface")),
+        "Points": _point_table(run.latest) + _paragraphs(table_notes(run.latest, truths)),
+        f"Against free air{' and the truth of the simulation' if truths else ''}": _air_table(
+            measured, truths
+        ),
+        "Left out": _bullets(skipped_lines(run)),
+        "Damaged files": _bullets(run.problems),
+        "Scene": f"<pre>{html.escape(run.scene)}</pre>",
+        "Made with": f"<pre>{html.escape(yaml.safe_dump(facts, sort_keys=False))}</pre>",
+    }
     parts = [f"<h1>{html.escape(name)}</h1>"]
-    if any(result.simulated for result in run.latest):
-        parts.append(f'<p class="mark">{SIMULATED}</p>')
-    parts += [f"<p>{html.escape(line)}</p>" for line in summary(run)]
+    parts += [_paragraphs([SIMULATED], mark=True) if simulated else "", _paragraphs(summary(run))]
     if picture is not None:
         data = base64.b64encode(picture).decode()
         parts.append(f'<img alt="pole map" src="data:image/png;base64,{data}">')
-    scene = _scene_of(run)
-    health, sentence = sensor_health(run, scene.drift_limits if scene else DriftLimits())
-    css = "" if health is SensorHealth.STEADY else ' class="mark"'
-    parts += ["<h2>Sensor in free air</h2>", f"<p{css}>{html.escape(sentence)}</p>"]
-    if silent := silent_lines(run):
-        parts += ["<h2>Silent record</h2><ul>"]
-        parts += [f"<li>{html.escape(line)}</li>" for line in silent] + ["</ul>"]
-    notes = run.facts.get("notes") or {"notes": "none"}
-    parts += ["<h2>Notes of the session</h2><ul>"]
-    parts += [f"<li>{html.escape(f'{name}: {value}')}</li>" for name, value in notes.items()]
-    parts += ["</ul>"]
-    if "surface" in run.facts:
-        parts += ["<h2>Surface, found by touch</h2>", _touches(run.facts["surface"])]
-    parts += ["<h2>Points</h2>", _table(run.latest)]
-    parts += [f"<p>{html.escape(line)}</p>" for line in table_notes(run.latest, truths)]
-    measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
-    parts += [f"<h2>Against free air{' and the truth of the simulation' if truths else ''}</h2>"]
-    parts += [_air_table(measured, truths)]
-    skipped = run.facts.get("skipped", [])
-    if skipped:
-        parts += ["<h2>Left out</h2><ul>"]
-        parts += [f"<li>{html.escape(line)}</li>" for line in skipped_lines(run)]
-        parts += ["</ul>"]
-    if run.problems:
-        parts += ["<h2>Damaged files</h2><ul>"]
-        parts += [f"<li>{html.escape(problem)}</li>" for problem in run.problems]
-        parts += ["</ul>"]
-    parts += ["<h2>Scene</h2>", f"<pre>{html.escape(run.scene)}</pre>"]
-    facts = yaml.safe_dump({k: v for k, v in run.facts.items() if k not in _SHOWN}, sort_keys=False)
-    parts += ["<h2>Made with</h2>", f"<pre>{html.escape(facts)}</pre>"]
+    parts += [f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text]
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
         f"<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
@@ -213,28 +201,42 @@ def skipped_lines(run: RunContent) -> list[str]:
     return lines
 
 
-def _cell(kind: str, name: str, text: str) -> str:
-    css = ' class="text"' if name in _TEXT else ""
-    return f"<{kind}{css}>{html.escape(text)}</{kind}>"
+def _paragraphs(lines: Iterable[str], mark: bool = False) -> str:
+    css = ' class="mark"' if mark else ""
+    return "".join(f"<p{css}>{html.escape(line)}</p>" for line in lines)
 
 
-def _table(results: Sequence[PointResult]) -> str:
-    rows = ["<tr>" + "".join(_cell("th", name, name) for name, _ in _COLUMNS) + "</tr>"]
+def _bullets(lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    return items and f"<ul>{items}</ul>"
+
+
+def _row(kind: str, names: Sequence[str], texts: Sequence[str], css: str = "") -> str:
+    cells = ""
+    for name, text in zip(names, texts, strict=True):
+        side = ' class="text"' if name in _TEXT else ""
+        cells += f"<{kind}{side}>{html.escape(text)}</{kind}>"
+    return f"<tr{css}>{cells}</tr>"
+
+
+def _table(names: Sequence[str], rows: Iterable[str]) -> str:
+    return f'<div class="wide"><table>{_row("th", names, names)}{"".join(rows)}</table></div>'
+
+
+def _point_table(results: Sequence[PointResult]) -> str:
+    names, rows = [name for name, _ in _COLUMNS], []
     for result in results:
         css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
-        rows.append(
-            f"<tr{css}>" + "".join(_cell("td", n, show(result)) for n, show in _COLUMNS) + "</tr>"
-        )
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+        rows.append(_row("td", names, [show(result) for _, show in _COLUMNS], css))
+    return _table(names, rows)
 
 
 def _air_table(results: Sequence[PointResult], truths: Truths) -> str:
-    names = [name for name, _ in _AIR_COLUMNS] + list(_TRUTH_COLUMNS if truths else ())
-    rows = ["<tr>" + "".join(_cell("th", name, name) for name in names) + "</tr>"]
+    names, rows = [name for name, _ in _AIR_COLUMNS] + list(_TRUTH_COLUMNS if truths else ()), []
     for result in results:
         texts = [show(result) for _, show in _AIR_COLUMNS] + _against_truth(result, truths)
-        rows.append("<tr>" + "".join(_cell("td", "", text) for text in texts) + "</tr>")
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+        rows.append(_row("td", names, texts))
+    return _table(names, rows)
 
 
 def _against_truth(result: PointResult, truths: Truths) -> list[str]:
@@ -252,21 +254,22 @@ def _against_truth(result: PointResult, truths: Truths) -> list[str]:
     ]
 
 
-def _touches(surface: Mapping[str, Any]) -> str:
-    """What the surface rests on."""
-    names = ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]")
-    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in names) + "</tr>"]
+def _touches(surface: Mapping[str, Any] | None) -> str:
+    """What the surface rests on; nothing where it was not found by touch."""
+    if surface is None:
+        return ""
+    names, rows = ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]"), []
     for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
         x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
         z += f" ± {1e3 * touch['std_m']:.2g}"
-        cells = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+        texts = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
+        rows.append(_row("td", names, texts))
     told = {
         True: "The touches lie on it as well as their noise allows.",
         False: "The touches lie off it by more than their noise explains.",
         None: "There was no touch to spare to check it.",
     }[surface["consistent"]]
-    return f"<p>A {surface['form']}. {told}</p><table>{''.join(rows)}</table>"
+    return _paragraphs([f"A {surface['form']}. {told}"]) + _table(names, rows)
 
 
 def _scene_of(run: RunContent) -> ScanScene | None:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
 
 from tactile_resonance.fields import require
 
@@ -34,20 +35,21 @@ class KrigedSurface:
     xy_m : (n, 2) float
         Points measured.
     values : (n,) float
-    noise_std : (n,) float
     length_m : float
         Distance over which the quantity changes.
     process_std : float
-        How much it varies; 0 where nothing but noise is seen.
+        How much it varies.
     mean : float
+    factor : tuple
+        Of the covariance of the values, of `scipy.linalg.cho_factor`.
     """
 
     xy_m: FloatArray
     values: FloatArray
-    noise_std: FloatArray
     length_m: float
     process_std: float
     mean: float
+    factor: tuple[FloatArray, bool]
 
     def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) value and its standard deviation at (..., 2) positions.
@@ -56,22 +58,15 @@ class KrigedSurface:
         includes that of the mean, but not that of length and size.
         """
         at = np.asarray(xy_m, float)
-        points = at.reshape(-1, 2)
-        factor, ones = self._factor(), np.ones(len(self.values))
-        cross = self.process_std**2 * _matern(_distances(points, self.xy_m) / self.length_m)
-        weights = cho_solve(factor, cross.T)  # (n, q)
-        value = self.mean + weights.T @ (self.values - self.mean)
+        distances = cdist(self.xy_m, at.reshape(-1, 2))  # (n, q)
+        cross = self.process_std**2 * _matern(distances / self.length_m)
+        weights = cho_solve(self.factor, cross)
+        value = self.mean + (self.values - self.mean) @ weights
         # what the mean's own uncertainty adds
-        known = ones @ cho_solve(factor, ones)
-        rest = 1 - weights.T @ ones
-        explained = np.sum(cross.T * weights, axis=0)
-        variance = self.process_std**2 - explained + rest**2 / known
+        of_mean = (1 - np.sum(weights, axis=0)) ** 2 / _mean(self.factor, self.values)[1]
+        variance = self.process_std**2 - np.sum(cross * weights, axis=0) + of_mean
         std = np.sqrt(np.maximum(variance, 0))
         return value.reshape(at.shape[:-1]), std.reshape(at.shape[:-1])
-
-    def _factor(self) -> tuple[FloatArray, bool]:
-        distances = _distances(self.xy_m, self.xy_m)
-        return _factor(distances, self.noise_std, self.length_m, self.process_std)
 
 
 def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) -> KrigedSurface:
@@ -97,18 +92,15 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
     require(same, "values, noise_std", (y.shape, noise.shape), f"shape ({len(xy)},)")
     good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)) and np.all(noise >= 0))
     require(good and bool(np.all(np.isfinite(noise))), "values", "NaN", "finite numbers")
-    distances = _distances(xy, xy)
+    distances = cdist(xy, xy)
     apart = distances + np.diag(np.full(len(xy), np.inf))
     extent = float(distances.max())
     require(extent > 0, "xy_m", "one place", "places apart from each other")
     twice = (apart < 1e-9 * extent) & (noise[:, None] == 0) & (noise == 0)
     require(not twice.any(), "xy_m", "one place twice, without noise", "one exact value a place")
-    scale = float(np.std(y))
-    if scale == 0:
-        return KrigedSurface(xy, y, noise, extent, 0.0, float(y[0]))
+    scale = float(np.std(y)) or 1e-9 * (abs(float(y[0])) or 1.0)
     # starts over the lengths that the points resolve: a likelihood may have several maxima
     picked = np.unique(np.linspace(0, len(y) - 1, min(len(y), FIT_POINTS)).astype(int))
-    picked_distances = distances[np.ix_(picked, picked)]
     nearest = float(np.median(apart.min(axis=1)))
     lowest, highest = np.log(0.3 * nearest), np.log(10 * extent)
     best = min(
@@ -116,7 +108,7 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
             minimize(
                 _cost,
                 np.array([start, np.log(scale)]),
-                args=(picked_distances, y[picked], noise[picked]),
+                args=(distances[np.ix_(picked, picked)], y[picked], noise[picked]),
                 method="L-BFGS-B",
                 bounds=[(lowest, highest), (np.log(1e-4 * scale), np.log(100 * scale))],
             )
@@ -124,22 +116,24 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
         ),
         key=lambda found: found.fun,
     )
-    length, size = np.exp(best.x)
+    length, size = np.exp(best.x).tolist()
     factor = _factor(distances, noise, length, size)
-    ones = np.ones(len(y))
-    mean = float(ones @ cho_solve(factor, y) / (ones @ cho_solve(factor, ones)))
-    return KrigedSurface(xy, y, noise, float(length), float(size), mean)
+    return KrigedSurface(xy, y, length, size, _mean(factor, y)[0], factor)
 
 
 def _cost(x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray) -> float:
     """Minus the logarithm of the restricted likelihood, but for a constant."""
-    length, size = np.exp(x)
-    factor = _factor(distances, noise, length, size)
-    ones = np.ones(len(y))
-    known = ones @ cho_solve(factor, ones)
-    residual = y - ones @ cho_solve(factor, y) / known
+    factor = _factor(distances, noise, *np.exp(x).tolist())
+    mean, known = _mean(factor, y)
     log_volume = 2 * np.sum(np.log(np.diag(factor[0]))) + np.log(known)
-    return float(0.5 * (residual @ cho_solve(factor, residual) + log_volume))
+    return float(0.5 * ((y - mean) @ cho_solve(factor, y - mean) + log_volume))
+
+
+def _mean(factor: tuple[FloatArray, bool], y: FloatArray) -> tuple[float, float]:
+    """Mean by generalised least squares, and the inverse of its variance."""
+    weights = cho_solve(factor, np.ones(len(y)))
+    known = float(np.sum(weights))
+    return float(weights @ y) / known, known
 
 
 def _factor(
@@ -153,7 +147,3 @@ def _matern(ratio: FloatArray) -> FloatArray:
     """Correlation at distances over length."""
     scaled = np.sqrt(5) * ratio
     return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
-
-
-def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(a[:, None] - b[None, :], axis=-1))

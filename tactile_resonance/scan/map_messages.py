@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.recording.messages import POLES_STATUS
-from tactile_resonance.scan.mesh import grid_faces
+from tactile_resonance.recording.messages import POLES_STATUS, write_header
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
@@ -165,20 +164,10 @@ def legend_lines(
     return lines
 
 
-def header_message(frame_id: str, time_ns: int) -> Message:
-    """Header of everything that shows one state of the map."""
-    return make_message("std_msgs/msg/Header", frame_id=frame_id, stamp=_stamp(time_ns))
-
-
 def restamp(message: Message, time_ns: int) -> None:
     """Set all stamps of a message."""
     for part in getattr(message, "markers", [message]):
-        part.header.stamp = _stamp(time_ns)
-
-
-def _stamp(time_ns: int) -> Message:
-    sec, nanosec = divmod(time_ns, 10**9)
-    return make_message("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        write_header(part.header, time_ns, part.header.frame_id)
 
 
 def _cloud(table: np.ndarray, header: Message) -> Message:
@@ -219,7 +208,10 @@ def _deleted(marker: Message) -> Message:
 
 def _lay(marker: Message, positions_m: FloatArray, share: FloatArray, alpha: float = 1.0) -> None:
     """Triangles between positions (r, c, 3), in the colours of shares (r, c)."""
-    faces = grid_faces(*share.shape).ravel()
+    corner = np.arange(share.size).reshape(share.shape)
+    a, b = corner[:-1, :-1], corner[:-1, 1:]  # of each cell, round about it
+    c, d = corner[1:, 1:], corner[1:, :-1]
+    faces = np.stack([a, b, c, a, c, d], axis=-1).ravel()
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
     corners = _points(positions_m.reshape(-1, 3))
     rgba = [_colour(rgb, alpha) for rgb in colours(share.ravel())]

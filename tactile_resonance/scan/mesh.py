@@ -23,7 +23,8 @@ class TriangleMesh:
 
     Normals are those of the corners, interpolated over each triangle, so that a finely meshed organ is
     smooth; the normal of a corner is the mean of its faces' weighted by their angles there (Thuermer and
-    Wuethrich, J. Graphics Tools 3 (1998) 43). A sharp edge is rounded over the triangles beside it.
+    Wuethrich, J. Graphics Tools 3 (1998) 43; trimesh computes it). A sharp edge is rounded over the triangles
+    beside it.
 
     Attributes
     ----------
@@ -48,6 +49,8 @@ class TriangleMesh:
         ValueError
             If there is no triangle of finite size, or neighbours are wound in opposite senses.
         """
+        import trimesh  # of the extra `mesh`
+
         triangles = np.asarray(triangles_m, float)
         good = triangles.ndim == 3 and triangles.shape[1:] == (3, 3) and triangles.shape[0] > 0
         require(good, "triangles", triangles.shape, "shape (t, 3, 3) with t above 0")
@@ -55,19 +58,17 @@ class TriangleMesh:
         flat = triangles.reshape(-1, 3)
         size = float(np.max(np.ptp(flat, axis=0)))
         require(size > 0, "triangles", size, "a mesh larger than a point")
-        rounded = np.round((flat - flat.min(axis=0)) / (1e-6 * size)).astype(np.int64)
-        _, first, inverse = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-        faces = inverse.reshape(-1, 3)
-        distinct = (
-            (faces[:, 0] != faces[:, 1])
-            & (faces[:, 1] != faces[:, 2])
-            & (faces[:, 2] != faces[:, 0])
+        low = flat.min(axis=0)
+        mesh = trimesh.Trimesh(
+            (flat - low) / size, np.arange(len(flat)).reshape(-1, 3), process=False
         )
-        faces = faces[distinct]
+        mesh.merge_vertices(digits_vertex=6)
+        faces = mesh.faces[np.all(mesh.faces != np.roll(mesh.faces, 1, axis=1), axis=1)]
         require(len(faces) > 0, "triangles", 0, "one triangle of finite size or more")
-        _check_winding(faces)
-        corners = flat[first]
-        return cls(corners, faces, _corner_normals(corners, faces))
+        mesh.faces = faces
+        accepted = "one winding for all"
+        require(mesh.is_winding_consistent, "triangles", "edges run twice in one sense", accepted)
+        return cls(low + size * mesh.vertices, np.asarray(faces), np.asarray(mesh.vertex_normals))
 
     def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) height of the topmost face [m], NaN beside the mesh."""
@@ -130,37 +131,6 @@ def read_stl(path: Path) -> FloatArray:
     corners = np.asarray(mesh.triangles, float)
     require(len(corners) > 0, "file", str(path), "STL, binary or text, with a triangle or more")
     return corners
-
-
-def grid_faces(rows: int, columns: int) -> IntArray:
-    """(t, 3) indices of the triangles between the corners of a grid, which are counted row by row."""
-    corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b = corner[:-1, :-1], corner[:-1, 1:]  # of each cell, round about it
-    c, d = corner[1:, 1:], corner[1:, :-1]
-    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-
-
-def _check_winding(faces: IntArray) -> None:
-    """Neighbours run along their common edge in opposite directions."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    twice = int(np.sum(counts > 1))
-    require(twice == 0, "triangles", f"{twice} edges run twice in one sense", "one winding for all")
-
-
-def _corner_normals(corners: FloatArray, faces: IntArray) -> FloatArray:
-    triangles = corners[faces]
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    total = np.zeros_like(corners)
-    for k in range(3):
-        a = triangles[:, (k + 1) % 3] - triangles[:, k]
-        b = triangles[:, (k + 2) % 3] - triangles[:, k]
-        angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
-        np.add.at(total, faces[:, k], angle[:, None] * normals)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.divide(total, length, out=np.full_like(total, np.nan), where=length > 0)
 
 
 def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from tactile_resonance.configuration import PACKAGE_NAME, share_path
+from tactile_resonance.recording.messages import write_header
 
 
 class OtherVersionError(ValueError):
@@ -55,6 +56,13 @@ def make_message(type_name: str, **content: Any) -> Any:
             node, element = detail[0]
             content[field] = [] if node is Nodetype.NAME else np.zeros(0, element[0])
     return store.types[type_name](**content)
+
+
+def header_message(frame_id: str, time_ns: int) -> Any:
+    """Header of a frame and a UNIX time [ns]."""
+    header = make_message("std_msgs/msg/Header")
+    write_header(header, time_ns, frame_id)
+    return header
 
 
 _ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}

@@ -26,37 +26,47 @@ def air_point(index: int) -> ScanPoint:
     return ScanPoint(index, nowhere, nowhere, (0.0, 0.0, 0.0, 1.0), "air")
 
 
+def attempt_at(point: ScanPoint, attempt: int, frame_id: str) -> PointResult:
+    """Result of an attempt at a point, in a frame, of which nothing more is known yet."""
+    x_m, y_m, z_m = point.position_m
+    normal_x, normal_y, normal_z = point.normal
+    return PointResult(
+        index=point.index,
+        attempt=attempt,
+        label=point.label,
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
+        normal_x=normal_x,
+        normal_y=normal_y,
+        normal_z=normal_z,
+        frame_id=frame_id,
+    )
+
+
 def measured_result(
-    point: ScanPoint,
-    attempt: int,
+    attempt: PointResult,
     scene: ScanScene,
     measured: Measured,
     decision: Decision,
-    *,
-    time_ns: int,
-    duration_s: float,
     air: AirReference | None = None,
 ) -> PointResult:
-    """Result of a point that was measured; `FAILED` where there is no pole.
+    """Result of an attempt that was measured; `FAILED` where there is no pole.
 
     Parameters
     ----------
+    attempt : PointResult
+    scene : ScanScene
+        With the tissue classes.
+    measured : Measured
     decision : Decision
         That ended the measurement.
     air : AirReference or None
         What the poles are compared with.
-    time_ns : int
-        When the point was finished (UNIX time) [ns].
-    duration_s : float
-        From the move to the point until the tip was free again [s].
     """
     poles = measured.poles
-    outcome = PointOutcome.DONE if poles.main.found else PointOutcome.FAILED
-    result = unmeasured_result(
-        point, attempt, scene, outcome, poles.message, time_ns=time_ns, duration_s=duration_s
-    )
     result = with_poles(
-        result,
+        attempt,
         poles,
         measured.origin,
         scene.tissue_classes,
@@ -68,6 +78,8 @@ def measured_result(
         result = replace(result, **asdict(relative))
     return replace(
         result,
+        outcome=PointOutcome.DONE if poles.main.found else PointOutcome.FAILED,
+        reason=poles.message,
         blocks=decision.blocks,
         blocks_saved=decision.blocks_saved,
         verdict=decision.verdict.value,
@@ -148,35 +160,4 @@ def with_poles(
         tissue_class=call.name,
         tissue_probability=call.probability,
         tissue_reason="; ".join(filter(None, [call.reason if known else "", at.note])),
-    )
-
-
-def unmeasured_result(
-    point: ScanPoint,
-    attempt: int,
-    scene: ScanScene,
-    outcome: PointOutcome,
-    reason: str,
-    *,
-    time_ns: int,
-    duration_s: float,
-) -> PointResult:
-    """Result of an attempt without poles that count: it failed, was skipped or is discarded."""
-    x_m, y_m, z_m = point.position_m
-    normal_x, normal_y, normal_z = point.normal
-    return PointResult(
-        index=point.index,
-        attempt=attempt,
-        label=point.label,
-        outcome=outcome,
-        reason=reason,
-        x_m=x_m,
-        y_m=y_m,
-        z_m=z_m,
-        normal_x=normal_x,
-        normal_y=normal_y,
-        normal_z=normal_z,
-        duration_s=duration_s,
-        time_ns=time_ns,
-        frame_id=scene.frame_id,
     )

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.scan.messages import message_types, to_cdr
+from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 
 TOPIC = "point_result"
 TYPE = "tactile_resonance/msg/PointResult"
@@ -151,14 +152,10 @@ def to_message(result: PointResult, poles: Any = None) -> Any:
     poles : message or None
         The last one of the attempt, as rosbags knows it; None where none came.
     """
-    types = message_types().types
-    time = types["builtin_interfaces/msg/Time"](
-        sec=result.time_ns // 10**9, nanosec=result.time_ns % 10**9
-    )
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id=result.frame_id)
     content = {name: getattr(result, name) for name in COLUMNS if name not in _HEADER}
     content["kind"] = result.kind.value
-    return types[TYPE](header=header, poles=[] if poles is None else [poles], **content)
+    header = header_message(result.frame_id, result.time_ns)
+    return make_message(TYPE, header=header, poles=[] if poles is None else [poles], **content)
 
 
 def serialised(result: PointResult, poles: Any = None) -> bytes:
@@ -169,16 +166,10 @@ def serialised(result: PointResult, poles: Any = None) -> bytes:
 def from_message(message: Any) -> PointResult:
     """Result of a message, of rosbags or of ROS."""
     content = {name: getattr(message, name) for name in COLUMNS if name not in _HEADER}
-    stamp = message.header.stamp
-    return PointResult(
-        **{
-            **content,
-            "outcome": PointOutcome(message.outcome),
-            "kind": PointKind(message.kind or PointKind.TISSUE),
-        },
-        time_ns=stamp.sec * 10**9 + stamp.nanosec,
-        frame_id=message.header.frame_id,
-    )
+    content["outcome"] = PointOutcome(message.outcome)
+    content["kind"] = PointKind(message.kind or PointKind.TISSUE)
+    time_ns = time_from_message(message.header.stamp)
+    return PointResult(**content, time_ns=time_ns, frame_id=message.header.frame_id)
 
 
 def as_csv(results: Iterable[PointResult]) -> str:

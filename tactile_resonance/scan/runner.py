@@ -27,7 +27,7 @@ from tactile_resonance.scan.hands import (
     ScanEnded,
 )
 from tactile_resonance.scan.plan import Plan
-from tactile_resonance.scan.point_outcome import air_point, measured_result, unmeasured_result
+from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
 from tactile_resonance.scan.references import (
@@ -125,7 +125,7 @@ class ScanRunner:
             return self._run.content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
-                result = self._unmeasured(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
+                result = self._ended(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
                 self._publish(recording.finish(result))
             return self._next()
         return point
@@ -204,19 +204,10 @@ class ScanRunner:
             self._say(point, Phase.RETRACT)
             moved_n = self._hands.retract()
             duration_s = self._hands.now_s() - begun_s
-            if measured is None:
-                result = self._unmeasured(point, recording, outcome, reason, duration_s)
-            else:
-                result = measured_result(
-                    point,
-                    recording.attempt,
-                    scene,
-                    measured.with_zero_moved(moved_n),
-                    decisions[-1],
-                    time_ns=time.time_ns(),
-                    duration_s=duration_s,
-                    air=self._air,
-                )
+            result = self._ended(point, recording, outcome, reason, duration_s)
+            if measured is not None:
+                measured = measured.with_zero_moved(moved_n)
+                result = measured_result(result, scene, measured, decisions[-1], self._air)
             if moved_n:
                 text = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
                 result = replace(result, reason=f"{result.reason}; {text}" if result.reason else text)
@@ -296,34 +287,26 @@ class ScanRunner:
                     if isinstance(error, PointDisturbed) and disturbed.again(error):
                         self._discard(point, recording, str(error))
                         continue
-                    failed = self._unmeasured(point, recording, PointOutcome.FAILED, str(error))
+                    failed = self._ended(point, recording, PointOutcome.FAILED, str(error))
                     self._publish(recording.message_of(failed))
                     return
                 except (Interrupted, ScanEnded) as error:
                     self._discard(point, recording, str(error) or LEFT)
                     raise
                 duration_s = self._hands.now_s() - begun_s
-                if silent:
-                    result = self._unmeasured(
-                        point, recording, PointOutcome.SKIPPED, NOTHING_PLAYED, duration_s
-                    )
-                    result = replace(result, simulated=measured.origin.simulated)
-                else:
-                    result = measured_result(
-                        point,
-                        recording.attempt,
-                        replace(self._scene, tissue_classes=(), nominal_contact=None),
-                        measured,
-                        Decision(Verdict.MOST_BLOCKS, "", told),
-                        time_ns=time.time_ns(),
-                        duration_s=duration_s,
-                    )
+                result = self._ended(
+                    point, recording, PointOutcome.SKIPPED, NOTHING_PLAYED, duration_s
+                )
+                result = replace(result, simulated=measured.origin.simulated)
+                if not silent:
+                    in_air = replace(self._scene, tissue_classes=(), nominal_contact=None)
+                    decision = Decision(Verdict.MOST_BLOCKS, "", told)
+                    result = measured_result(result, in_air, measured, decision)
                 result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
-                result = replace(result, kind=PointKind.AIR)
                 self._publish(recording.finish(result))
                 return
 
-    def _unmeasured(
+    def _ended(
         self,
         point: ScanPoint,
         recording: PointRecording,
@@ -331,22 +314,21 @@ class ScanRunner:
         reason: str,
         duration_s: float = NAN,
     ) -> PointResult:
-        """Result of an attempt without poles that count."""
-        result = unmeasured_result(
-            point,
-            recording.attempt,
-            self._scene,
-            outcome,
-            reason,
-            time_ns=time.time_ns(),
-            duration_s=duration_s,
-        )
+        """Result of an attempt that has ended, without poles."""
         kind = PointKind.AIR if point.index >= len(self._plan.points) else PointKind.TISSUE
-        return replace(result, kind=kind, measurement_id=recording.measurement_id)
+        return replace(
+            attempt_at(point, recording.attempt, self._scene.frame_id),
+            outcome=outcome,
+            reason=reason,
+            duration_s=duration_s,
+            measurement_id=recording.measurement_id,
+            kind=kind,
+            time_ns=time.time_ns(),
+        )
 
     def _discard(self, point: ScanPoint, recording: PointRecording, reason: str) -> None:
         """Tell that nothing is kept of an attempt."""
-        result = self._unmeasured(point, recording, PointOutcome.DISCARDED, reason)
+        result = self._ended(point, recording, PointOutcome.DISCARDED, reason)
         self._publish(recording.message_of(result))
 
     def _say(

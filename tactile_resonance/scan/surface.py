@@ -52,31 +52,35 @@ class Surface(Protocol):
         ...
 
 
+class ExactSurface:
+    """A surface that is given, not estimated."""
+
+    def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
+        """(...) zeros."""
+        return np.zeros(np.shape(xy_m)[:-1])
+
+
 @dataclass(frozen=True)
-class Plane:
+class Plane(ExactSurface):
     """A plane through a point [m]; its normal points upwards and need not be of length 1."""
 
-    point_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    normal_vector: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    point_m: Vector = (0.0, 0.0, 0.0)
+    normal_: Vector = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        good = bool(np.all(np.isfinite(self.normal_vector))) and self.normal_vector[2] > 0
-        require(good, "normal", self.normal_vector, "a vector with z above 0")
+        good = bool(np.all(np.isfinite(self.normal_))) and self.normal_[2] > 0
+        require(good, "normal", self.normal_, "a vector with z above 0")
 
     def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) height [m]."""
-        xy, n = np.asarray(xy_m, float), self.normal_vector
+        xy, n = np.asarray(xy_m, float), self.normal_
         offset = xy - self.point_m[:2]
         return np.asarray(self.point_m[2] - offset @ np.asarray(n[:2]) / n[2])
 
     def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(..., 3) unit normal."""
-        unit = np.asarray(self.normal_vector) / np.linalg.norm(self.normal_vector)
+        unit = np.asarray(self.normal_) / np.linalg.norm(self.normal_)
         return np.broadcast_to(unit, (*np.shape(xy_m)[:-1], 3)).copy()
-
-    def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) zeros."""
-        return np.zeros(np.shape(xy_m)[:-1])
 
     def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) everywhere."""
@@ -84,7 +88,7 @@ class Plane:
 
 
 @dataclass(frozen=True, eq=False)
-class HeightField:
+class HeightField(ExactSurface):
     """Heights on a rectangular grid, joined by a bicubic spline (of lower order on small grids).
 
     Attributes
@@ -111,34 +115,25 @@ class HeightField:
 
     def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) height [m], NaN outside of the grid."""
-        return self._evaluate(np.asarray(xy_m, float))
+        return self._evaluate(xy_m)
 
     def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(..., 3) unit normal, NaN outside of the grid."""
-        xy = np.asarray(xy_m, float)
-        slope_x, slope_y = self._evaluate(xy, dx=1), self._evaluate(xy, dy=1)
-        return unit_normal(slope_x, slope_y)
-
-    def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) zeros."""
-        return np.zeros(np.shape(xy_m)[:-1])
+        return unit_normal(self._evaluate(xy_m, dx=1), self._evaluate(xy_m, dy=1))
 
     def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) inside of the grid."""
-        return self._inside(np.asarray(xy_m, float))
+        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
+        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
 
     @cached_property
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
         return RectBivariateSpline(self.x_m, self.y_m, self.z_m, kx=orders[0], ky=orders[1])
 
-    def _inside(self, xy: FloatArray) -> BoolArray:
-        x, y = xy[..., 0], xy[..., 1]
-        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
-
-    def _evaluate(self, xy: FloatArray, dx: int = 0, dy: int = 0) -> FloatArray:
-        x, y = xy[..., 0], xy[..., 1]
-        inside = self._inside(xy)
+    def _evaluate(self, xy_m: npt.ArrayLike, dx: int = 0, dy: int = 0) -> FloatArray:
+        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
+        inside = self.known(xy_m)
         value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
         return np.where(inside, value, np.nan)
 
@@ -234,18 +229,8 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
         If it is none of the known forms, or a field or file of it is wrong.
     """
     form, entry = one_of(_FORMS, fields, where)
-    if form == "touch":
-        return entry
-    return build(entry.surface, f"{where}.{form}", folder)
-
-
-@dataclass(frozen=True)
-class _PlaneForm:
-    point_m: Vector = (0.0, 0.0, 0.0)
-    normal: Vector = (0.0, 0.0, 1.0)
-
-    def surface(self, _: Path) -> Surface:
-        return Plane(self.point_m, self.normal)
+    filed = isinstance(entry, (_Mesh, _HeightFile))
+    return build(entry.surface, f"{where}.{form}", folder) if filed else entry
 
 
 @dataclass(frozen=True)
@@ -273,23 +258,13 @@ class _HeightFile:
         return HeightField(*axes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Heights:
-    x_m: FloatArray
-    y_m: FloatArray
-    z_m: FloatArray
-
-    def surface(self, _: Path) -> Surface:
-        return HeightField(self.x_m, self.y_m, self.z_m)
-
-
-def _read_heights(value: object, where: str) -> _HeightFile | _Heights:
+def _read_heights(value: object, where: str) -> _HeightFile | HeightField:
     filed = isinstance(value, Mapping) and "file" in value
-    return read(_HeightFile if filed else _Heights, value, where)
+    return read(_HeightFile if filed else HeightField, value, where)
 
 
 _FORMS = {
-    "plane": _PlaneForm,
+    "plane": Plane,
     "height_field": Annotated[Any, _read_heights],
     "mesh": _Mesh,
     "touch": TouchRequest,
@@ -300,5 +275,3 @@ def check_search(search_m: float, field: str) -> None:
     """``ValueError`` where a search is not from 0 to `MOST_SEARCH_M`."""
     accepted = f"a number from 0 to {MOST_SEARCH_M:g} [m]"
     require(0 <= search_m <= MOST_SEARCH_M, field, search_m, accepted)
-
-

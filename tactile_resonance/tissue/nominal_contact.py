@@ -108,17 +108,14 @@ class NominalContact:
 
 @dataclass(frozen=True, eq=False)
 class PoleForTissue:
-    """A measured pole, and beside it what is compared with tissue classes.
+    """What of a measured pole is compared with tissue classes.
 
     Attributes
     ----------
-    measured : (2,) float
-        f0 [Hz] and damping ratio.
-    measured_covariance : (2, 2) float
-        Of the measured pole: noise, distortion and model error.
     compared : (2,) float
-        What classes are compared with: the pole at the nominal force and age where `referred`, else the
-        measured one; NaN where the force or the age is unknown and nothing states how far it may be off.
+        f0 [Hz] and damping ratio with which classes are compared: the pole at the nominal force and age
+        where `referred`, else the measured one; NaN where the force or the age is unknown and nothing states
+        how far it may be off.
     covariance : (2, 2) float
         Of `compared`, for statements on tissue.
     referred : bool
@@ -127,8 +124,6 @@ class PoleForTissue:
         What was taken for granted, or is missing; empty where force and age were measured.
     """
 
-    measured: FloatArray
-    measured_covariance: FloatArray
     compared: FloatArray
     covariance: FloatArray
     referred: bool
@@ -173,18 +168,17 @@ def refer_to_nominal(
     x, own = np.array(estimate, float), np.array(covariance, float)
     if nominal is None:
         note = "force and age of contact are not accounted for: no nominal_contact is given"
-        return PoleForTissue(x, own, x, own, False, note)
+        return PoleForTissue(x, own, False, note)
     equivalent = _equivalent_force(contact, nominal)
     if isinstance(equivalent, str):
-        unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
-        return PoleForTissue(x, own, *unknown, False, equivalent)
+        return PoleForTissue(np.full(2, np.nan), np.full((2, 2), np.nan), False, equivalent)
     off_n, variance, note = equivalent
     per_n, uncertain = nominal.sensitivity.per_n, nominal.sensitivity.covariance
     total = own + np.outer(per_n, per_n) * variance + uncertain * (off_n**2 + variance)
     fourth = off_n**4 + 6 * off_n**2 * variance + 3 * variance**2  # of a Gaussian
     bend_hz = _BEND * np.hypot(per_n[0], x[0] * per_n[1]) * math.sqrt(fourth) / nominal.force_n
     total = total + np.diag([bend_hz, bend_hz / x[0]]) ** 2
-    return PoleForTissue(x, own, x - per_n * off_n, total, True, note)
+    return PoleForTissue(x - per_n * off_n, total, True, note)
 
 
 def _equivalent_force(

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole scan of a scene on the simulated bench, in this process: the core as scan_node drives it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from tactile_resonance.multisine import design_multisine
@@ -9,7 +11,7 @@ from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.point_outcome import measured_result
+from tactile_resonance.scan.point_outcome import attempt_at, measured_result
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.run_start import run_facts
 from tactile_resonance.scan.scene import read_scan_scene
@@ -84,15 +86,12 @@ def measure(scene, phantoms, design, bench, point, attempt):
     origin = Origin(
         measurement_id=1000 + point.index, label=point.label, simulated=True, contact=contact
     )
-    return measured_result(
-        point,
-        attempt,
-        scene,
-        Measured(poles, origin, AGE_S),
-        decision,
+    result = replace(
+        attempt_at(point, attempt, scene.frame_id),
         time_ns=START_NS + point.index * 10**9,
         duration_s=2.5 + decision.blocks * design.block_s,
     )
+    return measured_result(result, scene, Measured(poles, origin, AGE_S), decision)
 
 
 def true_poles(path, position_m):

@@ -51,6 +51,14 @@ def test_among_nothing_but_noise_it_is_the_weighted_mean():
     assert std < 0.05
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_equal_values_are_that_value_everywhere(noise):
+    xy = np.random.default_rng(5).uniform(0, 0.02, (9, 2))
+    value, std = krige(xy, np.full(9, 250.0), np.full(9, noise)).predict([[0.01, 0.01], [0.1, 0]])
+    np.testing.assert_allclose(value, 250.0)
+    assert np.all(std < noise + 1e-6)
+
+
 @pytest.mark.parametrize("noise", [0.05, 0.7])
 def test_coverage_is_honest(noise):
     """Seeded Monte Carlo over processes: errors in stated standard deviations have mean square near 1.

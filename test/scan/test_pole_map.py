@@ -16,9 +16,10 @@ from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import POLES_STATUS
 from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.map_messages import POINT, cloud_message, header_message
+from tactile_resonance.scan.map_messages import POINT, cloud_message
+from tactile_resonance.scan.messages import header_message
 from tactile_resonance.scan.plan import tip_orientation
-from tactile_resonance.scan.point_outcome import air_point, measured_result, with_poles
+from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
 from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
@@ -58,15 +59,8 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     assert mode.estimate[0] == 280.0
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
-    result = measured_result(
-        air_point(3),
-        0,
-        scene(),
-        Measured(modes, origin()),
-        Decision(Verdict.MOST_BLOCKS, "", 8),
-        time_ns=1,
-        duration_s=1.0,
-    )
+    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, "", 8)
+    result = measured_result(attempt, scene(), Measured(modes, origin()), decision)
     assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
     assert result.f0_drift_std_hz_per_s == pytest.approx(0.2)
     assert result.damping_drift_std_per_s == pytest.approx(2e-5)
@@ -77,15 +71,8 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
 def test_how_the_force_moved_stands_in_the_result():
     there = origin()
     there = replace(there, contact=replace(there.contact, spread=ForceSpread(3e-4, 0.009, 0.011)))
-    result = measured_result(
-        air_point(3),
-        0,
-        scene(),
-        Measured(poles((250.0,)), there),
-        Decision(Verdict.MOST_BLOCKS, "", 8),
-        time_ns=1,
-        duration_s=1.0,
-    )
+    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, "", 8)
+    result = measured_result(attempt, scene(), Measured(poles((250.0,)), there), decision)
     assert (result.force_rms_n, result.force_min_n, result.force_max_n) == (3e-4, 0.009, 0.011)
     header, row = as_csv([result]).splitlines()
     at = header.split(",").index("force_rms_n")
