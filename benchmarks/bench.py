@@ -105,20 +105,22 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         system = scipy.signal.StateSpace(a, b[:, None], c[None], [[d]])
         return scipy.signal.lsim(system, u, np.arange(u.size) / 50e3)
 
-    def push(tip: Indenter | SprungIndenter) -> Callable:
+    def push(made: Callable[[], Indenter | SprungIndenter]) -> Callable:
         depth = 6e-4 * np.sin(np.linspace(0, 6 * np.pi, int(SIGNAL_S / STEP_S)))  # three contacts
 
         def steps() -> None:
-            tip.reset()
+            tip = made()
             for x in depth.tolist():
                 tip.step(x, STEP_S)
 
         return steps
 
-    rigid, sprung = (
-        Indenter(setup.library["cortex"], tip_radius_m=2.5e-3, poisson_ratio=0.49) for _ in range(2)
-    )
-    on_beam = SprungIndenter.on_beam(sprung, setup.bench.coupled(None).beam)
+    def rigid() -> Indenter:
+        return Indenter(setup.library["cortex"], tip_radius_m=2.5e-3, poisson_ratio=0.49)
+
+    def on_beam() -> SprungIndenter:
+        return SprungIndenter.on_beam(rigid(), setup.bench.coupled(None).beam)
+
     tasks: dict[str, tuple[Callable, str]] = {
         "bare real FFT of the record": (transform, ""),
         "linear": (setup.play(setup.excitation, IDEAL), "5 FFT"),

@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
         pace.run()
     finally:
         reactor.close()
-    if pace.pace.stalls:
+    if pace.stalls:
         print(f"load cell: {pace.pace}", file=sys.stderr)
     return 0
 

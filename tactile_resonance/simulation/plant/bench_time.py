@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from tactile_resonance.clock import ENDLESS_NS, MESSAGE, Demand, FromBench, ToBench
 from tactile_resonance.simulation.ur5e.reactor import Connection, Reactor
@@ -25,25 +24,6 @@ REPEAT_S = 0.05
 PACKETS_WITHIN_S = 0.5
 """A packet that was announced is waited for so long, on this machine's clock [s]."""
 _LONGEST_JOIN = 4096
-
-
-@dataclass
-class Pace:
-    """How well steps on the wall clock kept their pace.
-
-    Attributes
-    ----------
-    stalls : int
-        Steps that began more than 10 ms late.
-    longest_s : float
-        Longest delay of a step [s].
-    """
-
-    stalls: int = 0
-    longest_s: float = 0.0
-
-    def __str__(self) -> str:
-        return f"{self.stalls} stalls, longest delay {self.longest_s * 1e3:.1f} ms"
 
 
 class Participant:
@@ -144,7 +124,10 @@ class BenchTime:
         of the bus sent to it.
     packets_arrived : callable
         Number of packets that the robot has received since the start; None while it is not connected.
-    pace : Pace
+    stalls : int
+        Steps on the wall clock that began more than 10 ms late.
+    longest_delay_s : float
+        Of a step on the wall clock [s].
     """
 
     def __init__(self, reactor: Reactor, step_ns: int, *, simulated: bool) -> None:
@@ -156,13 +139,18 @@ class BenchTime:
         self.robot_sent_ns: Callable[[int], int] = lambda port: 0
         self.frames_sent: Callable[[int], int] = lambda port: 0
         self.packets_arrived: Callable[[], int | None] = lambda: None
-        self.pace = Pace()
+        self.stalls, self.longest_delay_s = 0, 0.0
         self.simulated = simulated
         self._reactor, self._step_ns = reactor, step_ns
         self._participants: list[Participant] = []
         self._packets_due = self._packets_mark = 0
         self._packets_late_s = 0.0
         self._stopping = False
+
+    @property
+    def pace(self) -> str:
+        """How well steps on the wall clock kept their pace."""
+        return f"{self.stalls} stalls, longest delay {self.longest_delay_s * 1e3:.1f} ms"
 
     # participants
 
@@ -309,10 +297,10 @@ class BenchTime:
         late_ns = now_ns - due_ns
         if self.simulated:
             return max(due_ns, now_ns - self._step_ns) + self._step_ns
-        self.pace.longest_s = max(self.pace.longest_s, late_ns * 1e-9)
+        self.longest_delay_s = max(self.longest_delay_s, late_ns * 1e-9)
         if late_ns <= STALL_S * 1e9:
             return due_ns + self._step_ns
-        self.pace.stalls += 1
+        self.stalls += 1
         for call in self.stalled:
             call(late_ns * 1e-9)
         return now_ns + self._step_ns

@@ -17,47 +17,36 @@ from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService
 PORT = 30020
 
 
-class ControlPort:
-    """Makes the service of each connection; parts of the plant add commands of their own.
+class ControlService(MessageService):
+    """One connection to the control port.
 
-    Attributes
+    Parameters
     ----------
-    commands : dict
+    connection : Connection
+    orders : dict
         Name of each command and the function that does it: takes the fields of the request, returns
         those of the answer, raises ValueError where it refuses.
     """
 
-    def __init__(self, commands: dict[str, Callable[[dict], dict]]) -> None:
-        self.commands = commands
+    def __init__(self, connection: Connection, orders: dict[str, Callable[[dict], dict]]) -> None:
+        super().__init__(connection)
+        self._orders = orders
 
-    def serve(self, connection: Connection) -> ControlService:
-        """Serve a new connection."""
-        return ControlService(self, connection)
+    def understand(self, message: bytes) -> None:
+        """Answer one line."""
+        self.connection.send(json.dumps(self._answer(message)).encode() + b"\n")
 
-    def answer(self, line: bytes) -> dict:
-        """Do one request and return its answer."""
+    def _answer(self, line: bytes) -> dict:
         try:
             fields = json.loads(line)
             name = fields.get("command") if isinstance(fields, dict) else None
-            if not isinstance(name, str) or name not in self.commands:
-                raise ValueError(f"command: expected one of {', '.join(self.commands)}")
-            return {"ok": True, **self.commands[name](fields)}
+            if not isinstance(name, str) or name not in self._orders:
+                raise ValueError(f"command: expected one of {', '.join(self._orders)}")
+            return {"ok": True, **self._orders[name](fields)}
         except RecursionError:
             return {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
             return {"ok": False, "error": str(error)}
-
-
-class ControlService(MessageService):
-    """One connection to the control port."""
-
-    def __init__(self, port: ControlPort, connection: Connection) -> None:
-        super().__init__(connection)
-        self._port = port
-
-    def understand(self, message: bytes) -> None:
-        """Answer one line."""
-        self.connection.send(json.dumps(self._port.answer(message)).encode() + b"\n")
 
 
 def order(host: str, command: str, port: int = PORT, timeout_s: float = 5.0, **fields: Any) -> dict:

@@ -13,7 +13,7 @@ from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.control_port import PORT as CONTROL_PORT
-from tactile_resonance.simulation.plant.control_port import ControlPort
+from tactile_resonance.simulation.plant.control_port import ControlService
 from tactile_resonance.simulation.ur5e import dashboard, rtde_server
 from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.reactor import Reactor
@@ -76,7 +76,8 @@ class SimulatedRobot:
     controller : UrController
     reactor : Reactor
     rtde : RtdeServer
-    control : ControlPort
+    orders : dict
+        What the control port does, by its name; parts of the plant add their own (`ControlService`).
     time : BenchTime
     after_step : list of callables
         Called after each step of the controller: what shares its clock.
@@ -100,7 +101,7 @@ class SimulatedRobot:
         self._cycle = 0
         self._frozen_until_ns = self._halted_until_ns = 0
         self.rtde = rtde_server.RtdeServer(controller)
-        self.control = ControlPort(self._orders())
+        self.orders = self._own_orders()
         self.reactor = Reactor(host)
         self.time = BenchTime(self.reactor, round(CYCLE_S * 1e9), simulated=simulated_time)
         self.time.steps.append(self._step)
@@ -112,21 +113,14 @@ class SimulatedRobot:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
             self.reactor.listen(dashboard.PORT, partial(dashboard.DashboardService, controller))
             self.reactor.listen(SCRIPT_PORT, lambda _: ScriptService(controller))
-            self.reactor.listen(control_port, self.control.serve, freezable=False)
+            self.reactor.listen(
+                control_port, partial(ControlService, orders=self.orders), freezable=False
+            )
             if simulated_time:
                 self.reactor.listen(TIME_PORT, self.time.serve, freezable=False)
         except ValueError:
             self.reactor.close()
             raise
-
-    def freeze_network(self, seconds: float) -> None:
-        """Let no packet of the robot's own ports pass for a time; the robot goes on."""
-        self._frozen_until_ns = self.time.now_ns + round(seconds * 1e9)
-        self.reactor.freeze(True)
-
-    def freeze_controller(self, seconds: float) -> None:
-        """Let the whole controller stand still for a time, its clock too."""
-        self._halted_until_ns = self.time.now_ns + round(seconds * 1e9)
 
     def run(self) -> None:
         """Step and serve until `time` is stopped, then close all ports."""
@@ -157,7 +151,7 @@ class SimulatedRobot:
     def _packets_arrived(self) -> int | None:
         return None if self.reactor.frozen else self.rtde.packets
 
-    def _orders(self) -> dict[str, Callable[[dict], dict]]:
+    def _own_orders(self) -> dict[str, Callable[[dict], dict]]:
         """What the control port does for the robot itself."""
         controller, rtde = self.controller, self.rtde
         return {
@@ -166,7 +160,7 @@ class SimulatedRobot:
             "drop": lambda _: {"dropped": rtde.drop()},
             "protective_stop": _plain(controller.protective_stop),
             "emergency_stop": _plain(controller.emergency_stop),
-            "release_emergency_stop": _plain(controller.release_emergency_stop),
+            "release_emergency_stop": _plain(controller.safety.release_emergency_stop),
             "remote_control": _switch(controller, "remote_control"),
             "script_starts": _switch(controller, "script_starts"),
             "registers_in_use": _switch(rtde, "registers_in_use"),
@@ -177,16 +171,16 @@ class SimulatedRobot:
         controller = self.controller
         return {
             "time_s": controller.time_s,
-            "robot_mode": controller.robot_mode.name,
-            "safety_mode": controller.safety_mode.name,
+            "robot_mode": controller.safety.robot_mode.name,
+            "safety_mode": controller.safety.safety_mode.name,
             "runtime_state": controller.runtime_state.name,
             "tcp_pose": controller.outputs("actual_TCP_pose"),
             "tcp_speed": controller.outputs("actual_TCP_speed"),
             "tcp_force": controller.outputs("actual_TCP_force"),
             "rtde_connections": self.rtde.connections,
-            "stalls": self.time.pace.stalls,
+            "stalls": self.time.stalls,
             "stood_still_s": controller.stood_still_s,
-            "longest_delay_s": self.time.pace.longest_s,
+            "longest_delay_s": self.time.longest_delay_s,
         }
 
     def _freeze(self, fields: dict) -> dict:
@@ -194,10 +188,12 @@ class SimulatedRobot:
         if not 0 < seconds <= _LONGEST_FREEZE_S:
             raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
         part = fields.get("part", "network")
-        if part == "network":
-            self.freeze_network(seconds)
-        elif part == "controller":
-            self.freeze_controller(seconds)
+        until_ns = self.time.now_ns + round(seconds * 1e9)
+        if part == "network":  # no packet of the robot's own ports passes; the robot goes on
+            self._frozen_until_ns = until_ns
+            self.reactor.freeze(True)
+        elif part == "controller":  # all of it stands still, its clock too
+            self._halted_until_ns = until_ns
         else:
             raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
         return {}

@@ -297,11 +297,11 @@ class CellOnBus:
 
 def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = None) -> None:
     """Add the commands of table and cell to the robot's control port, and the cell to its clock."""
-    commands = robot.control.commands
+    commands = robot.orders
     commands["place_surface"] = tabletop.place_surface
     commands["move_surface"] = tabletop.move_surface
     commands["place_tissue"] = tabletop.place_tissue
-    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.pace.stalls}
+    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.stalls}
     history = PlantHistory(tabletop.plant)
     commands["history"] = history.since
     commands["contact_over"] = history.contact_over

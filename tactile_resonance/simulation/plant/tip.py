@@ -75,10 +75,6 @@ class OnBone(OnSoft):
         """On the ball along the outward normal [N]."""
         return self._soft.force_n + self._bone()[0]
 
-    def reset(self) -> None:
-        """Return to undisturbed tissue."""
-        self._soft.reset()
-
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the ball to a depth within a time; return the force [N]."""
         self._soft.step(depth_m, dt_s)
@@ -116,11 +112,6 @@ class Clinging(OnSoft):
     def force_n(self) -> float:
         """On the ball along the outward normal [N]."""
         return self._soft.force_n - self._pulled_n
-
-    def reset(self) -> None:
-        """Return to undisturbed tissue."""
-        self._soft.reset()
-        self._touched, self._pulled_n = False, 0.0
 
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the ball to a depth within a time; return the force [N]."""
@@ -210,7 +201,11 @@ class SprungIndenter:
         self._stiffness, self._mass, self._damping = k, m, c
         self._swing_of = 0.0, 0.0  # stiffness and sub-step of the swing that was computed last
         self._swing = 0.0, 0.0
-        self.reset()
+        # the first step begins at rest, with the beam straight
+        self.force_n = 0.0
+        self.tip_depth_m = -np.inf
+        self._speed = 0.0
+        self._base: float | None = None
 
     @classmethod
     def on_beam(cls, indenter: Ball, modes: BeamModes) -> SprungIndenter:
@@ -223,14 +218,6 @@ class SprungIndenter:
             mass_kg=mass,
             damping_ns_per_m=2 * modes.damping_ratio * natural * mass,
         )
-
-    def reset(self) -> None:
-        """Return to undisturbed tissue; the next step begins at rest, with the beam straight."""
-        self.indenter.reset()
-        self.force_n = 0.0
-        self.tip_depth_m = -np.inf
-        self._speed = 0.0
-        self._base: float | None = None
 
     def step(self, base_depth_m: float, dt_s: float) -> float:
         """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""

@@ -92,10 +92,6 @@ class Ball(Protocol):
         """Of the contact on the tissue [m]."""
         ...
 
-    def reset(self) -> None:
-        """Return to undisturbed tissue."""
-        ...
-
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move to a depth within a time; return the force [N]."""
         ...
@@ -160,10 +156,7 @@ class Indenter:
         self._decay: Values = []
         self._gain: Values = []
         self._stiffness = 0.0
-        self.reset()
-
-    def reset(self) -> None:
-        """Return to undisturbed tissue with the tip far above it."""
+        # tissue undisturbed, the tip far above it
         self.force_n = 0.0
         self.contact_radius_m = 0.0
         self.depth_m = -np.inf

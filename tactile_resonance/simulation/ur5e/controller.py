@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
-from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES, Outputs, OutputValue
+from tactile_resonance.simulation.ur5e.outputs import Outputs, OutputValue
 from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.program import Program, register_offset
 from tactile_resonance.simulation.ur5e.registers import (
@@ -24,7 +24,7 @@ from tactile_resonance.simulation.ur5e.registers import (
     Registers,
     write_registers,
 )
-from tactile_resonance.simulation.ur5e.safety import RefusedError, RobotMode, Safety, SafetyMode
+from tactile_resonance.simulation.ur5e.safety import RefusedError, Safety
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
 
 # Lines of the controller's log that are kept.
@@ -69,8 +69,6 @@ class UrController:
 
     Attributes
     ----------
-    OUTPUT_TYPES, INPUT_TYPES : dict of str to str
-        RTDE types of all outputs and inputs, by name.
     config : ControllerConfig
     machine : Machine
         The arm.
@@ -96,9 +94,6 @@ class UrController:
         Newest lines of the controller's log, time stamped.
     """
 
-    OUTPUT_TYPES = OUTPUT_TYPES
-    INPUT_TYPES = INPUT_TYPES
-
     def __init__(
         self,
         config: ControllerConfig | None = None,
@@ -106,17 +101,17 @@ class UrController:
         seed: Seed = 0,
     ) -> None:
         self.config = config or ControllerConfig()
-        self.machine = Machine(self.config.machine, environment, np.random.default_rng(seed))
-        self.safety = Safety(self.config.switching_s)
-        self.registers = Registers()
-        self.ports = Ports()
+        self.machine: Machine = Machine(self.config.machine, environment, np.random.default_rng(seed))
+        self.safety: Safety = Safety(self.config.switching_s)
+        self.registers: Registers = Registers()
+        self.ports: Ports = Ports()
         self.program: Program | None = None
-        self.runtime_state = RuntimeState.STOPPED
+        self.runtime_state: RuntimeState = RuntimeState.STOPPED
         self.remote_control = True
         self.script_starts = True
         self.popup: str | None = None
         self.log: deque[str] = deque(maxlen=_LOG_LINES)
-        self.stood_still_s = 0.0
+        self.stood_still_s: float = 0.0
         self._cycles = 0
         self._refreshed_s = 0.0
         self.now = Outputs(self)
@@ -125,41 +120,6 @@ class UrController:
     def time_s(self) -> float:
         """Robot time since power-up [s]."""
         return self._cycles * CYCLE_S
-
-    @property
-    def program_running(self) -> bool:
-        """Whether a program runs."""
-        return self.program is not None
-
-    @property
-    def input_int(self) -> list[int]:
-        """Integer input registers, 48."""
-        return self.registers.input_int
-
-    @property
-    def input_double(self) -> list[float]:
-        """Double input registers, 48."""
-        return self.registers.input_double
-
-    @property
-    def output_int(self) -> list[int]:
-        """Integer output registers, 48."""
-        return self.registers.output_int
-
-    @property
-    def output_double(self) -> list[float]:
-        """Double output registers, 48."""
-        return self.registers.output_double
-
-    @property
-    def robot_mode(self) -> RobotMode:
-        """RTDE output ``robot_mode``."""
-        return self.safety.robot_mode
-
-    @property
-    def safety_mode(self) -> SafetyMode:
-        """RTDE output ``safety_mode``."""
-        return self.safety.safety_mode
 
     def reseed(self, seed: Seed) -> None:
         """Let all noise from the next step on be that of a seed, whatever was drawn before.
@@ -216,7 +176,7 @@ class UrController:
             raise RefusedError("not in remote control: the program is ignored")
         if not self.safety.may_move:
             raise RefusedError(
-                f"robot mode {self.robot_mode.name}, safety mode {self.safety_mode.name}: "
+                f"robot mode {self.safety.robot_mode.name}, safety mode {self.safety.safety_mode.name}: "
                 "the program is ignored"
             )
         if not self.script_starts:
@@ -246,38 +206,14 @@ class UrController:
         self.safety.violation(reason)
         self._end_program(f"safety violation: {reason}")
 
-    def release_emergency_stop(self) -> None:
-        """Release the emergency stop; power and brakes stay off."""
-        self.safety.release_emergency_stop()
-
-    def unlock_protective_stop(self) -> None:
-        """End a protective stop. Raises `RefusedError` within 5 s of it."""
-        self.safety.unlock_protective_stop()
-
-    def power_on(self) -> None:
-        """Power the arm. Raises `RefusedError` during a stop."""
-        self.safety.power_on()
-
-    def brake_release(self) -> None:
-        """Release the brakes. Raises `RefusedError` during a stop."""
-        self.safety.brake_release()
-
     def power_off(self) -> None:
         """Close the brakes and remove power; ends the program."""
         self._end_program("power off")
         self.safety.power_off()
         self.machine.catch_with_brakes()
 
-    def restart_safety(self) -> None:
-        """Restart after a violation; the arm is without power then."""
-        self.safety.restart_safety()
-
     def close_popup(self) -> None:
-        """Close a popup on the pendant."""
-        self.popup = None
-
-    def close_safety_popup(self) -> None:
-        """Close the popup of a stop."""
+        """Close the popup on the pendant."""
         self.popup = None
 
     def step(self) -> None:

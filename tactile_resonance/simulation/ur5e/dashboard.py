@@ -29,9 +29,9 @@ class DashboardService(MessageService):
         self._controller = c = controller
         # asked at any time
         self._questions: dict[str, Callable[[], str]] = {
-            "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
-            "safetymode": lambda: f"Safetymode: {c.safety_mode.name}",
-            "safetystatus": lambda: f"Safetystatus: {c.safety_mode.name}",
+            "robotmode": lambda: f"Robotmode: {c.safety.robot_mode.name}",
+            "safetymode": lambda: f"Safetymode: {c.safety.safety_mode.name}",
+            "safetystatus": lambda: f"Safetystatus: {c.safety.safety_mode.name}",
             "programState": lambda: f"{self._program_state()} rtde_control",
             "running": lambda: f"Program running: {str(self._running()).lower()}",
             "is in remote control": lambda: str(c.remote_control).lower(),
@@ -43,13 +43,16 @@ class DashboardService(MessageService):
             "version": lambda: ".".join(map(str, c.config.polyscope)),
         }
         self._actions: dict[str, tuple[Callable[[], None], str]] = {
-            "power on": (c.power_on, "Powering on"),
+            "power on": (c.safety.power_on, "Powering on"),
             "power off": (c.power_off, "Powering off"),
-            "brake release": (c.brake_release, "Brake releasing"),
-            "unlock protective stop": (c.unlock_protective_stop, "Protective stop releasing"),
-            "restart safety": (c.restart_safety, "Restarting safety"),
+            "brake release": (c.safety.brake_release, "Brake releasing"),
+            "unlock protective stop": (
+                c.safety.unlock_protective_stop,
+                "Protective stop releasing",
+            ),
+            "restart safety": (c.safety.restart_safety, "Restarting safety"),
             "close popup": (c.close_popup, "closing popup"),
-            "close safety popup": (c.close_safety_popup, "closing safety popup"),
+            "close safety popup": (c.close_popup, "closing safety popup"),
             "stop": (c.stop_program, "Stopped"),
             "shutdown": (c.power_off, "Shutting down"),
         }

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from tactile_resonance.contact.vectors import Vector, rotated_back
 from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, total
-from tactile_resonance.simulation.ur5e.registers import REGISTER_COUNT, Ports, Registers
-from tactile_resonance.simulation.ur5e.safety import RobotMode, Safety
+from tactile_resonance.simulation.ur5e.registers import REGISTER_COUNT
+from tactile_resonance.simulation.ur5e.safety import RobotMode
+
+if TYPE_CHECKING:
+    from tactile_resonance.simulation.ur5e.controller import UrController
 
 FloatArray = NDArray[np.float64]
 
@@ -85,36 +87,10 @@ NOMINAL_TEMPERATURE_C = 28.0
 MAINS_V, ROBOT_BUS_V = 230.0, 48.0
 
 
-class Robot(Protocol):
-    """What the outputs are read from."""
-
-    machine: Machine
-    safety: Safety
-    registers: Registers
-    ports: Ports
-
-    stood_still_s: float
-
-    @property
-    def time_s(self) -> float:
-        """Robot time [s]."""
-        ...
-
-    @property
-    def runtime_state(self) -> int:
-        """Of the program."""
-        ...
-
-    @property
-    def program_running(self) -> bool:
-        """Whether a program runs."""
-        ...
-
-
 class Outputs:
     """Outputs of one cycle; what several of them share is computed once, when first asked for."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: UrController) -> None:
         self.robot = robot
 
     def value(self, name: str) -> OutputValue:
@@ -148,7 +124,7 @@ class Outputs:
     def status_bits(self) -> int:
         """Power in bit 0, a running program in bit 1."""
         powered = self.robot.safety.robot_mode is not RobotMode.POWER_OFF
-        return int(powered) | int(self.robot.program_running) << 1
+        return int(powered) | int(self.robot.program is not None) << 1
 
     @property
     def joint_mode(self) -> list[int]:
@@ -192,7 +168,7 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "actual_tool_accelerometer": ("VECTOR3D", lambda o: o.tool_accelerometer),
     "speed_scaling": (
         "DOUBLE",
-        lambda o: o.robot.ports.speed_slider if o.robot.program_running else 0.0,
+        lambda o: o.robot.ports.speed_slider if o.robot.program else 0.0,
     ),
     "target_speed_fraction": ("DOUBLE", lambda o: o.robot.ports.speed_slider),
     "actual_momentum": (

@@ -22,49 +22,33 @@ from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.registers import Registers, Script, Thread
 from tactile_resonance.simulation.ur5e.target import ScriptError
 
+# Commands that are done anew in every cycle in which they stand in the command register.
+STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
 
-class Commands:
-    """Commands by number."""
 
-    # Done anew in every cycle in which they stand in the command register.
-    STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
-
-    def __init__(self, script: Script, machine: Machine) -> None:
-        moves = MotionCommands(script, machine)
-        settings = SettingCommands(script, machine)
-        self._do: dict[int, Callable[[], Thread | None]] = {
-            1: moves.movej, 2: moves.movej_pose, 3: moves.movel, 4: moves.movel_joints,
-            6: settings.force_mode, 7: settings.end_force_mode, 8: machine.sensor.zero,
-            9: moves.speedj, 10: moves.speedl, 11: moves.servoj, 15: moves.speed_stop,
-            16: moves.servo_stop, 17: settings.set_payload, 20: settings.set_damping,
-            21: settings.set_gain, 24: moves.servol, 25: settings.tool_contact,
-            26: settings.step_time, 27: settings.past_joints, 29: settings.set_tcp,
-            30: settings.inverse_near, 31: settings.protective_stop, 33: moves.stop,
-            34: moves.stop, 35: settings.set_watchdog, 36: settings.pose_within_limits,
-            37: settings.joints_within_limits, 38: settings.joint_torques,
-            39: settings.pose_trans, 40: settings.tcp_offset, 41: moves.start_jog,
-            42: moves.stop_jog, 43: settings.actual_forward, 44: settings.forward,
-            46: settings.inverse, 47: settings.steady, 51: moves.move_until_contact,
-            56: settings.external_sensor, 57: settings.external_sensor,
-            58: settings.flange_pose, 59: settings.set_gravity, 60: settings.has_inverse,
-            61: settings.has_inverse, 62: moves.start_contact, 63: moves.stop_contact,
-            64: moves.read_contact, 65: settings.set_target_payload,
-            CONTACT_FOUND: moves.back_to_contact,
-        }  # fmt: skip
-
-    def execute(self, command: int) -> Thread:
-        """Do a command; a generator that ends when it is done.
-
-        Raises
-        ------
-        ScriptError
-            Where the command is not known to the model, or its arguments are not accepted.
-        """
-        if command not in self._do:
-            raise ScriptError(f"command {command}: not modelled")
-        work = self._do[command]()
-        if work is not None:
-            yield from work
+def _commands(script: Script, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
+    """What the client's program does, by the number of the command."""
+    moves = MotionCommands(script, machine)
+    settings = SettingCommands(script, machine)
+    return {
+        1: moves.movej, 2: moves.movej_pose, 3: moves.movel, 4: moves.movel_joints,
+        6: settings.force_mode, 7: settings.end_force_mode, 8: machine.sensor.zero,
+        9: moves.speedj, 10: moves.speedl, 11: moves.servoj, 15: moves.speed_stop,
+        16: moves.servo_stop, 17: settings.set_payload, 20: settings.set_damping,
+        21: settings.set_gain, 24: moves.servol, 25: settings.tool_contact,
+        26: settings.step_time, 27: settings.past_joints, 29: settings.set_tcp,
+        30: settings.inverse_near, 31: settings.protective_stop, 33: moves.stop,
+        34: moves.stop, 35: settings.set_watchdog, 36: settings.pose_within_limits,
+        37: settings.joints_within_limits, 38: settings.joint_torques,
+        39: settings.pose_trans, 40: settings.tcp_offset, 41: moves.start_jog,
+        42: moves.stop_jog, 43: settings.actual_forward, 44: settings.forward,
+        46: settings.inverse, 47: settings.steady, 51: moves.move_until_contact,
+        56: settings.external_sensor, 57: settings.external_sensor,
+        58: settings.flange_pose, 59: settings.set_gravity, 60: settings.has_inverse,
+        61: settings.has_inverse, 62: moves.start_contact, 63: moves.stop_contact,
+        64: moves.read_contact, 65: settings.set_target_payload,
+        CONTACT_FOUND: moves.back_to_contact,
+    }  # fmt: skip
 
 
 READY, DONE = 1, 2
@@ -109,7 +93,7 @@ class Program:
         machine.force_mode.gain_scaling = _GAIN_SCALING
         machine.force_mode.damping = _DAMPING
         self._script = Script(registers, offset)
-        self._commands = Commands(self._script, machine)
+        self._commands = _commands(self._script, machine)
         self._main = self._loop()
 
     @property
@@ -151,8 +135,8 @@ class Program:
             command = script.integer(0)
             if command == 0:
                 command, script.internal_command = script.internal_command, 0
-            if command in self._commands.STREAMING:
-                yield from self._commands.execute(command)
+            if command in STREAMING:
+                yield from self._execute(command)
                 script.status(READY)
             elif command == 0:
                 executing = False
@@ -160,7 +144,15 @@ class Program:
             elif not executing:
                 if command == STOP_SCRIPT:
                     return
-                yield from self._commands.execute(command)
+                yield from self._execute(command)
                 script.status(DONE)
                 executing = True
             yield
+
+    def _execute(self, command: int) -> Thread:
+        """Do a command; raises ScriptError where the model has none such, or refuses its arguments."""
+        if command not in self._commands:
+            raise ScriptError(f"command {command}: not modelled")
+        work = self._commands[command]()
+        if work is not None:
+            yield from work

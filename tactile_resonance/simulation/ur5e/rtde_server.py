@@ -14,8 +14,9 @@ from enum import IntEnum
 from typing import Any
 
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.outputs import READERS, Reader
+from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES, READERS, Reader
 from tactile_resonance.simulation.ur5e.reactor import Connection
+from tactile_resonance.simulation.ur5e.registers import INPUT_TYPES
 
 PROTOCOL_VERSION = 2
 LONGEST_PAYLOAD = 0xFFFF - 3
@@ -275,7 +276,7 @@ class _Service:
             return b"\x00"
         self._period = round(CYCLE_HZ / frequency_hz)
         names = _names(payload[8:])
-        known = self._server.controller.OUTPUT_TYPES
+        known = OUTPUT_TYPES
         types = [known.get(name, "NOT_FOUND") for name in names]
         if "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
@@ -285,7 +286,7 @@ class _Service:
 
     def _set_up_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
-        known = self._server.controller.INPUT_TYPES
+        known = INPUT_TYPES
         types = [
             "IN_USE" if self._server.claimed(name, self) else known.get(name, "NOT_FOUND")
             for name in names

@@ -181,7 +181,7 @@ def test_pull_off_in_the_elastic_limit_is_that_of_jkr():
     assert force[-1] == 0
     assert tip.contact_radius_m == 0
     # equilibrium curve F(a), depth(a) of Johnson, Kendall & Roberts
-    tip.reset()
+    tip = indenter(ELASTIC, adhesion_j_per_m2=work)
     follow(tip, [0.0, 1.5e-4], 1e-3)
     a = tip.contact_radius_m
     expected = 4 * PLANE_MODULUS * a**3 / (3 * RADIUS) - np.sqrt(
@@ -257,7 +257,7 @@ def test_sprung_tip_rests_in_balance_and_rings_at_its_mode(sensor, tissue):
     bent = 7e-4 - tip.tip_depth_m
     assert tip.force_n == pytest.approx(modes.static_stiffness_n_per_m * bent, rel=1e-3)
     # in air, after a sudden stop
-    tip.reset()
+    tip = SprungIndenter.on_beam(indenter(tissue), modes)
     tip.step(-0.2, 1e-3)
     for depth in np.linspace(-0.2, -0.1, 50)[1:]:
         tip.step(depth, 1e-3)

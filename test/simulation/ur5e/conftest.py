@@ -37,19 +37,19 @@ class Client:
 
     @property
     def status(self) -> int:
-        return self.controller.output_int[self.offset]
+        return self.controller.registers.output_int[self.offset]
 
     @property
     def answer(self) -> int:
-        return self.controller.output_int[1 + self.offset]
+        return self.controller.registers.output_int[1 + self.offset]
 
     @property
     def answers(self) -> np.ndarray:
-        return np.array(self.controller.output_double[self.offset : self.offset + 6])
+        return np.array(self.controller.registers.output_double[self.offset : self.offset + 6])
 
     @property
     def progress(self) -> int:
-        return self.controller.output_int[2 + self.offset]
+        return self.controller.registers.output_int[2 + self.offset]
 
     def write(self, command: int, doubles: Sequence[float] = (), ints: Sequence[int] = ()) -> None:
         values: dict[str, float] = {f"input_int_register_{self.offset}": command}
@@ -66,7 +66,7 @@ class Client:
     def until(self, status: int, limit_s: float) -> None:
         steps = 0
         while self.status != status:
-            assert self.controller.program_running, self.controller.log[-1]
+            assert self.controller.program is not None, self.controller.log[-1]
             assert steps * 0.002 < limit_s, f"status {self.status}, waited for {status}"
             self.controller.step()
             steps += 1

@@ -118,7 +118,7 @@ def test_safety_limit_queries(any_client):
 def test_inverse_kinematics_out_of_reach_ends_the_program(client):
     client.write(46, [2.0, 0, 0, 0, 0, 0])
     client.run(0.01)
-    assert not client.controller.program_running
+    assert client.controller.program is None
     assert "no joint angles reach" in client.controller.popup
 
 
@@ -148,9 +148,9 @@ def test_past_joint_positions(client):
 def test_triggered_protective_stop_ends_the_program(client):
     client.write(31)
     client.run(0.1)
-    assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert client.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert client.controller.outputs("safety_status_bits") >> 2 & 1
-    assert not client.controller.program_running
+    assert client.controller.program is None
 
 
 def test_watchdog_stops_a_program_whose_client_falls_silent(any_client):
@@ -161,12 +161,12 @@ def test_watchdog_stops_a_program_whose_client_falls_silent(any_client):
     for _ in range(20):  # kicked: the register is refreshed, whatever its value
         client.write(0)
         client.run(0.08)
-        assert controller.program_running
+        assert controller.program is not None
     assert client.output("target_TCP_speed")[2] == pytest.approx(0.005)
     client.run(0.1 - 0.08)
-    assert controller.program_running
+    assert controller.program is not None
     client.run(0.004)
-    assert not controller.program_running
+    assert controller.program is None
     assert "watchdog" in controller.log[-1]
     client.run(0.1)
     assert not client.output("target_qd").any()
@@ -178,7 +178,7 @@ def test_watchdog_watches_the_command_register_alone(client):
     for _ in range(10):
         client.controller.write_inputs({"input_int_register_18": 1})
         client.run(0.02)
-    assert not client.controller.program_running
+    assert client.controller.program is None
 
 
 def test_stop_script_ends_the_program_and_brakes(any_client):
@@ -196,7 +196,7 @@ def test_stop_script_ends_the_program_and_brakes(any_client):
 def test_unknown_commands_end_the_program_with_their_number(client):
     client.write(18)
     client.run(0.01)
-    assert not client.controller.program_running
+    assert client.controller.program is None
     assert "command 18: not modelled" in client.controller.log[-1]
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.simulation.ur5e.controller import RuntimeState, UrController
+from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES
 from tactile_resonance.simulation.ur5e.safety import RefusedError, RobotMode, SafetyMode
 from tactile_resonance.simulation.ur5e.target import MotionLimits, SafetyPlane
 
@@ -41,11 +42,11 @@ def test_protective_stop_brakes_keeps_power_and_unlocks_after_five_seconds(movin
     assert controller.outputs("robot_mode") == RobotMode.RUNNING
     assert controller.outputs("robot_status_bits") == 1  # powered, no program
     with pytest.raises(RefusedError, match="until 5s after occurrence"):
-        controller.unlock_protective_stop()
+        controller.safety.unlock_protective_stop()
     with pytest.raises(RefusedError, match="PROTECTIVE_STOP"):
         controller.start_program(PROGRAM)
     run(controller, 5.0)
-    controller.unlock_protective_stop()
+    controller.safety.unlock_protective_stop()
     assert controller.outputs("safety_status_bits") == 1
     controller.start_program(PROGRAM)
     controller.step()
@@ -57,26 +58,26 @@ def test_emergency_stop_removes_power_after_braking_and_recovers_in_order(moving
     controller.emergency_stop()
     controller.step()
     assert controller.outputs("safety_status_bits") >> 7 & 1
-    assert controller.robot_mode is RobotMode.RUNNING  # still braking
+    assert controller.safety.robot_mode is RobotMode.RUNNING  # still braking
     run(controller, 0.5)
-    assert controller.robot_mode is RobotMode.POWER_OFF
+    assert controller.safety.robot_mode is RobotMode.POWER_OFF
     assert controller.outputs("robot_status_bits") == 0
     np.testing.assert_allclose(moving.output("actual_q"), moving.output("target_q"), atol=1e-12)
     stopped = moving.output("actual_q")
     with pytest.raises(RefusedError, match="ROBOT_EMERGENCY_STOP"):
-        controller.power_on()
-    controller.release_emergency_stop()
-    assert controller.safety_mode is SafetyMode.NORMAL
-    assert controller.robot_mode is RobotMode.POWER_OFF
-    controller.power_on()
-    assert controller.robot_mode is RobotMode.POWER_ON
+        controller.safety.power_on()
+    controller.safety.release_emergency_stop()
+    assert controller.safety.safety_mode is SafetyMode.NORMAL
+    assert controller.safety.robot_mode is RobotMode.POWER_OFF
+    controller.safety.power_on()
+    assert controller.safety.robot_mode is RobotMode.POWER_ON
     run(controller, 0.3)
-    assert controller.robot_mode is RobotMode.IDLE
+    assert controller.safety.robot_mode is RobotMode.IDLE
     with pytest.raises(RefusedError, match="IDLE"):
         controller.start_program(PROGRAM)
-    controller.brake_release()
+    controller.safety.brake_release()
     run(controller, 0.3)
-    assert controller.robot_mode is RobotMode.RUNNING
+    assert controller.safety.robot_mode is RobotMode.RUNNING
     np.testing.assert_allclose(moving.output("actual_q"), stopped, atol=1e-12)
     controller.start_program(PROGRAM)
 
@@ -86,13 +87,13 @@ def test_violation_needs_safety_to_be_restarted(moving):
     controller.violation("joint position")
     run(controller, 0.5)
     assert controller.outputs("safety_status_bits") >> 8 & 1
-    assert controller.robot_mode is RobotMode.POWER_OFF
+    assert controller.safety.robot_mode is RobotMode.POWER_OFF
     with pytest.raises(RefusedError, match="VIOLATION"):
-        controller.brake_release()
-    controller.restart_safety()
-    controller.brake_release()  # powers on, too
+        controller.safety.brake_release()
+    controller.safety.restart_safety()
+    controller.safety.brake_release()  # powers on, too
     run(controller, 0.5)
-    assert controller.robot_mode is RobotMode.RUNNING
+    assert controller.safety.robot_mode is RobotMode.RUNNING
 
 
 def test_power_off_holds_the_arm_at_once(moving):
@@ -100,7 +101,7 @@ def test_power_off_holds_the_arm_at_once(moving):
     held = moving.output("actual_q")
     run(moving.controller, 0.2)
     assert np.array_equal(moving.output("actual_q"), held)
-    assert not moving.controller.program_running
+    assert moving.controller.program is None
 
 
 def test_a_singular_path_is_a_protective_stop_of_the_robot(make_client):
@@ -111,7 +112,7 @@ def test_a_singular_path_is_a_protective_stop_of_the_robot(make_client):
     for _ in range(2000):
         client.controller.step()
         fastest = max(fastest, np.abs(client.output("target_qd")).max())
-    assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert client.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert fastest <= np.pi * (1 + 1e-6)
     client.run(0.5)
     assert not client.output("target_qd").any()
@@ -146,14 +147,14 @@ def test_other_programs_are_refused(text, message):
     controller = UrController()
     with pytest.raises(ValueError, match=message):
         controller.start_program(text)
-    assert not controller.program_running
+    assert controller.program is None
 
 
 def test_every_output_has_the_shape_of_its_type():
     controller = UrController(seed=3)
     run(controller, 0.01)
     lengths = {"VECTOR6D": 6, "VECTOR3D": 3, "VECTOR6INT32": 6}
-    for name, kind in controller.OUTPUT_TYPES.items():
+    for name, kind in OUTPUT_TYPES.items():
         value = controller.outputs(name)
         if kind in lengths:
             assert len(value) == lengths[kind], name
@@ -186,7 +187,7 @@ def test_inputs_write_what_their_masks_select():
     assert controller.outputs("standard_analog_output1") == 0.7
     with pytest.raises(KeyError, match="input_int_register_48"):
         controller.write_inputs({"input_int_register_3": 5, "input_int_register_48": 1})
-    assert controller.input_int[3] == 0
+    assert controller.registers.input_int[3] == 0
 
 
 def test_speed_slider_slows_a_move(make_client):
@@ -225,7 +226,7 @@ def test_a_safety_plane_stops_the_tool_and_is_known_to_the_queries(make_client):
     assert client.answer == 1
     client.stream(3, [*below, 0.05, 0.5])
     client.run((pose[2] - height) / 0.05 + 0.5)
-    assert not client.controller.program_running
+    assert client.controller.program is None
     assert "safety plane" in client.controller.safety.reason
     # it brakes within tenths of a millimetre
     assert client.output("target_TCP_pose")[2] == pytest.approx(height, abs=3e-4)
@@ -238,7 +239,7 @@ def test_numbers_that_are_none_end_the_program_and_move_nothing(make_client, com
     before = client.output("target_q")
     client.write(command, [0.1, value, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 0.1, 0.1, 300])
     client.run(0.02)
-    assert not client.controller.program_running
+    assert client.controller.program is None
     assert "accepted are numbers" in client.controller.log[-1]
     assert np.array_equal(client.output("target_q"), before)
 
@@ -270,10 +271,10 @@ def test_limits_hold_whatever_a_client_sends(make_client, seed):
             assert way <= 2 * limits.joint_speed_rad_s * 0.002 * (1 + 1e-6)
         client.write(0)
         controller.step()
-        if not controller.program_running:
+        if controller.program is None:
             client.run(5.2)
             assert not client.output("target_qd").any()
-            controller.unlock_protective_stop()
+            controller.safety.unlock_protective_stop()
             controller.start_program(PROGRAM)
             controller.step()
     assert travelled > 0.5

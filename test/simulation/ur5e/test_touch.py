@@ -148,7 +148,7 @@ def test_force_mode_gives_way_while_the_arm_moves_sideways(touching):
 def test_force_mode_refuses_what_it_cannot_do(touching, ints, limits, message):
     touching.stream(6, [0, 0, 0, 0, 0, 0, 0, 0, -8.0, 0, 0, 0, *limits], ints)
     touching.run(0.01)
-    assert not touching.controller.program_running
+    assert touching.controller.program is None
     assert message in touching.controller.log[-1]
 
 
@@ -156,7 +156,7 @@ def test_too_much_force_is_a_protective_stop(touching):
     pose = touching.output("target_TCP_pose")
     touching.write(3, [*(pose - [0, 0, 0.03, 0, 0, 0]), 0.05, 0.5])
     touching.run(1.5)
-    assert touching.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert touching.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert "N at the tool" in touching.controller.safety.reason
     assert touching.output("actual_TCP_force")[2] < 1.5 * 150.0
 
