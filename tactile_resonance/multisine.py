@@ -10,6 +10,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.poles.structure import PoleBand
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
@@ -57,6 +59,8 @@ class Excitation:
         What records refer to.
     label : str
         What is measured, for people.
+    bands : tuple of PoleBand
+        In which poles are wanted, the main one first; empty: nothing was said.
     """
 
     harmonics: IntArray
@@ -73,6 +77,7 @@ class Excitation:
     measurement_id: int = 0
     excitation_id: int = 0
     label: str = ""
+    bands: tuple[PoleBand, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("harmonics", "i"), ("amplitude_v", "f"), ("phase_rad", "f")):
@@ -205,7 +210,7 @@ def design_multisine(
     *,
     sample_rate_hz: float = 50e3,
     samples_per_period: int = 20000,
-    band_hz: tuple[float, float] = (10.0, 10e3),
+    band_hz: tuple[float, float] | Sequence[tuple[float, float]] = (10.0, 10e3),
     level_v: float = 1.0,
     scale_by: str = "rms",
     grid: Grid = Grid.FULL,
@@ -220,6 +225,7 @@ def design_multisine(
     measurement_id: int = 0,
     excitation_id: int = 0,
     label: str = "",
+    bands: tuple[PoleBand, ...] = (),
 ) -> Excitation:
     """Random-phase multisine over a band.
 
@@ -230,8 +236,8 @@ def design_multisine(
     ----------
     sample_rate_hz, samples_per_period
         The lines are multiples of their ratio. Defaults give 2.5 Hz (arXiv 1805.00682).
-    band_hz : (low, high)
-        Lines in this band, ends included, are excited.
+    band_hz : (low, high) or several of them
+        Lines in this band, ends included, are excited; several are ascending and share no line.
     level_v : float
         Root mean square of the whole signal, or its peak [V].
     scale_by : {"rms", "peak"}
@@ -244,7 +250,7 @@ def design_multisine(
     lines_beside : int
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.
-    seed, realisation, realisations, periods, measurement_id, excitation_id, label
+    seed, realisation, realisations, periods, measurement_id, excitation_id, label, bands
         See `Excitation`.
 
     Raises
@@ -259,23 +265,32 @@ def design_multisine(
     """
     _check_period(sample_rate_hz, samples_per_period)
     resolution_hz = sample_rate_hz / samples_per_period
-    low_hz, high_hz = band_hz
-    if not (0 < low_hz <= high_hz < sample_rate_hz / 2):
-        raise ValueError(
-            f"band_hz: {low_hz:g}..{high_hz:g}, expected 0 < low <= high < {sample_rate_hz / 2:g}"
-        )
+    stretches_hz = np.reshape(np.asarray(band_hz, float), (-1, 2))
+    for low_hz, high_hz in stretches_hz:
+        if not (0 < low_hz <= high_hz < sample_rate_hz / 2):
+            raise ValueError(
+                f"band_hz: {low_hz:g}..{high_hz:g}, expected 0 < low <= high < {sample_rate_hz / 2:g}"
+            )
     if not (np.isfinite(level_v) and level_v > 0):
         raise ValueError(f"level_v: {level_v}, expected a positive voltage")
     if scale_by not in ("rms", "peak"):
         raise ValueError(f"scale_by: {scale_by!r}, accepted are 'rms' and 'peak'")
     # 1e-9: a band edge that is a line stays in the band whatever the rounding of the division
-    low = int(np.ceil(low_hz / resolution_hz - 1e-9))
-    high = int(np.floor(high_hz / resolution_hz + 1e-9))
-    harmonics = harmonics_on_grid(low, high, grid, seed=seed, block_lines=block_lines)
+    ends = stretches_hz / resolution_hz + [-1e-9, 1e-9]
+    harmonics = np.concatenate(
+        [
+            harmonics_on_grid(
+                int(np.ceil(low)), int(np.floor(high)), grid, seed=seed, block_lines=block_lines
+            )
+            for low, high in ends
+        ]
+    )
     frequency_hz = np.asarray(harmonics * resolution_hz, float)
     hum = mains_lines(frequency_hz, resolution_hz, mains_hz, lines_beside)
     if hum.all():
-        raise ValueError(f"mains_hz: {list(mains_hz)} leave no line of {low_hz:g}..{high_hz:g} Hz")
+        raise ValueError(
+            f"mains_hz: {list(mains_hz)} leave no line of {frequency_hz[0]:g}..{frequency_hz[-1]:g} Hz"
+        )
     harmonics = harmonics[~hum]
     shape = np.ones(harmonics.size)
     if relative_amplitude is not None:
@@ -299,6 +314,7 @@ def design_multisine(
         measurement_id=measurement_id,
         excitation_id=excitation_id,
         label=label,
+        bands=bands,
     )
     return scaled_to(unscaled, level_v, scale_by)
 

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.frf.estimate import mean_spectra
+from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.frf.spectra import (
     ComplexArray,
     FloatArray,
@@ -18,6 +20,10 @@ from tactile_resonance.frf.spectra import (
     Spectrum,
     error_variance,
 )
+from tactile_resonance.multisine import Excitation, Grid
+
+DETECTING = (Grid.ODD, Grid.ODD_RANDOM)
+"""Grids that leave lines out between those excited: what stands there is distortion."""
 
 FALSE_ALARM = 0.01
 """Probability that noise alone passes for distortion."""
@@ -243,6 +249,52 @@ def nonlinear_distortion(
         even=_detection_lines(spectra.at(detection[detection % 2 == 0]), excited, sample_rate_hz),
         odd=_detection_lines(spectra.at(detection[detection % 2 == 1]), excited, sample_rate_hz),
     )
+
+
+def band_lines(excitation: Excitation, band_hz: tuple[float, float]) -> IntArray:
+    """All harmonics from the first to the last excited one of a band, those left out between them included.
+
+    Raises
+    ------
+    ValueError
+        If the band holds no excited line.
+    """
+    low_hz, high_hz = band_hz
+    f = excitation.frequency_hz
+    excited = excitation.harmonics[(f >= low_hz) & (f <= high_hz)]
+    if excited.size == 0:
+        raise ValueError(f"bands: {low_hz:g} to {high_hz:g} Hz hold no excited line")
+    return np.arange(excited[0], excited[-1] + 1)
+
+
+def distortion_in_band(
+    spectra: PeriodicSpectra,
+    excited_harmonics: npt.ArrayLike,
+    band_hz: tuple[float, float],
+    *,
+    sample_rate_hz: float,
+) -> BandDistortion:
+    """Levels of even and odd distortion at the detection lines of one band.
+
+    Parameters
+    ----------
+    spectra : PeriodicSpectra
+        At `band_lines`, (M, 2, H).
+    excited_harmonics : (F,) int
+        All that are excited; those of the band count.
+    band_hz : (low, high)
+    sample_rate_hz : float
+    """
+    excited = np.intersect1d(np.asarray(excited_harmonics), spectra.harmonics)
+    found = nonlinear_distortion(spectra, excited, sample_rate_hz=sample_rate_hz)
+    values: dict[str, Any] = {}
+    for name, lines in (("even", found.even), ("odd", found.odd)):
+        noise_db, above = lines.rms_noise_level_db, lines.above_noise
+        values[f"{name}_db"] = float(lines.rms_level_db)
+        values[f"{name}_noise_db"] = float("nan") if noise_db is None else float(noise_db)
+        values[f"{name}_above_noise"] = bool(above) if above is not None else False
+        values[f"input_{name}_db"] = float(lines.rms_input_level_db)
+    return BandDistortion(*band_hz, **values)
 
 
 def _detection_lines(

@@ -11,9 +11,10 @@ import numpy as np
 
 from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
+from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
 from tactile_resonance.frf.estimate import fast_frf, mean_spectra, robust_frf
 from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.spectra import (
     FloatArray,
@@ -23,6 +24,7 @@ from tactile_resonance.frf.spectra import (
     stacked_spectra,
 )
 from tactile_resonance.multisine import Excitation
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Contact, Origin, Record
 
 LEAST_COVERAGE = 0.8
@@ -47,7 +49,7 @@ class MeasurementFrf:
         Of the local polynomial method.
     bins_band_hz : (low, high), optional
         All bins of this band go with the FRF, as long as all realisations have as many periods and
-        the bins of all are no more than `MOST_BINS`.
+        the bins of all are no more than `MOST_BINS`; where an excitation names bands, theirs instead.
     """
 
     def __init__(
@@ -61,10 +63,14 @@ class MeasurementFrf:
     ) -> None:
         self.measurement_id = measurement_id
         self._band_hz, self._order, self._dof = band_hz, order, dof
-        self._bins_band_hz = bins_band_hz
+        self._bins_bands_hz: tuple[tuple[float, float], ...] = ()
+        if bins_band_hz is not None:
+            self._bins_bands_hz = (bins_band_hz,)
+        self._bands: tuple[PoleBand, ...] = ()
         self._lines: IntArray | None = None
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
-        self._spectra: dict[int, tuple[PeriodicSpectra, BandBins | None]] = {}
+        self._spectra: dict[int, tuple[PeriodicSpectra, list[BandBins | None]]] = {}
+        self._detection: dict[int, list[PeriodicSpectra]] = {}  # of each band that has such lines
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
@@ -99,6 +105,9 @@ class MeasurementFrf:
             self._note("nothing was played")
             return self.frf()
         if self._lines is None:
+            self._bands = excitation.bands
+            if self._bands:
+                self._bins_bands_hz = tuple(band.ends_hz for band in self._bands)
             self._lines = self._lines_of(excitation)
             self._samples = np.empty((2, excitation.periods, n))
         self._remember(record)
@@ -123,9 +132,10 @@ class MeasurementFrf:
         frf = self._frf
         if frf is None:
             frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
+        frf = replace(frf, bands=self._bands)
         delay_s = float("nan") if self._last is None else self._last.channel_delay_s
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
-            frf = correct_skew(replace(frf, bins=None), delay_s)
+            frf = correct_skew(replace(frf, bins=None, further_bins=()), delay_s)
         frf = FaultReport(tuple(self._faults.values())).marked(frf)
         if not self._notes:
             return frf
@@ -158,9 +168,8 @@ class MeasurementFrf:
     def _lines_of(self, excitation: Excitation) -> IntArray:
         """Excited harmonics in the band."""
         frequency_hz = excitation.frequency_hz
-        if self._bins_band_hz is not None:
-            low_hz, high_hz = self._bins_band_hz
-            line_hz = excitation.sample_rate_hz / excitation.samples_per_period
+        line_hz = excitation.sample_rate_hz / excitation.samples_per_period
+        for low_hz, high_hz in self._bins_bands_hz:
             top_hz = min(high_hz, excitation.sample_rate_hz / 2)
             count = (top_hz - low_hz) / line_hz * excitation.periods
             if count > MOST_BINS:
@@ -197,15 +206,22 @@ class MeasurementFrf:
         if so_far:
             record = Spectrum(self._samples[:, :periods])
         spectra = mean_spectra(record, lines, order=self._order, dof=self._dof)
-        bins = None
-        if self._bins_band_hz is not None:
-            bins = band_bins(
+        bins = [
+            band_bins(
                 record,
                 excitation.harmonics,
                 sample_rate_hz=excitation.sample_rate_hz,
-                band_hz=self._bins_band_hz,
+                band_hz=band_hz,
             )
+            for band_hz in self._bins_bands_hz
+        ]
         self._spectra[realisation] = spectra, bins
+        if self._bands and excitation.grid in DETECTING:
+            # the first period is left out: what a polynomial leaves of the transient hides distortion
+            self._detection[realisation] = [
+                mean_spectra(record, band_lines(excitation, band.ends_hz), method="average")
+                for band in self._bands
+            ]
         self._periods[realisation] = periods
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
@@ -214,10 +230,31 @@ class MeasurementFrf:
             frf = fast_frf(spectra, sample_rate_hz=excitation.sample_rate_hz)
         else:
             frf = robust_frf(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
-        bins = stacked_bins([of for _, of in self._spectra.values()])
-        if bins is not None and bins.u.size > MOST_BINS:
-            bins = None
-        self._frf = replace(frf, bins=bins)
+        stacked = [
+            stacked_bins(of) for of in zip(*(of for _, of in self._spectra.values()), strict=True)
+        ]
+        known = [of for of in stacked if of is not None and of.u.size <= MOST_BINS]
+        if not known or len(known) < len(stacked):
+            known = []
+        self._frf = replace(
+            frf,
+            bins=known[0] if known else None,
+            further_bins=tuple(known[1:]),
+            distortion=self._distortion(excitation),
+        )
+
+    def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
+        """In each band, from all realisations so far."""
+        realisations = list(self._detection.values())
+        return tuple(
+            distortion_in_band(
+                stacked_spectra([of[k] for of in realisations]),
+                excitation.harmonics,
+                band.ends_hz,
+                sample_rate_hz=excitation.sample_rate_hz,
+            )
+            for k, band in enumerate(self._bands if realisations else ())
+        )
 
     def _check(self, block: Spectrum, excitation: Excitation) -> None:
         """Keep the worst fault of each kind that a single block shows."""

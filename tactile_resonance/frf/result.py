@@ -8,12 +8,33 @@ from enum import Enum
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.spectra import ComplexArray, FloatArray
+from tactile_resonance.poles.structure import PoleBand
 
 PER_LINE = (
     *("frequency_hz", "g", "variance_noise", "variance_total"),
     *("actuator_amplitude", "sensor_variance_given_actuator"),
 )
 """Fields of an `FRF` whose last axis are its lines."""
+
+
+@dataclass(frozen=True)
+class BandDistortion:
+    """Nonlinear distortion in one band; ``msg/Distortion.msg`` gives unit and meaning of each field.
+
+    Levels are those of `distortion.DetectionLines`: `even_db` its ``rms_level_db``, `input_even_db` its
+    ``rms_input_level_db``, `even_noise_db` its ``rms_noise_level_db``.
+    """
+
+    low_hz: float
+    high_hz: float
+    even_db: float = float("nan")
+    odd_db: float = float("nan")
+    even_noise_db: float = float("nan")
+    odd_noise_db: float = float("nan")
+    even_above_noise: bool = False
+    odd_above_noise: bool = False
+    input_even_db: float = float("nan")
+    input_odd_db: float = float("nan")
 
 
 class FrfStatus(Enum):
@@ -51,6 +72,12 @@ class FRF:
         ``C_YY - |C_YU|^2 / C_UU`` [V^2]. Of one realisation.
     bins : BandBins or None
         All bins of a band of the records behind G, where asked for: of as many realisations.
+    further_bins : tuple of BandBins
+        Of several bands, those of the second and so on.
+    bands : tuple of PoleBand
+        In which poles are wanted, as the excitation says; empty: it does not.
+    distortion : tuple of BandDistortion
+        In each band, where the excitation leaves lines out that show it.
     periods, realisations : int
         How many were used.
     method : str
@@ -68,6 +95,9 @@ class FRF:
     actuator_amplitude: FloatArray | None = None
     sensor_variance_given_actuator: FloatArray | None = None
     bins: BandBins | None = None
+    further_bins: tuple[BandBins, ...] = ()
+    bands: tuple[PoleBand, ...] = ()
+    distortion: tuple[BandDistortion, ...] = ()
     periods: int = 1
     realisations: int = 1
     method: str = ""

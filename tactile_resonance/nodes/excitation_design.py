@@ -14,6 +14,7 @@ from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.recording.messages import bands_from_message
 
 GRIDS = {
     Measure.Goal.GRID_FULL: Grid.FULL,
@@ -98,6 +99,16 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     periods, realisations, seed, passes = rest
     if goal.silent and goal.level_v:
         raise ValueError(f"level_v: {goal.level_v:g}, a silent measurement plays nothing: 0")
+    counts = len(goal.excited_low_hz), len(goal.excited_high_hz)
+    if counts[0] != counts[1]:
+        raise ValueError(
+            f"excited_low_hz, excited_high_hz: {counts} values, as many of each are accepted"
+        )
+    stretches_hz = list(zip(goal.excited_low_hz, goal.excited_high_hz, strict=True))
+    if stretches_hz and (goal.f_min_hz or goal.f_max_hz):
+        raise ValueError(
+            f"f_min_hz, f_max_hz: {goal.f_min_hz:g}, {goal.f_max_hz:g}, 0 are accepted beside excited_low_hz"
+        )
     level = goal.level_v or level
     if not level <= max_level:
         raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
@@ -108,9 +119,9 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
         raise ValueError(f"realisations: {realisations}, accepted is up to {MOST_REALISATIONS}")
     excitations = [
         design_multisine(
-            sample_rate_hz=rate,
-            samples_per_period=samples,
-            band_hz=(goal.f_min_hz or low, goal.f_max_hz or high),
+            sample_rate_hz=goal.sample_rate_hz or rate,
+            samples_per_period=goal.samples_per_period or samples,
+            band_hz=stretches_hz or (goal.f_min_hz or low, goal.f_max_hz or high),
             level_v=level,
             grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
             mains_hz=(mains,) if mains else (),
@@ -121,6 +132,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
             periods=goal.periods or periods,
             measurement_id=goal.measurement_id,
             label=goal.label,
+            bands=bands_from_message(goal),
         )
         for realisation in range(realisations)
     ]

@@ -26,7 +26,8 @@ PARAMETERS = (
     Parameter(
         "bins_low_hz",
         200.0,
-        "All bins of the record from here go with the FRF, for the joint estimator of poles [Hz].",
+        "All bins of the record from here go with the FRF, for the joint estimator of poles [Hz]; those of "
+        "the bands that an excitation names instead.",
         0.0,
         1e7,
     ),
@@ -78,7 +79,9 @@ class FrfNode(ManagedNode):
         try:
             self._estimate(record)
         except Exception as error:
-            reason = self.health.failed(f"record of excitation {record.origin.excitation_id}", error)
+            reason = self.health.failed(
+                f"record of excitation {record.origin.excitation_id}", error
+            )
             nothing = FRF(
                 np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=reason
             )

@@ -28,12 +28,16 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
     array_of,
+    bands_from_message,
     complex_of,
+    distortion_from_message,
     fill,
     fill_complex,
     key_of,
     optional,
     origin_from_message,
+    write_bands,
+    write_distortion,
     write_excitation,
     write_origin,
     write_poles,
@@ -66,7 +70,7 @@ _HOLDS = {
 def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -> msg.Excitation:
     """Message of an excitation designed at `time_ns`."""
     message = msg.Excitation()
-    write_excitation(message, excitation, time_ns, frame_id)
+    write_excitation(message, msg.Band, excitation, time_ns, frame_id)
     return message
 
 
@@ -80,7 +84,7 @@ def record_to_message(record: Record) -> msg.Record:
 def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
     """Message of poles."""
     message = msg.Poles()
-    write_poles(message, poles, origin)
+    write_poles(message, msg.BandPoles, poles, origin)
     return message
 
 
@@ -116,8 +120,10 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
         values = getattr(frf, name)
         if values is not None:
             fill(getattr(message, name), values)
+    write_bands(message, msg.Band, frf.bands)
+    write_distortion(message, msg.Distortion, frf.distortion)
     if frf.bins is not None:
-        _write_bins(message, frf.bins)
+        _write_bins(message, (frf.bins, *frf.further_bins))
     return message
 
 
@@ -128,13 +134,17 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         values = getattr(message, name)
         if len(values) != lines and (len(values) or name in ("real", "imag")):
             raise ValueError(f"{name}: {len(values)} values for {lines} lines, expected as many")
+    bins = _bins(message)
     frf = FRF(
         frequency_hz=array_of(message.frequency_hz),
         g=complex_of(message, ""),
         **{name: optional(getattr(message, name)) for name in FRF_OPTIONAL},
         noise_dof=message.noise_dof,
         total_dof=message.total_dof,
-        bins=_bins(message),
+        bins=bins[0] if bins else None,
+        further_bins=bins[1:],
+        bands=bands_from_message(message),
+        distortion=distortion_from_message(message),
         periods=message.periods,
         realisations=message.realisations,
         method=message.method,
@@ -144,37 +154,53 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
     return frf, origin_from_message(message)
 
 
-def _write_bins(message: msg.FRF, bins: BandBins) -> None:
-    fill_complex(message, "bins_actuator_", bins.u)
-    fill_complex(message, "bins_sensor_", bins.y)
-    fill(message.bins_harmonics, bins.harmonics)
-    message.bins_first = bins.first_bin
-    message.bins_sample_rate_hz = bins.sample_rate_hz
-    message.bins_samples_per_period = bins.samples_per_period
-    message.bins_periods = bins.periods
+def _write_bins(message: msg.FRF, bands: Sequence[BandBins]) -> None:
+    """Of one record in several bands."""
+    first, further = bands[0], bands[1:]
+    for bins in bands:
+        fill_complex(message, "bins_actuator_", bins.u)
+        fill_complex(message, "bins_sensor_", bins.y)
+        fill(message.bins_harmonics, bins.harmonics)
+    message.bins_first = first.first_bin
+    fill(message.further_bins_first, [bins.first_bin for bins in further])
+    fill(message.further_bins_count, [bins.count for bins in further])
+    message.bins_sample_rate_hz = first.sample_rate_hz
+    message.bins_samples_per_period = first.samples_per_period
+    message.bins_periods = first.periods
 
 
-def _bins(message: msg.FRF) -> BandBins | None:
-    """Those of the realisations one after the other."""
+def _bins(message: msg.FRF) -> tuple[BandBins, ...]:
+    """Of each band; in it those of the realisations one after the other."""
     names = [f"bins_{c}_{part}" for c in ("actuator", "sensor") for part in ("real", "imag")]
     sizes = {len(getattr(message, name)) for name in names}
     if sizes == {0}:
-        return None
+        return ()
     if len(sizes) > 1:
         raise ValueError(f"{', '.join(names)}: sizes {sorted(sizes)}, expected as many of each")
-    records = max(1, message.realisations)
-    if max(sizes) % records:
+    (size,), records = sizes, max(1, message.realisations)
+    counts = np.array([0, *message.further_bins_count], np.int64)
+    firsts = [message.bins_first, *message.further_bins_first]
+    counts[0] = size // records - counts.sum()
+    if size % records or counts[0] <= 0 or len(firsts) != counts.size:
         raise ValueError(
-            f"{names[0]}: size {max(sizes)}, expected as many of each of {records} realisations"
+            f"{names[0]}: size {size}, expected as many of each of {records} realisations, in "
+            f"{len(firsts)} bands, of which the further ones have {counts[1:].tolist()}"
         )
-    return BandBins(
-        message.bins_first,
-        complex_of(message, "bins_actuator_").reshape(records, -1),
-        complex_of(message, "bins_sensor_").reshape(records, -1),
-        array_of(message.bins_harmonics).astype(np.int64),
-        message.bins_sample_rate_hz,
-        message.bins_samples_per_period,
-        message.bins_periods,
+    ends = np.cumsum(counts)[:-1] * records
+    u, y = (np.split(complex_of(message, f"bins_{c}_"), ends) for c in ("actuator", "sensor"))
+    harmonics = array_of(message.bins_harmonics).astype(np.int64)
+    bins = harmonics * message.bins_periods
+    return tuple(
+        BandBins(
+            first,
+            u[k].reshape(records, -1),
+            y[k].reshape(records, -1),
+            harmonics[(bins >= first) & (bins < first + counts[k])],
+            message.bins_sample_rate_hz,
+            message.bins_samples_per_period,
+            message.bins_periods,
+        )
+        for k, first in enumerate(firsts)
     )
 
 

@@ -4,21 +4,26 @@
 from __future__ import annotations
 
 from tactile_resonance import msg
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, RESULTS, run_node
-from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_frf
-from tactile_resonance.poles.order_choice import choose_among
+from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.poles.tables import compiled
 from tactile_resonance.recording.messages import origin_from_message
 
 PARAMETERS = (
-    Parameter("band_low_hz", 200.0, "Lower end of the band of the fit [Hz].", 0.0, 1e6),
-    Parameter("band_high_hz", 300.0, "Upper end of the band of the fit [Hz].", 0.0, 1e6),
+    Parameter(
+        "band_low_hz",
+        200.0,
+        "Lower end of the band of the fit, of FRFs that name none [Hz].",
+        0.0,
+        1e6,
+    ),
+    Parameter("band_high_hz", 300.0, "Upper end of it [Hz].", 0.0, 1e6),
     Parameter(
         "order",
         2,
@@ -46,7 +51,10 @@ PARAMETERS = (
 
 
 class PolesNode(ManagedNode):
-    """Every FRF that arrives becomes poles, with the same header."""
+    """Every FRF that arrives becomes poles, with the same header.
+
+    In the bands that its excitation names; the parameters hold for an FRF that names none.
+    """
 
     def __init__(self) -> None:
         super().__init__("poles_node", PARAMETERS)
@@ -71,13 +79,8 @@ class PolesNode(ManagedNode):
         low_hz, high_hz, order, terms, method = values(
             self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )
-
-        def fit(structure: ModelStructure) -> Poles:
-            return poles_of_frf(frf, (low_hz, high_hz), structure, method)
-
-        if order == 0 and frf.status is not FrfStatus.FAILED:
-            return choose_among(fit).best
-        return fit(ModelStructure.with_residual(order or 2, terms))
+        bands = frf.bands or (PoleBand(low_hz, high_hz, order, terms),)
+        return poles_of_bands(frf, bands, method)
 
 
 def main() -> None:

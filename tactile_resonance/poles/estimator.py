@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.identify import identify_poles
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
+from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import ModelStructure, PoleBand
 
 POLES_METHODS = ("auto", "joint", "frf")
 
@@ -59,6 +61,34 @@ def poles_of_frf(
     notes = [frf.message] if frf.status is not FrfStatus.OK else []
     poles = identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
     return second_attempt(poles, frf, band_hz, structure)
+
+
+def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") -> Poles:
+    """Poles in several bands of one FRF, each fitted by itself; those of the second and so on as `further`.
+
+    Parameters
+    ----------
+    frf : FRF
+        Its bins are those of the bands, in their order, where it brings any.
+    bands : sequence of PoleBand
+        One or more.
+    method : str
+        See `poles_of_frf`.
+    """
+    bins = [frf.bins, *frf.further_bins, *[None] * len(bands)]
+
+    def of_band(k: int, band: PoleBand) -> Poles:
+        alone = replace(frf, bins=bins[k], further_bins=())
+
+        def fit(structure: ModelStructure) -> Poles:
+            return poles_of_frf(alone, band.ends_hz, structure, method)
+
+        if band.order == 0 and frf.status is not FrfStatus.FAILED:
+            return choose_among(fit).best
+        return fit(ModelStructure.with_residual(band.order or 2, band.residual_terms))
+
+    first, *further = (of_band(k, band) for k, band in enumerate(bands))
+    return replace(first, further=tuple(further))
 
 
 def second_attempt(

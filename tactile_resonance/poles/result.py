@@ -130,6 +130,8 @@ class Poles:
     status : PolesStatus
     message : str
         A sentence for people.
+    further : tuple of Poles
+        Of a measurement of several bands, those of the second and so on; all else is of the first.
     """
 
     poles_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
@@ -158,6 +160,12 @@ class Poles:
     method: str = ""
     status: PolesStatus = PolesStatus.FAILED
     message: str = ""
+    further: tuple[Poles, ...] = ()
+
+    @property
+    def bands(self) -> tuple[Poles, ...]:
+        """Of each band, the first being these."""
+        return (self, *self.further)
 
     @property
     def best_covariance(self) -> FloatArray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rational model is fitted."""
+"""Which rational model is fitted, and in which band."""
 
 from __future__ import annotations
 
@@ -72,3 +72,35 @@ class ModelStructure:
     def fewest_lines(self) -> int:
         """Lines for more real equations than parameters."""
         return self.parameters // 2 + 1
+
+
+@dataclass(frozen=True)
+class PoleBand:
+    """A band in which poles are wanted, and the model of the response there.
+
+    It travels with an excitation and what comes of it, so that every stage works on what was asked for.
+
+    Attributes
+    ----------
+    low_hz, high_hz : float
+    order : int
+        Of the denominator, two poles a mode; 0: the data choose one to three modes.
+    residual_terms : int
+        Real polynomial terms beside the modes.
+    """
+
+    low_hz: float
+    high_hz: float
+    order: int = 2
+    residual_terms: int = DEFAULT_RESIDUAL_TERMS
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low_hz < self.high_hz < inf:
+            raise ValueError(
+                f"band: {self.low_hz:g} to {self.high_hz:g} Hz, expected 0 < low < high"
+            )
+
+    @property
+    def ends_hz(self) -> tuple[float, float]:
+        """Both ends."""
+        return self.low_hz, self.high_hz

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, replace
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.contact.force_spread import ForceSpread
+from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 
@@ -67,6 +68,8 @@ RECORD = (
     "anti_alias_filter",
 )
 POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
+BAND = ("low_hz", "high_hz", "order", "residual_terms")
+DISTORTION = tuple(each.name for each in fields(BandDistortion))
 POLES_ARRAYS = ("f0_hz", "damping_ratio")
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
@@ -85,16 +88,33 @@ def excitation_from_message(message: Any) -> Excitation:
     arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
     arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
-    return Excitation(**_values(message, EXCITATION), **arrays, grid=grid)
+    bands = bands_from_message(message)
+    return Excitation(**_values(message, EXCITATION), **arrays, grid=grid, bands=bands)
 
 
-def write_excitation(message: Any, excitation: Excitation, time_ns: int, frame_id: str) -> None:
-    """Fill the message of an excitation designed at `time_ns`."""
+def bands_from_message(message: Any) -> tuple[PoleBand, ...]:
+    """Bands in which poles are wanted, of a message with the field ``bands``."""
+    return tuple(PoleBand(**_values(band, BAND)) for band in message.bands)
+
+
+def write_bands(message: Any, make: Callable[[], Any], bands: Sequence[PoleBand]) -> None:
+    """Fill the field ``bands`` with messages that `make` gives."""
+    for band in bands:
+        written = make()
+        _write_values(written, BAND, band)
+        message.bands.append(written)
+
+
+def write_excitation(
+    message: Any, make: Callable[[], Any], excitation: Excitation, time_ns: int, frame_id: str
+) -> None:
+    """Fill the message of an excitation designed at `time_ns`; `make` gives messages for its bands."""
     write_header(message.header, time_ns, frame_id)
     _write_values(message, EXCITATION, excitation)
     for name in EXCITATION_ARRAYS:
         fill(getattr(message, name), getattr(excitation, name))
     message.grid, message.level_v = GRIDS[excitation.grid], excitation.level_v
+    write_bands(message, make, excitation.bands)
 
 
 def record_from_message(message: Any) -> Record:
@@ -147,6 +167,12 @@ def _channel(message: Any, name: str) -> Channel:
 
 def poles_from_message(message: Any) -> tuple[Poles, Origin]:
     """Poles of a message, and what they belong to; the fitted model itself does not travel."""
+    further = tuple(_poles_of_band(band) for band in message.further)
+    return replace(_poles_of_band(message), further=further), origin_from_message(message)
+
+
+def _poles_of_band(message: Any) -> Poles:
+    """Of a message of ``Poles`` those of its first band, or of ``BandPoles``."""
     poles_rad_s = complex_of(message, "", "_rad_s")
     arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in POLES_ARRAYS}
     for name in (*POLES_DRIFTS, *POLES_COVARIANCES):
@@ -157,7 +183,7 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
     structure = ModelStructure()
     if message.order:
         structure = ModelStructure(message.order, message.numerator_order)
-    poles = Poles(
+    return Poles(
         poles_rad_s=poles_rad_s,
         residues=complex_of(message, "residue_"),
         **arrays,
@@ -167,12 +193,19 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
         band_hz=(message.band_low_hz, message.band_high_hz),
         status=key_of(POLES_STATUS, message.status, "status"),
     )
-    return poles, origin_from_message(message)
 
 
-def write_poles(message: Any, poles: Poles, origin: Origin) -> None:
-    """Fill the message of poles."""
+def write_poles(message: Any, make: Callable[[], Any], poles: Poles, origin: Origin) -> None:
+    """Fill the message of poles; `make` gives messages for those of further bands."""
     write_origin(message, origin)
+    _write_band(message, poles)
+    for each in poles.further:
+        band = make()
+        _write_band(band, each)
+        message.further.append(band)
+
+
+def _write_band(message: Any, poles: Poles) -> None:
     _write_values(message, POLES, poles)
     message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
     message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
@@ -183,6 +216,21 @@ def write_poles(message: Any, poles: Poles, origin: Origin) -> None:
     for name in (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES):
         if (known := getattr(poles, name)) is not None:
             fill(getattr(message, name), known)
+
+
+def distortion_from_message(message: Any) -> tuple[BandDistortion, ...]:
+    """Distortion in each band, of a message with the field ``distortion``."""
+    return tuple(BandDistortion(**_values(band, DISTORTION)) for band in message.distortion)
+
+
+def write_distortion(
+    message: Any, make: Callable[[], Any], distortion: Sequence[BandDistortion]
+) -> None:
+    """Fill the field ``distortion`` with messages that `make` gives."""
+    for band in distortion:
+        written = make()
+        _write_values(written, DISTORTION, band)
+        message.distortion.append(written)
 
 
 def origin_from_message(message: Any) -> Origin:

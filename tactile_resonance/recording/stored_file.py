@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -95,6 +95,11 @@ def _flatten(prefix: str, value: Any, content: Fields) -> None:
         name, item = prefix + field.name, getattr(value, field.name)
         if is_dataclass(item):
             _flatten(f"{name}.", item, content)
+        elif isinstance(item, tuple) and item and is_dataclass(item[0]):
+            for part in fields(item[0]):
+                content[f"{name}.{part.name}"] = np.array(
+                    [getattr(each, part.name) for each in item]
+                )
         elif isinstance(item, np.ndarray):
             content[name] = item
             if item.dtype.kind == "i":
@@ -104,7 +109,7 @@ def _flatten(prefix: str, value: Any, content: Fields) -> None:
                 raise ValueError(f"{name}: values of type {item.dtype}, expected int or float")
         elif isinstance(item, Enum):
             content[name] = np.array(item.value)
-        elif item is not None:  # None: no field
+        elif item is not None and item != ():  # no field of what is not there
             content[name] = np.array(item)
 
 
@@ -115,6 +120,12 @@ def _unflatten(prefix: str, kind: type, content: Mapping[str, npt.NDArray[Any]])
         name, hint = prefix + field.name, hints[field.name]
         if is_dataclass(hint):
             values[field.name] = _unflatten(f"{name}.", hint, content)  # type: ignore[arg-type]
+            continue
+        if get_args(hint) and is_dataclass(part := get_args(hint)[0]):  # a tuple of them
+            columns = [
+                content.get(f"{name}.{each.name}", np.empty(0)).tolist() for each in fields(part)
+            ]
+            values[field.name] = tuple(part(*row) for row in zip(*columns, strict=True))  # type: ignore[operator]
             continue
         array = content.get(name)
         if array is None:

@@ -12,10 +12,11 @@ msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not 
 
 from tactile_resonance.contact.force_spread import ForceSpread  # noqa: E402
 from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
-from tactile_resonance.frf.result import FRF, FrfStatus  # noqa: E402
+from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus  # noqa: E402
 from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
 from tactile_resonance.nodes import messages  # noqa: E402
 from tactile_resonance.poles.result import Poles, PolesStatus  # noqa: E402
+from tactile_resonance.poles.structure import PoleBand  # noqa: E402
 from tactile_resonance.record import (  # noqa: E402
     BetweenSamples,
     Channel,
@@ -55,6 +56,10 @@ def assert_equal(a, b):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if dataclasses.is_dataclass(x):
             assert_equal(x, y)
+        elif isinstance(x, tuple) and x and dataclasses.is_dataclass(x[0]):
+            assert len(x) == len(y)
+            for one, other in zip(x, y, strict=True):
+                assert_equal(one, other)
         elif x is None or y is None:
             assert x is y, field.name
         else:
@@ -107,9 +112,7 @@ def test_record(channel):
 
 
 def test_record_with_two_or_no_representations_is_refused():
-    message = messages.record_to_message(
-        Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4)
-    )
+    message = messages.record_to_message(Record(Channel(np.ones(4)), Channel(np.ones(4)), 1.0, 4))
     message.sensor_v = []
     with pytest.raises(ValueError, match="sensor: 0 counts and 0 voltages"):
         stored.record_from_message(message)
@@ -121,7 +124,8 @@ def complex_normal(*shape):
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_frf(complete):
-    bins = BandBins(17, complex_normal(2, 6), complex_normal(2, 6), np.arange(5, 8), 1e3, 64, 4)
+    bins = BandBins(17, complex_normal(2, 12), complex_normal(2, 12), np.arange(5, 8), 1e3, 64, 4)
+    further = BandBins(90, complex_normal(2, 5), complex_normal(2, 5), np.array([23]), 1e3, 64, 4)
     frf = FRF(
         frequency_hz=np.sort(RNG.uniform(1, 100, 30)),
         g=complex_normal(30),
@@ -132,6 +136,11 @@ def test_frf(complete):
         actuator_amplitude=RNG.uniform(size=30) if complete else None,
         sensor_variance_given_actuator=RNG.uniform(size=30) if complete else None,
         bins=bins if complete else None,
+        further_bins=(further,) if complete else (),
+        bands=(PoleBand(60.0, 110.0), PoleBand(350.0, 370.0, 0, 8)) if complete else (),
+        distortion=(BandDistortion(60.0, 110.0, even_db=-70.0, even_above_noise=True),)
+        if complete
+        else (),
         periods=4,
         realisations=2,
         method="m",
@@ -165,6 +174,8 @@ def test_poles(modes):
         status=PolesStatus.MODEL_ERROR,
         message="why",
     )
+    second = dataclasses.replace(poles, band_hz=(600.0, 800.0), status=PolesStatus.OK, message="")
+    poles = dataclasses.replace(poles, further=(second,) if modes == 3 else ())
     message = through_the_wire(messages.poles_to_message(poles, ORIGIN))
     back, origin = stored.poles_from_message(message)
     assert_equal(back, poles)

@@ -122,7 +122,7 @@ def test_a_fit_that_raises_gets_a_failure_with_its_reason(node, monkeypatch):
         raise ZeroDivisionError("division by zero")
 
     with monkeypatch.context() as patched:
-        patched.setattr("tactile_resonance.nodes.poles_node.poles_of_frf", broken)
+        patched.setattr("tactile_resonance.nodes.poles_node.poles_of_bands", broken)
         node._on_frf(good())
     node._on_frf(good())
     failed, after = node.published
