@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clock of devices, loops and waits: this machine's, or that of a simulated bench.
 
-Simulated time belongs to the bench (`simulation.plant.bench_time`) and goes on in steps. Each participant connects
-to the bench and sends the time up to which it may go on. When that time is reached the bench reports it to
-the participant and waits for its next message. So nothing that is computed comes too late, however slow the
-machine is. A participant also sends its demand, whether it needs time to pass:
+Simulated time belongs to the bench (`simulation.plant.bench_time`) and goes on in steps. Each participant
+connects to the bench and sends the time up to which it may go on. When that time is reached the bench reports
+it to the participant and waits for its next message. So nothing that is computed comes too late, however slow
+the machine is. A participant also sends its demand, whether it needs time to pass:
 
 - `Demand.NONE`: time may stand as far as this participant is concerned;
 - `Demand.REAL`: it goes on, at the pace of real time at most;
