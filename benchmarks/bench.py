@@ -191,7 +191,8 @@ def measure_accuracy(setup: Setup, settling: int) -> tuple[dict, dict, dict]:
 
     def marched(oversampling: int) -> Array:
         stream = NonlinearStream(model, setup.nonlinear, oversampling=oversampling)
-        stream.skip(strong, settling)
+        for _ in range(settling):
+            stream.play(strong)
         return stream.play(strong)
 
     records = {

@@ -161,7 +161,7 @@ class _Bench:
         from tactile_resonance.simulation.cell.load_cell import LoadCell
         from tactile_resonance.simulation.cell.tcp_bus import SocketcandServer
         from tactile_resonance.simulation.cell.transducer import CellParameters
-        from tactile_resonance.simulation.plant.tabletop import CellOnBus, attach
+        from tactile_resonance.simulation.plant.tabletop import attach, attach_cell
 
         options = self._options
         cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed + 1)
@@ -169,10 +169,9 @@ class _Bench:
             bus = SocketcandServer(robot.reactor, options.can_port, cell.receive)
         except ValueError as error:
             raise ValueError(f"can-port: {error}") from error
-        robot.time.frames_sent = bus.frames_sent
         robot.time.seeds.append(lambda seed: cell.reseed((options.seed + 1, *seed)))
-        plant, simulated = self.tabletop.plant, robot.time.simulated
-        attach(robot, self.tabletop, CellOnBus(plant, cell, bus, simulated))
+        attach(robot, self.tabletop)
+        attach_cell(robot, self.tabletop.plant, cell, bus)
 
 
 def require_loopback(host: str) -> None:

@@ -159,7 +159,7 @@ class PlantChild:
         )
         names = ("normal_force_n", "contact_radius_m", "depth_m")
         rows = zip(*(answer[name] for name in names), strict=True)
-        return [None if row[0] is None else ContactState(*row) for row in rows]
+        return [None if row[0] is None else row for row in rows]
 
     def close(self) -> None:
         """End the process."""

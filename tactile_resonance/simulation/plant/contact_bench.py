@@ -40,6 +40,12 @@ from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 PROTECTIVE_DECELERATION_M_S2 = 2.0
 """With which the robot brakes without a command (chosen)."""
+WATCHDOG_NS = 40_000_000
+"""Without a command for so long the robot stops."""
+STALE_NS = 20_000_000
+"""States older than this are refused."""
+CELL_DELAY_NS = 1_000_000
+"""From a measurement of the cell to its arrival."""
 
 
 class VirtualBench:
@@ -104,17 +110,10 @@ class VirtualArm:
     Parameters
     ----------
     bench : VirtualBench
-    watchdog_s : float
-        Without a command for so long the robot stops [s]: 25 Hz.
-    stale_s : float
-        `state` refuses states older than this [s].
     """
 
-    def __init__(
-        self, bench: VirtualBench, *, watchdog_s: float = 0.04, stale_s: float = 0.02
-    ) -> None:
+    def __init__(self, bench: VirtualBench) -> None:
         self._bench, self._motion = bench, bench.motion
-        self._watchdog_ns, self._stale_ns = round(1e9 * watchdog_s), round(1e9 * stale_s)
         self._connected = False
         self._broken: ArmFault | None = None  # what connect and all commands meet
         self._stopped: ArmFault | None = None  # why the robot does not move
@@ -140,7 +139,7 @@ class VirtualArm:
         self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
         if self._bench.time_ns >= self._frozen_until_ns:
             self._sample = self._fresh()
-        if self._bench.time_ns - self._sample.time_ns > self._stale_ns:
+        if self._bench.time_ns - self._sample.time_ns > STALE_NS:
             self._raise_if(ArmFault.STALE)
         return self._sample
 
@@ -188,7 +187,7 @@ class VirtualArm:
         alive = self._connected and self._broken is None
         if alive and bench.time_ns >= self._frozen_until_ns:
             return
-        if bench.time_ns - self._heard_ns > self._watchdog_ns and self._stopped is None:
+        if bench.time_ns - self._heard_ns > WATCHDOG_NS and self._stopped is None:
             self.halt(ArmFault.PROGRAM_STOPPED)
 
     def _heard(self) -> bool:
@@ -234,8 +233,6 @@ class VirtualCell:
     bench : VirtualBench
     parameters : CellParameters, optional
         By default those of ``config/load_cells/fine.yaml``.
-    delay_s : float
-        From a measurement to its arrival [s].
     seed : int
 
     Attributes
@@ -250,8 +247,6 @@ class VirtualCell:
         self,
         bench: VirtualBench,
         parameters: CellParameters | None = None,
-        *,
-        delay_s: float = 0.001,
         seed: int = 0,
     ) -> None:
         self.error: ForceFault | None = None
@@ -262,7 +257,6 @@ class VirtualCell:
         self._scale = np.repeat(
             [1 / self._parameters.force_divisor, 1 / self._parameters.torque_divisor], 3
         )
-        self._delay_ns = round(1e9 * delay_s)
         self._waiting: list[CellSample] = []
         self._count = 0
         bench.on_step.append(self._measure)
@@ -288,7 +282,7 @@ class VirtualCell:
     def read(self) -> list[CellSample]:
         """Wrenches that have arrived since the last call."""
         self._raise_if_broken()
-        until = self._bench.time_ns - self._delay_ns
+        until = self._bench.time_ns - CELL_DELAY_NS
         count = sum(sample.time_ns <= until for sample in self._waiting)
         arrived, self._waiting = self._waiting[:count], self._waiting[count:]
         return arrived

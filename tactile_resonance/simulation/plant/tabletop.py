@@ -134,8 +134,6 @@ class BenchSetup:
     rigid_tip : bool
         The ball on the robot itself; else at the end of the sensor's beam.
     mount : Mount
-    carried_kg : float
-        What the cell carries besides.
     """
 
     tissue: str = "gel12"
@@ -144,7 +142,6 @@ class BenchSetup:
     azimuth_rad: float = 0.0
     rigid_tip: bool = False
     mount: Mount = Mount.TABLE
-    carried_kg: float = 0.0
 
     def __post_init__(self) -> None:
         height = self.surface_height_m
@@ -213,7 +210,7 @@ class Tabletop:
             self._tissue_at,
             lambda tissue: tip.on(tissue, surface),
             tip_radius_m=tip.radius_m,
-            mounting=CellMounting(setup.mount, carried_kg=setup.carried_kg),
+            mounting=CellMounting(setup.mount),
         )
         self.plant.motion = laid.scene.motion if laid else None
 
@@ -262,50 +259,41 @@ class Tabletop:
         }
 
 
-class CellOnBus:
-    """A load cell stepped with the plant, on the bus that it sends to.
+def attach(robot: SimulatedRobot, tabletop: Tabletop) -> None:
+    """Add the orders of the table to the robot's control port, and keep its history."""
+    history = PlantHistory(tabletop.plant)
+    robot.after_step.append(history.step)
+    robot.orders.update(
+        place_surface=tabletop.place_surface,
+        move_surface=tabletop.move_surface,
+        place_tissue=tabletop.place_tissue,
+        truth=lambda fields: {**tabletop.truth(fields), "stalls": robot.time.stalls},
+        history=history.since,
+        contact_over=history.contact_over,
+    )
 
-    Parameters
-    ----------
-    plant : Plant
-    cell : LoadCell
-    bus : TcpBus
-    simulated_time : bool
-        Frames are stamped with the plant's time; else with this machine's.
+
+def attach_cell(robot: SimulatedRobot, plant: Plant, cell: LoadCell, bus: TcpBus) -> None:
+    """Step a load cell with the plant, on the bus that it sends to; its faults are orders to the control port.
+
+    On the wall clock its frames are stamped with this machine's time, else with the plant's.
     """
 
-    def __init__(self, plant: Plant, cell: LoadCell, bus: TcpBus, simulated_time: bool) -> None:
-        self._plant, self._cell, self._bus = plant, cell, bus
-        self._simulated = simulated_time
+    def step() -> None:
+        if not robot.time.simulated:
+            bus.keep_epoch(time.time(), plant.time_s)
+        force_n, torque_nm = plant.wrench_at_cell()
+        bus.send(cell.step((*force_n, *torque_nm), plant.time_s))
 
-    def step(self) -> None:
-        """Advance to the plant's time, send what is due."""
-        if not self._simulated:
-            self._bus.keep_epoch(time.time(), self._plant.time_s)
-        force_n, torque_nm = self._plant.wrench_at_cell()
-        self._bus.send(self._cell.step((*force_n, *torque_nm), self._plant.time_s))
-
-    def inject(self, fields: dict) -> dict:
-        """Control port: fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
+    def inject(fields: dict) -> dict:
+        """Fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
         fault = fields.get("fault")
         if fault == "server_gone":
-            self._bus.drop_clients()
+            bus.drop_clients()
         else:
-            self._cell.faults.inject(str(fault), number(fields.get("value"), "value"))
+            cell.faults.inject(str(fault), number(fields.get("value"), "value"))
         return {}
 
-
-def attach(robot: SimulatedRobot, tabletop: Tabletop, cell: CellOnBus | None = None) -> None:
-    """Add the commands of table and cell to the robot's control port, and the cell to its clock."""
-    commands = robot.orders
-    commands["place_surface"] = tabletop.place_surface
-    commands["move_surface"] = tabletop.move_surface
-    commands["place_tissue"] = tabletop.place_tissue
-    commands["truth"] = lambda fields: {**tabletop.truth(fields), "stalls": robot.time.stalls}
-    history = PlantHistory(tabletop.plant)
-    commands["history"] = history.since
-    commands["contact_over"] = history.contact_over
-    robot.after_step.append(history.step)
-    if cell is not None:
-        commands["cell_fault"] = cell.inject
-        robot.after_step.append(cell.step)
+    robot.after_step.append(step)
+    robot.orders["cell_fault"] = inject
+    robot.time.frames_sent = bus.frames_sent

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_resonance.fields import require
+from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects, SignalParts, convert
@@ -19,7 +20,6 @@ from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.sensor.linear import (
     FloatArray,
     Lines,
-    PeriodicExcitation,
     PoleResidueModel,
 )
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
@@ -130,7 +130,7 @@ class BenchRun:
         """
         return self.coupled if self._coupled_at is None else self._coupled_at(time_s)
 
-    def effort(self, excitation: PeriodicExcitation | Lines) -> Effort:
+    def effort(self, excitation: Excitation | Lines) -> Effort:
         """Return what an excitation from rest takes; computed without playing it."""
         lines, model = Lines.of(excitation), self.coupled.modal
         size = model.weights * np.abs(steady_state(model, lines))  # (K,)
@@ -148,7 +148,7 @@ class BenchRun:
             omitted_v=float(np.minimum(size, floor).sum()),
         )
 
-    def block(self, excitation: PeriodicExcitation | Lines, periods: int = 1) -> Record:
+    def block(self, excitation: Excitation | Lines, periods: int = 1) -> Record:
         """Return the next periods of an excitation as one block; its origin's time counts from the start."""
         require(periods >= 1, "periods", periods, "1 or above")
         lines = self._take_up(excitation)
@@ -171,7 +171,7 @@ class BenchRun:
 
     def play(
         self,
-        excitation: PeriodicExcitation | Lines,
+        excitation: Excitation | Lines,
         periods: int,
         *,
         periods_per_block: int = 1,
@@ -184,22 +184,7 @@ class BenchRun:
         for _ in range(periods // periods_per_block):
             yield self.block(lines, periods_per_block)
 
-    def skip(self, excitation: PeriodicExcitation | Lines, periods: int) -> None:
-        """Let periods pass unrecorded, at little cost; what follows is as if they had been."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        if periods == 0:
-            return
-        lines = self._take_up(excitation)
-        for stream in self._streams():
-            stream.skip(lines, periods)
-        self._index += periods
-        self._samples += periods * lines.samples_per_period
-
-    def _streams(self) -> list[Stream]:
-        linear = [] if self._linear is None else [self._linear]
-        return [self._drive, self._sensor, *linear]
-
-    def _take_up(self, excitation: PeriodicExcitation | Lines) -> Lines:
+    def _take_up(self, excitation: Excitation | Lines) -> Lines:
         lines = Lines.of(excitation)
         if self._lines is None or not lines.same_signal(self._lines):
             self._lines = lines

@@ -268,19 +268,8 @@ LEAST_RADIUS_M = 1e-6
 """A contact that is lost stays one of this radius: its stiffness is below a hundredth of that at 1 cN."""
 
 
-@dataclass(frozen=True)
-class ContactState:
-    """Mean state of a contact over a part of time.
-
-    Attributes
-    ----------
-    force_n, contact_radius_m, depth_m : float
-        Along the normal; 0 out of contact.
-    """
-
-    force_n: float
-    contact_radius_m: float
-    depth_m: float
+ContactState = tuple[float, float, float]
+"""Mean force [N], contact radius and depth [m] along the normal over a part of time; 0 out of contact."""
 
 
 class ContactSoFar:
@@ -323,12 +312,9 @@ class ContactSoFar:
         return self.parts[min(bisect_right(self._ends_s, time_s), len(self.parts) - 1)]
 
     def _coupled(self, state: ContactState) -> CoupledBimorph:
-        tip = replace(
-            self._tip,
-            force_n=state.force_n,
-            contact_radius_m=max(state.contact_radius_m, LEAST_RADIUS_M),
-            depth_m=state.depth_m,
-        )
+        force_n, radius_m, depth_m = state
+        radius_m = max(radius_m, LEAST_RADIUS_M)
+        tip = replace(self._tip, force_n=force_n, contact_radius_m=radius_m, depth_m=depth_m)
         return tip.coupled(self._bench)
 
 

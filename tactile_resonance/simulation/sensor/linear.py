@@ -9,13 +9,13 @@ floating point at this order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_resonance.fields import require
+from tactile_resonance.multisine import Excitation
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -65,25 +65,6 @@ class PoleResidueModel:
         return 1 / (s - self.poles_rad_s), 1 / (s - np.conj(self.poles_rad_s))
 
 
-class PeriodicExcitation(Protocol):
-    """What the simulation needs to know of an excitation.
-
-    ``u(t) = sum_k amplitude_v[k] cos(2 pi f_k t + phase_rad[k])`` with
-    ``f_k = harmonics[k] sample_rate_hz / samples_per_period``; amplitudes are peak values.
-    """
-
-    @property
-    def harmonics(self) -> ArrayLike: ...  # noqa: D102
-    @property
-    def amplitude_v(self) -> ArrayLike: ...  # noqa: D102
-    @property
-    def phase_rad(self) -> ArrayLike: ...  # noqa: D102
-    @property
-    def sample_rate_hz(self) -> float: ...  # noqa: D102
-    @property
-    def samples_per_period(self) -> int: ...  # noqa: D102
-
-
 @dataclass(frozen=True, eq=False)
 class Lines:
     """A checked excitation: harmonics (F,), complex peak amplitudes (F,) [V], and the sampling.
@@ -112,7 +93,7 @@ class Lines:
         require(good, "amplitude_v, phase_rad", phasor, accepted)
 
     @classmethod
-    def of(cls, excitation: PeriodicExcitation | Lines) -> Lines:
+    def of(cls, excitation: Excitation | Lines) -> Lines:
         """Check an excitation and convert it; raises ``ValueError`` naming the field at fault."""
         if isinstance(excitation, Lines):
             return excitation

@@ -274,12 +274,6 @@ class NonlinearStream:
         strain = self._march(driven, lines.sample_rate_hz * self._oversampling, lines)
         return strain[:: self._oversampling] + through
 
-    def skip(self, lines: Lines, periods: int) -> None:
-        """Advance whole periods; a nonlinear response has to be computed all the same."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        for _ in range(periods):
-            self.play(lines)
-
     def _march(self, driven: FloatArray, rate_hz: float, lines: Lines) -> FloatArray:
         """Add the feedback of the strain term to the driven strain, window by window."""
         strain = np.empty_like(driven)

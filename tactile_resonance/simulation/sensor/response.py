@@ -277,9 +277,3 @@ class VaryingStream:
             parts.append(self._stream.play(lines, int(end - begin)))
         self._time = start + samples / rate_hz
         return np.concatenate(parts)
-
-    def skip(self, lines: Lines, periods: int) -> None:
-        """Advance whole periods."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        for _ in range(periods):
-            self.play(lines)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import check_above_zero, check_within, require
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -108,13 +108,8 @@ class HertzParameters:
     radiation_reference_hz: float
 
     def __post_init__(self) -> None:
-        require(0 < self.force_n < np.inf, "force_n", self.force_n, "a number above 0")
-        nu = self.poisson_ratio
-        require(0 <= nu <= 0.5, "poisson_ratio", nu, "0 to 0.5")
-        rho, reference = self.density_kg_per_m3, self.radiation_reference_hz
-        require(0 < rho < np.inf, "density_kg_per_m3", rho, "a number above 0")
-        good = 0 < reference < np.inf
-        require(good, "radiation_reference_hz", reference, "a number above 0")
+        check_above_zero(self, "force_n", "density_kg_per_m3", "radiation_reference_hz")
+        check_within(self, poisson_ratio=(0, 0.5))
 
 
 @dataclass(frozen=True)

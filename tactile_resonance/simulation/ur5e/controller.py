@@ -101,7 +101,9 @@ class UrController:
         seed: Seed = 0,
     ) -> None:
         self.config = config or ControllerConfig()
-        self.machine: Machine = Machine(self.config.machine, environment, np.random.default_rng(seed))
+        self.machine: Machine = Machine(
+            self.config.machine, environment, np.random.default_rng(seed)
+        )
         self.safety: Safety = Safety(self.config.switching_s)
         self.registers: Registers = Registers()
         self.ports: Ports = Ports()

@@ -15,14 +15,6 @@ REGISTER_COUNT = 48
 LARGEST_FIGURE = 1e6
 
 
-def _zeros() -> list[int]:
-    return [0] * REGISTER_COUNT
-
-
-def _float_zeros() -> list[float]:
-    return [0.0] * REGISTER_COUNT
-
-
 @dataclass
 class Registers:
     """Registers of a controller.
@@ -37,10 +29,10 @@ class Registers:
         Names of inputs written since the last cycle, with whatever value: what a watchdog watches.
     """
 
-    input_int: list[int] = field(default_factory=_zeros)
-    input_double: list[float] = field(default_factory=_float_zeros)
-    output_int: list[int] = field(default_factory=_zeros)
-    output_double: list[float] = field(default_factory=_float_zeros)
+    input_int: list[int] = field(default_factory=lambda: [0] * REGISTER_COUNT)
+    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTER_COUNT)
+    output_int: list[int] = field(default_factory=lambda: [0] * REGISTER_COUNT)
+    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTER_COUNT)
     refreshed: set[str] = field(default_factory=set)
 
 

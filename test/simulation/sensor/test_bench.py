@@ -48,12 +48,6 @@ def test_same_seed_same_samples_however_divided(bench, gel, multisine, nonlinear
     found = volts([*pieces.play(one, 2), *pieces.play(one, 2, periods_per_block=2)]
                   + [pieces.block(two), pieces.block(two)])  # fmt: skip
     np.testing.assert_array_equal(found, expected)
-    jumped = bench.start(gel, seed=5, effects=effects)
-    jumped.skip(one, 3)
-    block = jumped.block(multisine(1))
-    assert (block.realisation, block.block_index) == (0, 3)
-    assert block.origin.time_ns == 300_000_000
-    np.testing.assert_array_equal(block.sensor.volts(), expected[1][15_000:20_000])
     other = bench.start(gel, seed=6, effects=effects).block(one)
     assert not np.array_equal(other.sensor.volts(), expected[1][:5000])
 
@@ -200,7 +194,7 @@ def test_skew_delays_the_nonlinear_response_alike(bench, gel, multisine):
 def test_hum_offset_and_drift_are_as_stated(bench, gel, multisine):
     effects = replace(IDEAL, hum_v=0.2, offset_v=0.5, drift_v_per_s=0.25)
     run = bench.start(gel, effects=effects, keep_parts=True)
-    run.skip(multisine(1), 3)
+    run.block(multisine(1), 3)
     run.block(multisine(1), 2)  # 0.3 s to 0.5 s
     time = 0.3 + np.arange(10_000) / 50e3
     expected = 0.5 + 0.25 * time
@@ -273,5 +267,5 @@ def test_what_is_left_out_is_said_and_smaller_than_a_count(bench, gel, multisine
     wide = multisine(1)
     settled = int(np.ceil(run.effort(wide).settled_s / 0.1))
     late = bench.start(gel, effects=replace(IDEAL, quantisation=True))
-    late.skip(wide, settled)
+    late.block(wide, settled)
     np.testing.assert_array_equal(late.block(wide).sensor.volts(), late.block(wide).sensor.volts())

@@ -7,7 +7,6 @@ import pytest
 from tactile_resonance.simulation.sensor.changing_contact import (
     BenchTip,
     ContactSoFar,
-    ContactState,
     parts_of,
 )
 from tactile_resonance.simulation.sensor.response import INTERVAL_S
@@ -19,7 +18,7 @@ def near_250(coupled):
 
 def state_under(bench, tissue, force_n):
     contact = bench.coupled(tissue, force_n=force_n).contact
-    return ContactState(force_n, contact.contact_radius_m, contact.indentation_m)
+    return force_n, contact.contact_radius_m, contact.indentation_m
 
 
 def test_poles_follow_the_force_part_by_part(bench, library):
@@ -41,7 +40,7 @@ def test_poles_follow_the_force_part_by_part(bench, library):
 def test_a_plant_that_stands_still_keeps_its_contact_and_a_lost_one_is_nearly_air(bench, library):
     gel = library["gel10"]
     so_far = ContactSoFar(bench, BenchTip(gel, 0.01, 1.0))
-    so_far.extend(0.08, [None, ContactState(0.0, 0.0, 0.0)])
+    so_far.extend(0.08, [None, (0.0, 0.0, 0.0)])
     assert near_250(so_far.coupled_at(0.01)) == near_250(bench.coupled(gel, force_n=0.01))
     air, held = near_250(bench.coupled(None)), near_250(bench.coupled(gel))
     assert abs(near_250(so_far.coupled_at(0.06)) - air) < 0.02 * (held - air)
@@ -58,7 +57,7 @@ def test_a_run_on_it_is_that_of_each_contact(bench, library, multisine):
     period_s = excitation.samples_per_period / excitation.sample_rate_hz
     expected = list(still.play(excitation, 2))
     found = following.play(excitation, 2)
-    so_far.extend(period_s, [ContactState(0.01, start.contact_radius_m, start.indentation_m)] * 3)
+    so_far.extend(period_s, [(0.01, start.contact_radius_m, start.indentation_m)] * 3)
     one_count_v = expected[0].sensor.scale_v  # where rounding decides
     first = next(found).sensor.volts()
     np.testing.assert_allclose(first, expected[0].sensor.volts(), rtol=0, atol=1.01 * one_count_v)
