@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import re
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterable
+from typing import ClassVar
 
 from tactile_resonance.simulation.cell.load_cell import CanFrame
 from tactile_resonance.simulation.plant.bench_time import STALL_S
@@ -42,13 +43,18 @@ class BusClient(MessageService):
         self.listens_from_s: float | None = None
         self.frames = 0
 
+    @staticmethod
+    @abstractmethod
+    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
+        """A frame of the bus as it is sent; `epoch_s` [s] is the time at time 0 of frames."""
+
     def closed(self) -> None:
         """It has gone."""
         self._bus.clients.discard(self)
 
 
-class TcpBus(ABC):
-    """One bus, any number of clients.
+class TcpBus:
+    """One bus, any number of clients, served by `CLIENT`.
 
     Parameters
     ----------
@@ -73,19 +79,13 @@ class TcpBus(ABC):
         Where the port cannot be had.
     """
 
+    CLIENT: ClassVar[type[BusClient]]
+
     def __init__(self, reactor: Reactor, port: int, receiver: Receiver) -> None:
         self.epoch_s = 0.0
         self.clients: set[BusClient] = set()
         self._receiver = receiver
         self.port = reactor.listen(port, self._serve, freezable=False, most_unsent=LONGEST_QUEUE)
-
-    @abstractmethod
-    def client(self, connection: Connection) -> BusClient:
-        """Serve a new connection."""
-
-    @abstractmethod
-    def text_of(self, frame: CanFrame) -> bytes:
-        """A frame of the bus as clients read it."""
 
     def take(self, can_id: int, data: bytes) -> None:
         """Hand a client's frame to the cell, and its answer to all."""
@@ -99,7 +99,8 @@ class TcpBus(ABC):
             for client in self.clients
             if client.listens_from_s is not None and client.listens_from_s <= now_s
         ]
-        texts = [self.text_of(frame) for frame in frames] if listening else []
+        text_of = self.CLIENT.text_of
+        texts = [text_of(frame, self.epoch_s) for frame in frames] if listening else []
         if not texts:
             return
         text = b"".join(texts)
@@ -123,11 +124,13 @@ class TcpBus(ABC):
             client.connection.close()
 
     def _serve(self, connection: Connection) -> BusClient:
-        client = self.client(connection)
+        client = self.CLIENT(self, connection)
         self.clients.add(client)
         return client
 
 
+CHANNEL = "can0"
+"""Of a socketcand server."""
 MOST_EXTENDED = 0x1FFFFFFF
 """Largest identifier of 29 bits."""
 _HEXADECIMAL = re.compile("[0-9A-Fa-f]{1,8}")
@@ -135,32 +138,18 @@ QUIET_S = 0.05
 """Clients read their last `ok` in one piece: no frame follows it for this long, or until they speak."""
 
 
-class SocketcandServer(TcpBus):
-    """The bus `channel`; see `TcpBus`."""
-
-    def __init__(
-        self, reactor: Reactor, port: int, receiver: Receiver, channel: str = "can0"
-    ) -> None:
-        super().__init__(reactor, port, receiver)
-        self.channel = channel
-
-    def client(self, connection: Connection) -> BusClient:
-        """Serve a new connection."""
-        return _SocketcandClient(self, connection)
-
-    def text_of(self, frame: CanFrame) -> bytes:
-        """A frame of the bus as clients read it."""
-        stamp = self.epoch_s + frame.time_s
-        return b"< frame %03X %.6f %s >" % (frame.can_id, stamp, frame.data.hex().upper().encode())
-
-
 class _SocketcandClient(BusClient):
     END = b">"
 
-    def __init__(self, bus: SocketcandServer, connection: Connection) -> None:
+    def __init__(self, bus: TcpBus, connection: Connection) -> None:
         super().__init__(bus, connection)
-        self._server = bus
         self.connection.send(b"< hi >")
+
+    @staticmethod
+    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
+        """As it is sent, with its time."""
+        text = frame.data.hex().upper().encode()
+        return b"< frame %03X %.6f %s >" % (frame.can_id, epoch_s + frame.time_s, text)
 
     def understand(self, message: bytes) -> None:
         """Execute one message."""
@@ -173,8 +162,8 @@ class _SocketcandClient(BusClient):
                 self.connection.send(b"< error syntax of send >")
                 return
             self.listens_from_s = time.monotonic()
-            self._server.take(*frame)
-        elif words[0] == "open" and words[1:] != [self._server.channel]:
+            self._bus.take(*frame)
+        elif words[0] == "open" and words[1:] != [CHANNEL]:
             self.connection.send(b"< error could not open bus >")
         elif words[0] in ("open", "rawmode"):
             self.connection.send(b"< ok >")
@@ -196,24 +185,23 @@ def _socketcand_frame(words: list[str]) -> tuple[int, bytes] | None:
     return can_id, bytes(data)
 
 
+class SocketcandServer(TcpBus):
+    """The bus `CHANNEL`; see `TcpBus`."""
+
+    CLIENT = _SocketcandClient
+
+
 OK, FAILED = b"\r", b"\a"
 _FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
-class SlcanServer(TcpBus):
-    """See `TcpBus`. Frames carry no time stamps."""
-
-    def client(self, connection: Connection) -> BusClient:
-        """Serve a new connection."""
-        return _SlcanClient(self, connection)
-
-    def text_of(self, frame: CanFrame) -> bytes:
-        """A frame of the bus as clients read it."""
-        return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
-
-
 class _SlcanClient(BusClient):
     END = b"\r"
+
+    @staticmethod
+    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
+        """As it is sent, without a time."""
+        return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
 
     def understand(self, message: bytes) -> None:
         """Execute one line."""
@@ -247,3 +235,9 @@ def _slcan_frame(line: str) -> tuple[int, bytes] | None:
         return None
     data = bytes.fromhex(found[3])
     return (int(found[1], 16), data) if len(data) == int(found[2]) else None
+
+
+class SlcanServer(TcpBus):
+    """See `TcpBus`. Frames carry no time stamps."""
+
+    CLIENT = _SlcanClient
