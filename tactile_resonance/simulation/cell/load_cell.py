@@ -111,21 +111,24 @@ class LoadCell:
         if self._time_s is None:
             self._time_s, self._wrench = time_s, load
         span = time_s - self._time_s
+        steady = load == self._wrench
         change = list(map(sub, load, self._wrench))
         frames: list[CanFrame] = []
         period = SAMPLE_PERIOD_S
-        start_s = self._time_s
+        start_s, now = self._time_s, load
         while self._time_s + period <= time_s + 1e-9:
             self._time_s += period
-            part = (self._time_s - start_s) / span
-            now = [old + part * way for old, way in zip(self._wrench, change, strict=True)]
+            if not steady:
+                part = (self._time_s - start_s) / span
+                now = [old + part * way for old, way in zip(self._wrench, change, strict=True)]
             self._counts, self._bits = self._transducer.convert(now)
             self._ticks += 1
             if self.streaming and self._ticks % self._decimation == 0:
                 frames += self._wrench_frames(START, self._time_s)
         # what is left of the span counts for the next call
-        left = (time_s - self._time_s) / span if span > 0 else 0.0
-        self._wrench = [new - left * way for new, way in zip(load, change, strict=True)]
+        if not steady:
+            left = (time_s - self._time_s) / span if span > 0 else 0.0
+            self._wrench = [new - left * way for new, way in zip(load, change, strict=True)]
         return frames
 
     def receive(self, can_id: int, data: bytes) -> list[CanFrame]:

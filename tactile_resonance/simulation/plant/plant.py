@@ -192,7 +192,7 @@ class Plant:
             height -= self.motion.displacement_m(self.time_s)
         depth = self.tip_radius_m - height
         pushed = held = 0.0
-        self._find_tissue(place, height, normal, math.hypot(*_along(way, normal)))
+        self._find_tissue(place, height, normal, way)
         if self._on is not None:
             held = self._on.step(depth, dt_s)
             pushed = self._on.indenter.force_n
@@ -206,13 +206,16 @@ class Plant:
         self.in_contact = touching
         self.contact_s = self.contact_s + dt_s if touching else 0.0
         self.tip_m, self.normal_force_n = place, pushed
-        x, y, z = self._friction(way, normal, pushed)
-        nx, ny, nz = normal
-        self.force_n = (pushed * nx + x, pushed * ny + y, pushed * nz + z)
-        self._held_n = (held * nx + x, held * ny + y, held * nz + z)
-        # the ball is touched at its lowest point
-        radius = -self.tip_radius_m
-        self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
+        if held == 0.0 == pushed:
+            self.force_n = self._held_n = self.torque_nm = self._slip = ORIGIN
+        else:
+            x, y, z = self._friction(way, normal, pushed)
+            nx, ny, nz = normal
+            self.force_n = (pushed * nx + x, pushed * ny + y, pushed * nz + z)
+            self._held_n = (held * nx + x, held * ny + y, held * nz + z)
+            # the ball is touched at its lowest point
+            radius = -self.tip_radius_m
+            self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
         if self.mounting.mount is Mount.TOOL:
             self._places = [*self._places[-2:], self._on_tip(self._carried_m)]
 
@@ -245,7 +248,7 @@ class Plant:
             rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
         )
 
-    def _find_tissue(self, place: Vector, height: float, normal: Vector, moved_m: float) -> None:
+    def _find_tissue(self, place: Vector, height: float, normal: Vector, way: Vector) -> None:
         """Tissue remembers a touch at the same place; elsewhere it is fresh, and what lies exactly there."""
         if self.in_contact or height > self.tip_radius_m + NEAR_M:
             return
@@ -254,6 +257,7 @@ class Plant:
             if self._site_touched:
                 known = away_m < SAME_PLACE * self.tip_radius_m
             else:  # it is not asked for all along the way: that may take longer than a step
+                moved_m = math.hypot(*_along(way, normal))
                 known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip_radius_m)
             if known:
                 return

@@ -35,7 +35,7 @@ class Posture:
         Tool flange in the base.
     """
 
-    __slots__ = ("_carried", "_numbers", "_tool", "flange", "q")
+    __slots__ = ("_numbers", "_tools", "flange", "q")
 
     def __init__(self, q: Six) -> None:
         self.q = q
@@ -65,13 +65,14 @@ class Posture:
             (wx + D6 * z5x, wy + D6 * z5y, wz + D6 * z5z),
         )  # fmt: skip
         self._numbers = s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4
-        self._carried, self._tool = IDENTITY, self.flange
+        self._tools: dict[Transform, Transform] = {IDENTITY: self.flange}
 
     def tool(self, tcp: Transform) -> Transform:
-        """Return a frame that the flange carries, in the base; computed anew for another frame only."""
-        if tcp != self._carried:
-            self._carried, self._tool = tcp, product(self.flange, tcp)
-        return self._tool
+        """Return a frame that the flange carries, in the base; each is computed once."""
+        tool = self._tools.get(tcp)
+        if tool is None:
+            tool = self._tools[tcp] = product(self.flange, tcp)
+        return tool
 
     def twist(self, point_m: Vector, qd: Six) -> Six:
         """Return the velocity [m/s] of a point that the flange carries and its angular velocity [rad/s].

@@ -343,6 +343,8 @@ class Machine:
         turn, (x, y, z) = self.posture.tool(self._tip)
         dx, dy, dz = self.joints.tremble_m
         environment.step((turn, (x + dx, y + dy, z + dz)), CYCLE_S)
+        if environment.force_n == ORIGIN == environment.torque_nm:
+            return ZERO
         flange = self.posture.flange[0]
         force = rotated_back(flange, environment.force_n)
         tx, ty, tz = rotated_back(flange, environment.torque_nm)
