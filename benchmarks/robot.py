@@ -22,7 +22,7 @@ from benchmarks.simulated_robot import simulated_robot
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.simulation.plant.control_port import order
+from tactile_resonance.simulation.plant.simulated_robot import order
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 FloatArray = NDArray[np.float64]

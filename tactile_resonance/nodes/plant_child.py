@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.processes import end_with_parent, may_take_priority
-from tactile_resonance.simulation.plant.control_port import order
 from tactile_resonance.simulation.plant.defaults import PRIORITY, READY
+from tactile_resonance.simulation.plant.simulated_robot import order
 from tactile_resonance.simulation.sensor.changing_contact import ContactState
 
 START_WITHIN_S = 90.0

@@ -3,7 +3,7 @@
 
 `sensor/`: `bench` (blocks of samples), `bimorph` and `beam` (poles, zeros and response of the coupled sensor),
 `response` and `nonlinear` (its time domain), `changing_contact`.
-`tissue/`: `scene` (what lies where), `library`, `materials`, `shapes`, `hertz` (the contact that a small
+`tissue/`: `scene` (what lies where), `library`, `shapes`, `hertz` (the contact that a small
 vibration sees), `indenter` (force against depth through time).
 `ur5e/`: the robot and its controller, which know nothing of the rest; `cell/`: the load cell and its buses.
 `plant/`: tip, tissue and cell on one clock; `contact_bench` moves them in virtual time, `tabletop` and

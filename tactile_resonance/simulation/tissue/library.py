@@ -1,18 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The library of tissues, read from ``config/tissues.yaml``; gelatine at any concentration."""
+"""Tissues by name, read from ``config/tissues.yaml``, and what regions are filled with.
+
+That is one tissue, gelatine of any concentration, a gradient between two, random heterogeneity.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import build, read_file, require
+from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.fields import (
+    build,
+    check_above_zero,
+    check_not_negative,
+    check_within,
+    read_file,
+    require,
+)
+from tactile_resonance.simulation.sensor.linear import FloatArray
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue
+from tactile_resonance.simulation.tissue.shapes import Point
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values
 
@@ -119,3 +135,216 @@ class _LibraryFile:
     contact: HertzParameters
     prony: _Prony
     tissues: Mapping[str, _TissueFields]
+
+
+WAVES = 512  # of a random field: kurtosis within 0.6 % of the Gaussian one
+
+
+class Material(Protocol):
+    """A filling of space."""
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue:
+        """Return the tissue at one position (3,) [m]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """The same tissue everywhere."""
+
+    tissue: Tissue
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue:
+        """Return the tissue."""
+        return self.tissue
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A tissue that changes along the way from one point to another, constant beyond both.
+
+    Attributes
+    ----------
+    start_m, end_m : tuple of 3 floats
+    tissue_between : callable
+        Tissue at a share of the way, 0 (start) to 1 (end).
+    """
+
+    start_m: Point
+    end_m: Point
+    tissue_between: Callable[[float], Tissue]
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue:
+        """Return the tissue at the foot of the perpendicular on the way."""
+        start = np.asarray(self.start_m)
+        way = np.asarray(self.end_m) - start
+        share = float((position_m - start) @ way / (way @ way))
+        return self.tissue_between(min(1.0, max(0.0, share)))
+
+
+@dataclass(frozen=True)
+class RandomField:
+    """A Gaussian random field of unit variance, correlation ``exp(-r^2 / (2 l^2))``.
+
+    A sum of plane waves with Gaussian wave vectors (spectral representation: Shinozuka & Deodatis,
+    Appl. Mech. Rev. 44 (1991)), so that its value at a place depends on the seed and the place
+    alone, in whatever order places are asked for.
+
+    Attributes
+    ----------
+    correlation_length_m : float
+        l: distance at which the correlation is 0.61.
+    seed : int
+    """
+
+    correlation_length_m: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "correlation_length_m")
+        check_not_negative(self, "seed")
+
+    @cached_property
+    def _waves(self) -> tuple[FloatArray, FloatArray]:
+        """Wave vectors (3, waves) [rad/m] and phases (waves,)."""
+        rng = np.random.default_rng(self.seed)
+        vectors = rng.standard_normal((3, WAVES)) / self.correlation_length_m
+        return vectors, rng.uniform(0, 2 * np.pi, WAVES)
+
+    def value(self, position_m: ArrayLike) -> FloatArray:
+        """Return the field at positions (..., 3) [m], shape (...)."""
+        vectors, phases = self._waves
+        wave = np.cos(np.asarray(position_m, dtype=float) @ vectors + phases)  # (..., waves)
+        return np.asarray(np.sqrt(2 / WAVES) * wave.sum(axis=-1))
+
+
+@dataclass(frozen=True)
+class Heterogeneous:
+    """A material whose modulus varies at random: log-normal with mean 1, ratios unchanged.
+
+    Attributes
+    ----------
+    material : Material
+    field : RandomField
+    modulus_spread : float
+        Standard deviation of ln E.
+    """
+
+    material: Material
+    field: RandomField
+    modulus_spread: float
+
+    def __post_init__(self) -> None:
+        check_within(self, modulus_spread=(0, 1))
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue:
+        """Return the tissue there, its modulus times the local factor."""
+        tissue = self.material.tissue_at(position_m)
+        spread = self.modulus_spread
+        factor = float(np.exp(spread * self.field.value(position_m) - spread**2 / 2))
+        return replace(
+            tissue,
+            relaxation_modulus_1s_pa=tissue.relaxation_modulus_1s_pa * factor,
+            gelatine_percent=None,
+        )
+
+
+def mixture(first: Tissue, second: Tissue, share: float, modulus_1s_pa: float) -> Tissue:
+    """Return a tissue of a given E(1 s) whose Prony ratios lie at `share` between two tissues.
+
+    Ratios in between leave Einf above 0 where those of both do, so a mixture is passive.
+
+    Raises
+    ------
+    ValueError
+        If the tissues differ in their Prony times.
+    """
+    times = first.prony_times_s
+    require(second.prony_times_s == times, "prony_times_s", second.prony_times_s, f"{times}")
+    if share in (0, 1):
+        return (first, second)[int(share)]
+    pairs = zip(first.prony_ratios, second.prony_ratios, strict=True)
+    return Tissue(
+        name=f"{first.name}_{second.name}",
+        relaxation_modulus_1s_pa=modulus_1s_pa,
+        prony_times_s=times,
+        prony_ratios=tuple((1 - share) * a + share * b for a, b in pairs),
+        label=f"{first.label or first.name}, {100 * share:.1f} % {second.label or second.name}",
+    )
+
+
+def geometric_mixture(first: Tissue, second: Tissue, share: float) -> Tissue:
+    """Return a mixture whose E(1 s) is the weighted geometric mean (a choice: no law is known)."""
+    low, high = first.relaxation_modulus_1s_pa, second.relaxation_modulus_1s_pa
+    return mixture(first, second, share, low ** (1 - share) * high**share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TissueEntry:
+    """Part of a file: a tissue by its name, or gelatine by its concentration [% w/w]."""
+
+    tissue: str | None = None
+    gelatine_percent: float | None = None
+
+    def tissue_of(self, library: TissueLibrary) -> Tissue:
+        """Return it; ``ValueError`` where neither or both are given, or the library has none such."""
+        name, percent = self.tissue, self.gelatine_percent
+        one = (name is None) != (percent is None)
+        require(one, "tissue", name, "exactly one of tissue, gelatine_percent")
+        return library.gelatine(percent) if percent is not None else library[str(name)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientEntry:
+    """Part of a file: two tissues, and where they are."""
+
+    from_: TissueEntry
+    to: TissueEntry
+    start_m: Vector
+    end_m: Vector
+
+    def __post_init__(self) -> None:
+        apart = self.start_m != self.end_m
+        require(apart, "end_m", self.end_m, "a point other than start_m")
+
+    def gradient_of(self, library: TissueLibrary) -> Gradient:
+        """Return what lies there: gelatine between two of gelatine, else a mixture."""
+        first = build(self.from_.tissue_of, "from", library)
+        second = build(self.to.tissue_of, "to", library)
+        low, high = first.gelatine_percent, second.gelatine_percent
+
+        def between(share: float) -> Tissue:
+            if low is None or high is None:
+                return geometric_mixture(first, second, share)
+            return library.gelatine(low + share * (high - low))
+
+        return Gradient(self.start_m, self.end_m, between)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeterogeneityEntry(RandomField):
+    """Part of a file: a random field, and how far the modulus follows it; see `Heterogeneous`."""
+
+    modulus_spread: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FillingEntry(TissueEntry):
+    """Part of a file: what a region is filled with."""
+
+    gradient: GradientEntry | None = None
+    heterogeneity: HeterogeneityEntry | None = None
+
+    def material_of(self, library: TissueLibrary) -> Material:
+        """Return it; ``ValueError`` as `TissueEntry.tissue_of`."""
+        material: Material
+        if self.gradient is None:
+            material = Uniform(self.tissue_of(library))
+        else:
+            given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
+            require(not given, "gradient", given, "no tissue beside a gradient")
+            material = build(self.gradient.gradient_of, "gradient", library)
+        field = self.heterogeneity
+        if field is None:
+            return material
+        return build(Heterogeneous, "heterogeneity", material, field, field.modulus_spread)

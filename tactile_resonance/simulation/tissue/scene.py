@@ -15,11 +15,11 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.sensor.linear import FloatArray
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.library import TissueLibrary
-from tactile_resonance.simulation.tissue.materials import (
+from tactile_resonance.simulation.tissue.library import (
     FillingEntry,
     Material,
     TissueEntry,
+    TissueLibrary,
     mixture,
 )
 from tactile_resonance.simulation.tissue.shapes import Shape, ShapeEntry, energy_share

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
-from tactile_resonance.simulation.ur5e.compliance import ForceTask
-from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
+from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.machine import ExternalSensor, Machine
 from tactile_resonance.simulation.ur5e.poses import (

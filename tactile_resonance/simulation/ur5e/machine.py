@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, cross, dot, rotated_back
 from tactile_resonance.simulation.noise import Seed
-from tactile_resonance.simulation.ur5e.compliance import ForceMode
-from tactile_resonance.simulation.ur5e.ft_sensor import (
+from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
+    ForceMode,
     FtSensor,
     FtSpecification,
     ToolPayload,

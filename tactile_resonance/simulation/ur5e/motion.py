@@ -9,7 +9,7 @@ model's choice is stated at the function. Moves from rest to rest have a trapezo
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from tactile_resonance.contact.vectors import transposed, turn_product
@@ -166,13 +166,7 @@ def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0)
     fast = math.hypot(*twist[:3]) / target.limits.tool_speed_m_s
     share = target.pace / max(1.0, fast)
     goal = tuple([value * share for value in twist])
-    time = 0.0
-    while True:
-        reached = _step_twist(target, goal, acceleration)
-        time += CYCLE_S
-        yield
-        if (time > time_s - CYCLE_S / 2) if time_s > 0.0 else reached:
-            return
+    yield from _repeated(lambda: _step_twist(target, goal, acceleration), time_s)
 
 
 def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0) -> Motion:
@@ -183,9 +177,14 @@ def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0
     _require_positive("speedj", "acceleration", acceleration)
     share = target.pace / max(1.0, largest(speeds) / target.limits.joint_speed_rad_s)
     goal = tuple([value * share for value in speeds])
+    yield from _repeated(lambda: _step_joints(target, goal, acceleration), time_s)
+
+
+def _repeated(step: Callable[[], bool], time_s: float) -> Motion:
+    """Step for a time or, where that is 0, until a step says that the speed is reached."""
     time = 0.0
     while True:
-        reached = _step_joints(target, goal, acceleration)
+        reached = step()
         time += CYCLE_S
         yield
         if (time > time_s - CYCLE_S / 2) if time_s > 0.0 else reached:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance.contact.vectors import Vector, rotated_back
-from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
+from tactile_resonance.simulation.ur5e.forces import ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, total
 from tactile_resonance.simulation.ur5e.registers import REGISTER_COUNT

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.plant.control_port import PORT
+from tactile_resonance.simulation.plant.simulated_robot import CONTROL_PORT
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 
@@ -33,7 +33,7 @@ def test_control_port_says_what_it_accepts(robot, fields, message):
 
 
 def test_control_port_survives_what_is_no_json(robot):
-    with socket.create_connection((robot.host, PORT), 5) as channel:
+    with socket.create_connection((robot.host, CONTROL_PORT), 5) as channel:
         channel.sendall(b"{\n[1]\n")
         lines = channel.makefile()
         assert [json.loads(lines.readline())["ok"] for _ in range(2)] == [False, False]
@@ -79,7 +79,7 @@ def test_table_and_truth(robot):
     ],
 )
 def test_control_port_answers_whatever_comes(robot, line):
-    with socket.create_connection((robot.host, PORT), 5) as channel:
+    with socket.create_connection((robot.host, CONTROL_PORT), 5) as channel:
         channel.sendall(line + b"\n")
         assert not json.loads(channel.makefile().readline())["ok"]
     assert robot.order("state")["robot_mode"] == "RUNNING"

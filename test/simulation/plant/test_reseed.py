@@ -9,7 +9,7 @@ from tactile_resonance.simulation.cell.load_cell import LoadCell
 from tactile_resonance.simulation.cell.transducer import CellParameters, Transducer
 from tactile_resonance.simulation.noise import ROWS
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.ft_sensor import FtSensor, FtSpecification
+from tactile_resonance.simulation.ur5e.forces import FtSensor, FtSpecification
 from tactile_resonance.simulation.ur5e.poses import ZERO
 from tactile_resonance.simulation.ur5e.tracking import Jitter, TrackingParameters
 

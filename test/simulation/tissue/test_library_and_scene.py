@@ -9,8 +9,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.tissue.library import read_tissues
-from tactile_resonance.simulation.tissue.materials import Uniform
+from tactile_resonance.simulation.tissue.library import Uniform, read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene, Region, read_scene
 from tactile_resonance.simulation.tissue.shapes import Box, HalfSpace, Sphere
 

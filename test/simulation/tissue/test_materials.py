@@ -12,7 +12,7 @@ from scipy.integrate import dblquad
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.sensor.experiments import truth_map
-from tactile_resonance.simulation.tissue.materials import (
+from tactile_resonance.simulation.tissue.library import (
     Gradient,
     Heterogeneous,
     RandomField,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.simulation.ur5e.controller import ControllerConfig, UrController
-from tactile_resonance.simulation.ur5e.ft_sensor import FtSpecification
+from tactile_resonance.simulation.ur5e.forces import FtSpecification
 from tactile_resonance.simulation.ur5e.machine import MachineConfig
 from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 

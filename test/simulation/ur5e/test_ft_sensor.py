@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from tactile_resonance.contact.vectors import NO_TURN
-from tactile_resonance.simulation.ur5e.ft_sensor import (
+from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
     FtSpecification,

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.ur5e import kinematics
-from tactile_resonance.simulation.ur5e.ft_sensor import ToolPayload
+from tactile_resonance.simulation.ur5e.forces import ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.outputs import (
     LINK_CENTRE_M,
