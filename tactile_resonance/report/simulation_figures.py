@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from tactile_resonance.simulation.sensor.changing_contact import (
     indent,
     pole_trajectory,
 )
-from tactile_resonance.simulation.sensor.experiments import truth_map
+from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import TissueLibrary
@@ -162,13 +163,17 @@ def draw_scene(bench: SimulatedBench, scene: PhantomScene, points: np.ndarray) -
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = (np.linspace(a, b, 31) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x, y), axis=-1)  # (31, 31, 2)
-    truth = truth_map(bench, scene, grid)
+    felt = truth_over(bench, scene, grid)
+
+    def over(value: Callable[[Any], float]) -> np.ndarray:
+        return np.array([np.nan if at is None else value(at) for at in felt.flat]).reshape(felt.shape)
+
     figure = new_figure(17, 5.5)
     figure.suptitle(f"What the tip feels over the scene '{scene.name}' ({SIMULATED})")
     panels = (
-        ("E(1 s) felt [kPa]", truth.modulus_1s_pa / 1e3),
-        ("f0 [Hz]", truth.f0_hz),
-        ("damping ratio", truth.damping_ratio),
+        ("E(1 s) felt [kPa]", over(lambda at: at.contact.tissue.relaxation_modulus_1s_pa / 1e3)),
+        ("f0 [Hz]", over(lambda at: at.mode_near(250.0).f0_hz)),
+        ("damping ratio", over(lambda at: at.mode_near(250.0).damping_ratio)),
     )
     angle = np.linspace(0, 2 * np.pi, 100)
     for axes, (title, values) in zip(figure.subplots(1, 3), panels, strict=True):

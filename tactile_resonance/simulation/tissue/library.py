@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -140,46 +139,33 @@ class _LibraryFile:
 WAVES = 512  # of a random field: kurtosis within 0.6 % of the Gaussian one
 
 
-class Material(Protocol):
-    """A filling of space."""
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue:
-        """Return the tissue at one position (3,) [m]."""
-        ...
+Material = Callable[[FloatArray], Tissue]
+"""A filling of space: from a position (3,) [m] to the tissue there."""
 
 
-@dataclass(frozen=True)
-class Uniform:
-    """The same tissue everywhere."""
-
-    tissue: Tissue
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue:
-        """Return the tissue."""
-        return self.tissue
+def uniform(tissue: Tissue) -> Material:
+    """Return the same tissue everywhere."""
+    return lambda position_m: tissue
 
 
-@dataclass(frozen=True)
-class Gradient:
-    """A tissue that changes along the way from one point to another, constant beyond both.
+def gradient(start_m: Point, end_m: Point, tissue_between: Callable[[float], Tissue]) -> Material:
+    """Return a tissue that changes along the way from one point to another, constant beyond both.
 
-    Attributes
+    Parameters
     ----------
     start_m, end_m : tuple of 3 floats
     tissue_between : callable
         Tissue at a share of the way, 0 (start) to 1 (end).
     """
+    start = np.asarray(start_m)
+    way = np.asarray(end_m) - start
 
-    start_m: Point
-    end_m: Point
-    tissue_between: Callable[[float], Tissue]
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue:
-        """Return the tissue at the foot of the perpendicular on the way."""
-        start = np.asarray(self.start_m)
-        way = np.asarray(self.end_m) - start
+    def tissue_at(position_m: FloatArray) -> Tissue:
+        # at the foot of the perpendicular on the way
         share = float((position_m - start) @ way / (way @ way))
-        return self.tissue_between(min(1.0, max(0.0, share)))
+        return tissue_between(min(1.0, max(0.0, share)))
+
+    return tissue_at
 
 
 @dataclass(frozen=True)
@@ -218,11 +204,10 @@ class RandomField:
         return np.asarray(np.sqrt(2 / WAVES) * wave.sum(axis=-1))
 
 
-@dataclass(frozen=True)
-class Heterogeneous:
-    """A material whose modulus varies at random: log-normal with mean 1, ratios unchanged.
+def heterogeneous(material: Material, field: RandomField, modulus_spread: float) -> Material:
+    """Return a material whose modulus varies at random: log-normal with mean 1, ratios unchanged.
 
-    Attributes
+    Parameters
     ----------
     material : Material
     field : RandomField
@@ -230,23 +215,13 @@ class Heterogeneous:
         Standard deviation of ln E.
     """
 
-    material: Material
-    field: RandomField
-    modulus_spread: float
+    def tissue_at(position_m: FloatArray) -> Tissue:
+        tissue = material(position_m)
+        exponent = modulus_spread * field.value(position_m) - modulus_spread**2 / 2
+        modulus = tissue.relaxation_modulus_1s_pa * float(np.exp(exponent))
+        return replace(tissue, relaxation_modulus_1s_pa=modulus, gelatine_percent=None)
 
-    def __post_init__(self) -> None:
-        check_within(self, modulus_spread=(0, 1))
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue:
-        """Return the tissue there, its modulus times the local factor."""
-        tissue = self.material.tissue_at(position_m)
-        spread = self.modulus_spread
-        factor = float(np.exp(spread * self.field.value(position_m) - spread**2 / 2))
-        return replace(
-            tissue,
-            relaxation_modulus_1s_pa=tissue.relaxation_modulus_1s_pa * factor,
-            gelatine_percent=None,
-        )
+    return tissue_at
 
 
 def mixture(first: Tissue, second: Tissue, share: float, modulus_1s_pa: float) -> Tissue:
@@ -307,7 +282,7 @@ class GradientEntry:
         apart = self.start_m != self.end_m
         require(apart, "end_m", self.end_m, "a point other than start_m")
 
-    def gradient_of(self, library: TissueLibrary) -> Gradient:
+    def gradient_of(self, library: TissueLibrary) -> Material:
         """Return what lies there: gelatine between two of gelatine, else a mixture."""
         first = build(self.from_.tissue_of, "from", library)
         second = build(self.to.tissue_of, "to", library)
@@ -318,14 +293,18 @@ class GradientEntry:
                 return geometric_mixture(first, second, share)
             return library.gelatine(low + share * (high - low))
 
-        return Gradient(self.start_m, self.end_m, between)
+        return gradient(self.start_m, self.end_m, between)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeterogeneityEntry(RandomField):
-    """Part of a file: a random field, and how far the modulus follows it; see `Heterogeneous`."""
+    """Part of a file: a random field, and how far the modulus follows it; see `heterogeneous`."""
 
     modulus_spread: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_within(self, modulus_spread=(0, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,12 +318,10 @@ class FillingEntry(TissueEntry):
         """Return it; ``ValueError`` as `TissueEntry.tissue_of`."""
         material: Material
         if self.gradient is None:
-            material = Uniform(self.tissue_of(library))
+            material = uniform(self.tissue_of(library))
         else:
             given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
             require(not given, "gradient", given, "no tissue beside a gradient")
             material = build(self.gradient.gradient_of, "gradient", library)
         field = self.heterogeneity
-        if field is None:
-            return material
-        return build(Heterogeneous, "heterogeneity", material, field, field.modulus_spread)
+        return material if field is None else heterogeneous(material, field, field.modulus_spread)

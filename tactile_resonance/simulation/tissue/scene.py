@@ -116,7 +116,7 @@ class PhantomScene:
         position = np.zeros(3)
         given = np.asarray(position_m, dtype=float)
         position[: given.size] = given
-        tissue = region.material.tissue_at(position)
+        tissue = region.material(position)
         position[2] = 0.0
         for buried in self.buried:
             # Hertz contact of the preload, as in `hertz_contact`

@@ -9,7 +9,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.tissue.library import Uniform, read_tissues
+from tactile_resonance.simulation.tissue.library import read_tissues, uniform
 from tactile_resonance.simulation.tissue.scene import PhantomScene, Region, read_scene
 from tactile_resonance.simulation.tissue.shapes import Box, HalfSpace, Sphere
 
@@ -116,9 +116,9 @@ def test_later_regions_cover_earlier_ones(library):
         "nodule",
         0.01,
         (
-            Region("block", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), Uniform(gel)),
-            Region("right", HalfSpace((0.5, 0.0), (-1.0, 0.0)), Uniform(liver)),
-            Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), Uniform(library["gel16"])),
+            Region("block", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), uniform(gel)),
+            Region("right", HalfSpace((0.5, 0.0), (-1.0, 0.0)), uniform(liver)),
+            Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), uniform(library["gel16"])),
         ),
     )
     assert scene.region_at((0.0, 0.15)).name == "nodule"  # height 0
