@@ -90,7 +90,8 @@ class Participant:
         elif kind is ToBench.GO:
             self.until_ns = ENDLESS_NS
         elif kind is ToBench.SEED:
-            keeper.seed(a, b, c)
+            for call in keeper.seeds:
+                call((a, b, c))
         else:
             self.robot_port, self.bus_port = a, b
 
@@ -177,11 +178,6 @@ class BenchTime:
         elif self._packets_mark >= 0:
             self._packets_due = self._packets_mark + packets
             self._packets_late_s = time.monotonic() + PACKETS_WITHIN_S
-
-    def seed(self, *integers: int) -> None:
-        """Let noise follow from integers."""
-        for call in self.seeds:
-            call((integers[0], integers[1], integers[2]))
 
     # how far time may go
 

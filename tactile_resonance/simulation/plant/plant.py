@@ -23,7 +23,6 @@ from tactile_resonance.contact.vectors import (
     Vector,
     cross,
     difference,
-    dot,
     rotated,
     rotated_back,
     turn_from_vector,
@@ -34,7 +33,7 @@ from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import TipOnTissue
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform
+from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
 
 FloatArray = NDArray[np.float64]
 
@@ -253,11 +252,11 @@ class Plant:
         if self.in_contact or height > self.tip_radius_m + NEAR_M:
             return
         if self.site_m is not None:
-            away_m = math.hypot(*_along(difference(place, self.site_m), normal))
+            away_m = math.hypot(*beside(difference(place, self.site_m), normal))
             if self._site_touched:
                 known = away_m < SAME_PLACE * self.tip_radius_m
             else:  # it is not asked for all along the way: that may take longer than a step
-                moved_m = math.hypot(*_along(way, normal))
+                moved_m = math.hypot(*beside(way, normal))
                 known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip_radius_m)
             if known:
                 return
@@ -273,7 +272,7 @@ class Plant:
             self._slip = ORIGIN
             return ORIGIN
         (x, y, z), (dx, dy, dz) = self._slip, way
-        x, y, z = _along((x + dx, y + dy, z + dz), normal)
+        x, y, z = beside((x + dx, y + dy, z + dz), normal)
         stiffness = self.friction.stiffness_ratio * 1.5 * pushed / self.depth_m
         length, most = math.hypot(x, y, z), self.friction.coefficient * pushed / stiffness
         if length > most:
@@ -295,9 +294,3 @@ class Plant:
         """What has a place in the frame `tip`, in the base."""
         (x, y, z), (dx, dy, dz) = self.tip_m, rotated(self._turn, place_m)
         return x + dx, y + dy, z + dz
-
-
-def _along(way: Vector, normal: Vector) -> Vector:
-    """What of a way is along the surface."""
-    height = dot(normal, way)
-    return way[0] - height * normal[0], way[1] - height * normal[1], way[2] - height * normal[2]

@@ -49,10 +49,6 @@ class PoleResidueModel:
         """How often each listed pole counts, shape (K,): 2 for a complex pole, 1 for a real one."""
         return np.where(self.poles_rad_s.imag > 0, 2.0, 1.0)
 
-    def without_direct_term(self) -> PoleResidueModel:
-        """Return the strictly proper part."""
-        return PoleResidueModel(self.poles_rad_s, self.residues_rad_s, 0.0)
-
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Return G(j 2 pi f), of the shape of `frequency_hz`."""
         upper, lower = self.resolvents(frequency_hz)

@@ -10,7 +10,7 @@ the record starts from rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -201,7 +201,7 @@ def nonlinear_steady_state(
     drive = effective_drive(lines, nonlinear, oversampling)
     count = drive.samples_per_period
     frequency_hz = np.arange(count // 2 + 1) * (drive.sample_rate_hz / count)
-    response = model.without_direct_term().frequency_response(frequency_hz)
+    response = replace(model, direct=0.0).frequency_response(frequency_hz)
     response[-1] = 0.0  # half the sample rate has no phase
     linear = sample_period(drive, response[drive.harmonics])
     strain = linear
@@ -248,7 +248,7 @@ class NonlinearStream:
     ) -> None:
         self._oversampling = oversampling
         self._nonlinear = nonlinear
-        self._strain_model = model.without_direct_term()
+        self._strain_model = replace(model, direct=0.0)
         self._driven = ResponseStream(self._strain_model, delay_s=delay_s)
         nothing = np.zeros(0, dtype=complex)
         self._through = ResponseStream(

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.contact.vectors import Turn, Vector, cross, dot, rotated, rotated_back
+from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
 from tactile_resonance.simulation.noise import NormalRows
-from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, Six, Transform, difference
+from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, Six, Transform, beside, difference
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 FloatArray = NDArray[np.float64]
@@ -253,7 +253,7 @@ class ForceMode:
             axis, place = (x - tx, y - ty, z - tz), 1
         elif task.kind == 3:
             vx, vy, vz = target.twist[:3]
-            axis, place = _beside((vx, vy, vz), upright), 0
+            axis, place = beside((vx, vy, vz), upright), 0
         else:
             return turn
         if math.hypot(*axis) < 1e-6:  # no direction to point to: the frame stays as given
@@ -263,7 +263,7 @@ class ForceMode:
 
 def _completed(axis: Vector, place: int, upright: Vector) -> Turn:
     """Return right-handed axes with one at a place and z as near to `upright` as can be."""
-    z = _beside(upright, axis)
+    z = beside(upright, axis)
     if math.hypot(*z) < 1e-6:  # parallel: any perpendicular direction serves
         sizes = [abs(value) for value in axis]
         least = sizes.index(min(sizes))
@@ -275,12 +275,6 @@ def _completed(axis: Vector, place: int, upright: Vector) -> Turn:
         first[1], second[1], z[1],
         first[2], second[2], z[2],
     )  # fmt: skip
-
-
-def _beside(vector: Vector, axis: Vector) -> Vector:
-    """Return what of a vector is perpendicular to an axis of length 1."""
-    along = dot(vector, axis)
-    return vector[0] - axis[0] * along, vector[1] - axis[1] * along, vector[2] - axis[2] * along
 
 
 def _unit(vector: Vector) -> Vector:

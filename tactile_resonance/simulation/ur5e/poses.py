@@ -11,6 +11,7 @@ from tactile_resonance.contact.vectors import (
     Turn,
     Vector,
     cross,
+    dot,
     rotated,
     rotated_back,
     transposed,
@@ -42,6 +43,12 @@ def total(a: Six, b: Six) -> Six:
 def difference(a: Six, b: Six) -> Six:
     """Return a tuple less another, number by number."""
     return tuple(map(sub, a, b))
+
+
+def beside(vector: Vector, axis: Vector) -> Vector:
+    """Return what of a vector is perpendicular to an axis of length 1."""
+    along = dot(vector, axis)
+    return vector[0] - axis[0] * along, vector[1] - axis[1] * along, vector[2] - axis[2] * along
 
 
 def rounded(place_m: Vector) -> list[float]:

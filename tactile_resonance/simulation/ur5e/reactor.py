@@ -8,7 +8,7 @@ import socket
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 # What a client may leave unread before it is closed, where its port says nothing else: about 0.2 s of all
 # RTDE variables.
@@ -172,19 +172,14 @@ class MessageService(ABC):
         return None
 
 
-class _Listener:
+class _Listener(NamedTuple):
     """One port."""
 
-    def __init__(
-        self,
-        channel: socket.socket,
-        serve: Callable[[Connection], Service],
-        freezable: bool,
-        most_unsent: int,
-    ) -> None:
-        self.channel, self.serve = channel, serve
-        self.port = int(channel.getsockname()[1])
-        self.freezable, self.most_unsent = freezable, most_unsent
+    channel: socket.socket
+    port: int
+    serve: Callable[[Connection], Service]
+    freezable: bool
+    most_unsent: int
 
 
 class Reactor:
@@ -245,7 +240,9 @@ class Reactor:
                 "there? --host takes any address 127.x.y.z"
             ) from error
         channel.setblocking(False)
-        listener = _Listener(channel, serve, freezable, most_unsent)
+        listener = _Listener(
+            channel, int(channel.getsockname()[1]), serve, freezable, most_unsent
+        )
         self._listeners.append(listener)
         self.renew()
         return listener.port
