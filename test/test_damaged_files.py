@@ -13,7 +13,7 @@ from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.drivers.can_frames import read_can_description
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.twist_config import read_twist_config
+from tactile_resonance.drivers.twist import read_twist_config
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.fields import LONGEST
 from tactile_resonance.scan.scene import read_scan_scene

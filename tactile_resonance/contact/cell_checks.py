@@ -11,6 +11,7 @@ import numpy as np
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.vectors import Six
+from tactile_resonance.fields import require
 
 FALSE_ALARM = 1e-12
 """Accepted probability that noise alone repeats a sample so often that it is called stuck."""
@@ -42,16 +43,13 @@ class CellLimits:
     lost_tolerated: int = 3
 
     def __post_init__(self) -> None:
-        if not 0 < self.silent_s <= 1:
-            raise ValueError(f"silent_s: {self.silent_s!r}, expected above 0 to 1 s")
-        if self.stuck_samples is not None and self.stuck_samples < 2:
-            raise ValueError(f"stuck_samples: {self.stuck_samples!r}, expected 2 or more")
-        if not self.jump_n > 0:
-            raise ValueError(f"jump_n: {self.jump_n!r}, expected a number above 0")
-        if self.overload_samples < 1:
-            raise ValueError(f"overload_samples: {self.overload_samples!r}, expected 1 or more")
-        if not 0 <= self.lost_tolerated < LOST_WITHIN:
-            raise ValueError(f"lost_tolerated: {self.lost_tolerated!r}, expected 0 to 99")
+        require(0 < self.silent_s <= 1, "silent_s", self.silent_s, "above 0 to 1 s")
+        stuck = self.stuck_samples
+        require(stuck is None or stuck >= 2, "stuck_samples", stuck, "2 or more")
+        require(self.jump_n > 0, "jump_n", self.jump_n, "a number above 0")
+        require(self.overload_samples >= 1, "overload_samples", self.overload_samples, "1 or more")
+        lost = self.lost_tolerated
+        require(0 <= lost < LOST_WITHIN, "lost_tolerated", lost, f"0 to {LOST_WITHIN - 1}")
 
 
 def repeat_probability(noise_rms_n: float, resolution_n: float) -> float:

@@ -16,7 +16,8 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass
+
+from tactile_resonance.fields import require
 
 BLOCK_S = 0.25
 """Of all messages within a block the one that was quickest counts."""
@@ -32,31 +33,6 @@ FIRST_STD_S = 1e-3
 USUAL_DRIFT = 2e-4
 """Of quartz clocks, taken as the uncertainty until a drift is estimated."""
 LARGEST_DRIFT = 1e-3
-
-
-@dataclass(frozen=True)
-class ClockRelation:
-    """Remote to local time.
-
-    Attributes
-    ----------
-    local_ns : int
-        Local time (UNIX) [ns] at remote time `remote_s`.
-    remote_s : float
-    drift : float
-        Rate of the local clock per remote clock, minus 1.
-    uncertainty_s : float
-        Standard deviation of a converted time near the newest message [s].
-    """
-
-    local_ns: int
-    remote_s: float
-    drift: float
-    uncertainty_s: float
-
-    def to_local_ns(self, remote_s: float) -> int:
-        """Local time [ns] of a remote time [s]."""
-        return self.local_ns + round((remote_s - self.remote_s) * (1 + self.drift) * 1e9)
 
 
 class ClockTracker:
@@ -75,8 +51,7 @@ class ClockTracker:
 
     def __init__(self, shortest_delay_s: float = 0.0, delay_std_s: float = 0.0) -> None:
         for name, value in (("shortest_delay_s", shortest_delay_s), ("delay_std_s", delay_std_s)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name}: {value!r}, expected a number, 0 or above")
+            require(0 <= value < math.inf, name, value, "a number, 0 or above")
         self._delay_s, self._delay_std_s = shortest_delay_s, delay_std_s
         self.restarts = 0
         self._clear()
@@ -124,20 +99,17 @@ class ClockTracker:
             if not self._blocks:
                 self._line = (y, 0.0)
 
-    def relation(self) -> ClockRelation:
-        """The relation as of now.
+    @property
+    def drift(self) -> float:
+        """Rate of the local clock per remote clock, minus 1."""
+        return self._line[1]
 
-        Raises
-        ------
-        ValueError
-            If no message has come yet.
-        """
-        return ClockRelation(
-            local_ns=self.to_local_ns(self._last_s),
-            remote_s=self._last_s,
-            drift=self._line[1],
-            uncertainty_s=math.hypot(self._scatter_s, self._delay_std_s),
-        )
+    @property
+    def uncertainty_s(self) -> float:
+        """Standard deviation of a converted time near the newest message [s]; NaN before the first."""
+        if self._origin is None:
+            return math.nan
+        return math.hypot(self._scatter_s, self._delay_std_s)
 
     def to_local_ns(self, remote_s: float) -> int:
         """Local time [ns] of a remote time [s] near the newest message, by the relation as of now.

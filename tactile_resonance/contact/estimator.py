@@ -153,6 +153,8 @@ class ContactFilter:
     ----------
     surface_m, surface_speed_m_s : float
         Height of the tip at first touch [m], and its rate [m/s].
+    c : float
+        C [N/m^1.5].
     c_rate_per_s : float
         Relative change of C [1/s].
     """
@@ -175,16 +177,12 @@ class ContactFilter:
             np.asarray(heights_m, float), np.asarray(forces_n, float), noise_n, beam_n_per_m
         )
         self.surface_m, self._ln_c = float(mean[0]), float(mean[1])
+        self.c = math.exp(self._ln_c)
         self.surface_speed_m_s, self.c_rate_per_s = 0.0, RATE_MEAN_PER_S
         self._motion, self._passed_s = MovingSurface(), 0.0
         # covariance of (surface, speed, ln C, rate): its upper triangle, row by row
         (p00, p02), (_, p22) = covariance.tolist()
         self._p = (p00, 0.0, p02, 0.0, 0.0, 0.0, 0.0, p22, 0.0, RATE_STD_PER_S**2)
-
-    @property
-    def c(self) -> float:
-        """C [N/m^1.5]."""
-        return math.exp(self._ln_c)
 
     @property
     def moving(self) -> bool:
@@ -206,6 +204,7 @@ class ContactFilter:
         way_s = -SPEED_LASTS_S * math.expm1(-dt_s / SPEED_LASTS_S)
         stay = 1.0 - way_s / SPEED_LASTS_S
         self._ln_c += self.c_rate_per_s * adds_s
+        self.c = math.exp(self._ln_c)
         self.c_rate_per_s *= keep
         self.surface_m += self.surface_speed_m_s * way_s
         self.surface_speed_m_s = stay * self.surface_speed_m_s + motion.acceleration_m_s2 * way_s
@@ -246,6 +245,7 @@ class ContactFilter:
         self.surface_m += ph0 * step
         self.surface_speed_m_s += ph1 * step
         self._ln_c += ph2 * step
+        self.c = math.exp(self._ln_c)
         self.c_rate_per_s += ph3 * step
         gain0, gain1, gain2, gain3 = ph0 / spread, ph1 / spread, ph2 / spread, ph3 / spread
         innovation, motion = error / math.sqrt(spread), self._motion

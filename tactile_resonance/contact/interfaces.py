@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
@@ -40,16 +40,15 @@ class CommandLimits(Protocol):
 
 def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:
     """Return a twist [m/s, rad/s] as floats; ``ValueError`` where it is not finite or beyond a limit."""
-    values = tuple(map(float, twist))
-    if len(values) != 6 or not all(map(math.isfinite, values)):
-        raise ValueError(f"twist: {values}, expected 6 finite numbers")
-    for name, part, most in (
-        ("speed", values[:3], limits.max_speed_m_s),
-        ("turn", values[3:], limits.max_turn_rad_s),
-    ):
-        if math.hypot(*part) > most:
-            raise ValueError(f"{name}: {math.hypot(*part):g}, the configuration allows {most:g}")
-    return six(values)
+    if len(twist) != 6 or not math.isfinite(sum(twist)):
+        raise ValueError(f"twist: {tuple(twist)}, expected 6 finite numbers")
+    values = six(twist)
+    speed, turn = math.hypot(*values[:3]), math.hypot(*values[3:])
+    if speed > limits.max_speed_m_s:
+        raise ValueError(f"speed: {speed:g}, the configuration allows {limits.max_speed_m_s:g}")
+    if turn > limits.max_turn_rad_s:
+        raise ValueError(f"turn: {turn:g}, the configuration allows {limits.max_turn_rad_s:g}")
+    return values
 
 
 def check_acceleration(value: float, limits: CommandLimits) -> None:
@@ -149,8 +148,11 @@ class ForceInfo:
     clock_uncertainty_s: float = 0.0
 
 
-class Cell(Protocol):
-    """A force sensor alone: wrenches in its own frame, `ForceSource` in all else."""
+Sample = TypeVar("Sample")
+
+
+class Source(Protocol[Sample]):
+    """A stream of wrenches."""
 
     @property
     def info(self) -> ForceInfo:
@@ -161,28 +163,7 @@ class Cell(Protocol):
         """Connect and stream, also after a fault has ended. Raises `ForceError`."""
         ...
 
-    def read(self) -> list[CellSample]:
-        """Wrenches since the last call, oldest first, without waiting. Raises `ForceError`."""
-        ...
-
-    def close(self) -> None:
-        """Disconnect; never raises."""
-        ...
-
-
-class ForceSource(Protocol):
-    """A stream of wrenches at the tip."""
-
-    @property
-    def info(self) -> ForceInfo:
-        """What it can do."""
-        ...
-
-    def start(self) -> None:
-        """Connect and stream. Raises `ForceError`."""
-        ...
-
-    def read(self) -> list[WrenchSample]:
+    def read(self) -> list[Sample]:
         """Wrenches since the last call, oldest first, without waiting.
 
         Empty where none came; raises `ForceError` where the source is found faulty. After the fault
@@ -193,6 +174,13 @@ class ForceSource(Protocol):
     def close(self) -> None:
         """Disconnect; never raises."""
         ...
+
+
+Cell = Source[CellSample]
+"""A force sensor alone: wrenches in its own frame."""
+
+ForceSource = Source[WrenchSample]
+"""Wrenches at the tip."""
 
 
 class Arm(Protocol):

@@ -25,7 +25,7 @@ MOST_STOPS = 20
 GONE = (ArmFault.LINK_LOST, ArmFault.CLIENT_DIED)
 """With these no stop reaches the arm any more."""
 
-IDLE_PERIODS = 10
+IDLE_PERIODS = 20
 """While no contact is under way, only one of so many periods is run."""
 
 

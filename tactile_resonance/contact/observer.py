@@ -12,7 +12,7 @@ from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.contact.tare import TareError, TareLimits, tare
+from tactile_resonance.contact.tare import TareError, tare
 from tactile_resonance.contact.vectors import vector
 
 
@@ -118,9 +118,8 @@ class Observer:
         """Take the bias and look for the touch from now on; what is wrong with it is returned."""
         self.taring = False
         p = self._parameters
-        limits = TareLimits(p.cell_noise_n, p.tare_std_n, p.tare_drift_n_per_s, p.tare_offset_n)
         try:
-            zero = tare(self._unloaded, limits)
+            zero = tare(self._unloaded, p)
         except TareError as error:
             return Breach(Cause.TARE, str(error))
         noise = float(zero.noise_rms_n[2])

@@ -54,14 +54,20 @@ class Outcome:
             contact_s=(now_ns - touched_ns) * 1e-9,
             total_s=(now_ns - self._start_ns) * 1e-9,
             peak_force_n=self._observer.watch.peak_n,
-            retracted=False,
         )
 
     def ended(self, breach: Breach, now_ns: int, told_m: float | None, holding: bool) -> None:
         """Note why it was not reached, or ended; the first cause stays."""
         result = self.result(holding)
         if result is None:
-            self._result = self._not_reached(breach, now_ns, told_m)
+            self._result = ContactResult(
+                reached=False,
+                cause=breach.cause,
+                message=breach.message,
+                told_m=told_m,
+                total_s=(now_ns - self._start_ns) * 1e-9,
+                peak_force_n=self._observer.watch.peak_n,
+            )
         elif result.cause is Cause.NONE or (
             breach.cause is Cause.HELD and result.cause is not Cause.HELD
         ):
@@ -98,22 +104,4 @@ class Outcome:
                 zero_n = 0.0
         self._result = replace(
             result, retracted=True, zero_change_n=zero_n, message=message, force_std_n=std
-        )
-
-    def _not_reached(self, breach: Breach, now_ns: int, told_m: float | None) -> ContactResult:
-        return ContactResult(
-            reached=False,
-            cause=breach.cause,
-            message=breach.message,
-            force_n=None,
-            force_std_n=None,
-            depth_m=None,
-            stiffness_n_per_m=None,
-            surface_m=None,
-            told_m=told_m,
-            surface_std_m=None,
-            contact_s=None,
-            total_s=(now_ns - self._start_ns) * 1e-9,
-            peak_force_n=self._observer.watch.peak_n,
-            retracted=False,
         )

@@ -170,7 +170,7 @@ class Pressing:
             deepest = (
                 0.0 if model.surprise > STIFFENS else most if holding else self._touch_speed_m_s
             )
-        if holding:
+        if holding and speed < 0:
             # stiff tissue is not followed faster than the arm can be stopped in before it is too much
             slope, _ = model.slope_at(model.depth_for(self._aim.force_n))
             deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))

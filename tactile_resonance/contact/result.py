@@ -90,15 +90,15 @@ class ContactResult:
     reached: bool
     cause: Cause
     message: str
-    force_n: float | None
-    force_std_n: float | None
-    depth_m: float | None
-    stiffness_n_per_m: float | None
-    surface_m: float | None
-    surface_std_m: float | None
-    contact_s: float | None
     total_s: float
     peak_force_n: float
-    retracted: bool
+    retracted: bool = False
+    force_n: float | None = None
+    force_std_n: float | None = None
+    depth_m: float | None = None
+    stiffness_n_per_m: float | None = None
+    surface_m: float | None = None
+    surface_std_m: float | None = None
+    contact_s: float | None = None
     told_m: float | None = None
     zero_change_n: float | None = None

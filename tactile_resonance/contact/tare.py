@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import WrenchSample
 
 FloatArray = NDArray[np.float64]
@@ -22,55 +23,29 @@ class TareError(ValueError):
 
 
 @dataclass(frozen=True)
-class TareLimits:
-    """What a tare must keep; figures of each axis of force.
-
-    Attributes
-    ----------
-    noise_rms_n : float
-        Of one sample, as the source states it; half as much again is accepted.
-    std_n : float
-        Largest standard deviation of the zero.
-    drift_n_per_s : float
-        Largest drift beyond what noise explains.
-    offset_n : float
-        Largest zero: more means a bias step, a wrong sign, or something that presses or pulls.
-    """
-
-    noise_rms_n: float
-    std_n: float
-    drift_n_per_s: float
-    offset_n: float
-
-
-@dataclass(frozen=True)
 class Tare:
     """A zero.
 
     Attributes
     ----------
-    force_n, torque_nm : (3,) arrays
+    force_n : (3,) array
         Mean reading without contact.
     force_std_n : (3,) array
         Standard deviation of that mean, with the correlation of the samples.
     noise_rms_n : (3,) array
         Of one sample about the line through all.
     drift_n_per_s, drift_std_n_per_s : (3,) arrays
-    time_ns : int
-        Of the middle of the samples.
     """
 
     force_n: FloatArray
-    torque_nm: FloatArray
     force_std_n: FloatArray
     noise_rms_n: FloatArray
     drift_n_per_s: FloatArray
     drift_std_n_per_s: FloatArray
-    time_ns: int
 
 
-def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
-    """Zero from samples without contact.
+def tare(samples: Sequence[WrenchSample], parameters: ContactParameters) -> Tare:
+    """Zero from samples without contact, refused beyond the limits that the parameters state for each axis.
 
     The standard deviation of the mean takes the correlation of neighbouring samples into account: a filter
     in the sensor makes it no smaller than it is.
@@ -85,8 +60,7 @@ def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
     if any(sample.overload for sample in samples):
         raise TareError("tare: the sensor is overloaded")
     force = np.array([sample.force_n for sample in samples])  # (n, 3)
-    torque = np.array([sample.torque_nm for sample in samples])
-    if not (np.all(np.isfinite(force)) and np.all(np.isfinite(torque))):
+    if not np.all(np.isfinite(force)):
         raise TareError("tare: a sample is not finite")
     stamps = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     middle_ns = int(stamps[0]) + int(stamps[-1] - stamps[0]) // 2
@@ -102,8 +76,8 @@ def tare(samples: Sequence[WrenchSample], limits: TareLimits) -> Tare:
     inflation = _inflation(residual)
     mean_std = inflation * rms / math.sqrt(n)
     slope_std = inflation * rms / math.sqrt(t @ t)
-    result = Tare(mean, torque.mean(axis=0), mean_std, rms, slope, slope_std, middle_ns)
-    _check(result, limits)
+    result = Tare(mean, mean_std, rms, slope, slope_std)
+    _check(result, parameters)
     return result
 
 
@@ -120,29 +94,30 @@ def _inflation(residual: FloatArray) -> FloatArray:
     return np.sqrt((1 + r) / (1 - r))
 
 
-def _check(result: Tare, limits: TareLimits) -> None:
+def _check(result: Tare, parameters: ContactParameters) -> None:
+    p = parameters
     for axis, name in enumerate("xyz"):
         rms, std = float(result.noise_rms_n[axis]), float(result.force_std_n[axis])
         drift, drift_std = float(result.drift_n_per_s[axis]), float(result.drift_std_n_per_s[axis])
         zero = float(result.force_n[axis])
-        if rms > 1.5 * limits.noise_rms_n:
+        if rms > 1.5 * p.cell_noise_n:
             raise TareError(
                 f"tare: noise of F{name} {rms * 1e3:.3g} mN rms, the source states "
-                f"{limits.noise_rms_n * 1e3:.3g} mN: does something touch or shake?"
+                f"{p.cell_noise_n * 1e3:.3g} mN: does something touch or shake?"
             )
         # what is no more than noise is not called drift
-        if abs(drift) - 3 * drift_std > limits.drift_n_per_s:
+        if abs(drift) - 3 * drift_std > p.tare_drift_n_per_s:
             raise TareError(
                 f"tare: F{name} drifts by {drift * 1e3:.3g} +- {drift_std * 1e3:.2g} mN/s, accepted are "
-                f"{limits.drift_n_per_s * 1e3:.3g} mN/s"
+                f"{p.tare_drift_n_per_s * 1e3:.3g} mN/s"
             )
-        if std > limits.std_n:
+        if std > p.tare_std_n:
             raise TareError(
                 f"tare: zero of F{name} uncertain by {std * 1e3:.3g} mN, accepted are "
-                f"{limits.std_n * 1e3:.3g} mN: take more samples"
+                f"{p.tare_std_n * 1e3:.3g} mN: take more samples"
             )
-        if abs(zero) > limits.offset_n:
+        if abs(zero) > p.tare_offset_n:
             raise TareError(
                 f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are up to "
-                f"{limits.offset_n * 1e3:.4g} mN (tare_offset_n): does something press or pull?"
+                f"{p.tare_offset_n * 1e3:.4g} mN (tare_offset_n): does something press or pull?"
             )

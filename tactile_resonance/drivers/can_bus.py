@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import select
 import socket
 import threading
@@ -24,6 +25,7 @@ KEPT_FRAMES = 20000
 READER_HUNG_S = 0.25
 _LONGEST_MESSAGE = 4096
 _AT_ONCE = 1 << 16
+_FRAME = re.compile(rb"<\s*(frame|error)\s+([^\s>]+)\s+([^\s>]+)([^>]*)>")
 
 
 class Frame(NamedTuple):
@@ -127,36 +129,24 @@ class SocketcandBus:
         self._drained = len(data) < _AT_ONCE
         if not data:
             raise ConnectionError("the server has closed the connection")
-        *messages, self._buffer = (self._buffer + data).split(b">")
+        received = self._buffer + data
+        end = received.rfind(b">") + 1
+        self._buffer = received[end:]
         if len(self._buffer) > _LONGEST_MESSAGE:
             raise ConnectionError("the server sends a message without end")
         arrival_ns = time.monotonic_ns()
         frames = []
-        for message in messages:
-            words = message.split()
-            if len(words) < 4:
-                continue
-            _, kind, number, stamp, *data = words
-            if kind not in (b"frame", b"error"):
-                continue
+        for message in _FRAME.findall(received, 0, end):
+            kind, number, stamp, text = message
             is_error = kind == b"error"
             try:
-                values = b"" if is_error else unhexlify(b"".join(data))
-                extended = len(number) > 3
-                frames.append(
-                    Frame(
-                        int(number, 16),
-                        values,
-                        float(stamp),
-                        arrival_ns,
-                        extended,
-                        False,
-                        is_error,
-                    )
-                )
+                can_id, stamp_s = int(number, 16), float(stamp)
+                values = b"" if is_error else unhexlify(text.replace(b" ", b""))
             except (ValueError, HexError) as error:
-                text = message.decode("ascii", "replace")
-                raise ConnectionError(f"the server sends {text!r}") from error
+                said = b" ".join(message).decode("ascii", "replace")
+                raise ConnectionError(f"the server sends {said!r}") from error
+            extended = len(number) > 3
+            frames.append(Frame(can_id, values, stamp_s, arrival_ns, extended, False, is_error))
         self.frames += len(frames)
         return frames
 

@@ -60,7 +60,9 @@ class CanWrench:
     @property
     def info(self) -> ForceInfo:
         """What the cell can do, and how well its times are known at present."""
-        return replace(self._config.info, clock_uncertainty_s=self._clock_uncertainty_s())
+        arrival = self._config.stamps == "arrival"
+        std_s = self._config.delay_std_s if arrival else self._tracker.uncertainty_s
+        return replace(self._config.info, clock_uncertainty_s=std_s)
 
     @property
     def lost(self) -> int:
@@ -175,14 +177,6 @@ class CanWrench:
         within_s = 0.5 / self._config.info.rate_hz if adapter else math.inf
         return Assembler(self._config.description.frame_ids, within_s)
 
-    def _clock_uncertainty_s(self) -> float:
-        if self._config.stamps == "arrival":
-            return self._config.delay_std_s
-        try:
-            return self._tracker.relation().uncertainty_s
-        except ValueError:
-            return float("nan")
-
     def _send(self, bus: Bus, data: bytes) -> None:
         description = self._config.description
         bus.send(description.commands.id, data, description.extended_ids)
@@ -240,15 +234,20 @@ class CanWrench:
         self._ahead = []
         samples: list[CellSample] = []
         silent_s, stamped = self._config.limits.silent_s, self._config.stamps == "adapter"
+        of_the_cell, assembler = self._is_of_the_cell, self._assembler
         for frame in frames:
-            if frame.error:
-                raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
             stamp_s = frame.stamp_s
-            if self._is_of_the_cell(frame):
-                sample = self._take(frame)
+            if of_the_cell(frame):
+                lost = assembler.lost
+                whole = assembler.add(frame.can_id, frame.data, stamp_s)
+                if assembler.lost > lost:
+                    self._checks.lost()
+                sample = None if whole is None else self._wrench(whole, frame)
                 if sample is not None:
                     samples.append(sample)
                     self._last_stamp_s = stamp_s
+            elif frame.error:
+                raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
             elif stamped:
                 # the bus is never empty, but the frames of others are already those of later
                 self._last_stamp_s = min(self._last_stamp_s, stamp_s)
@@ -284,13 +283,9 @@ class CanWrench:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
-    def _take(self, frame: Frame) -> CellSample | None:
-        """The wrench that this frame of the cell completes, or None. Raises `ForceError`."""
-        lost = self._assembler.lost
-        whole = self._assembler.add(frame.can_id, frame.data, frame.stamp_s)
-        if self._assembler.lost > lost:
-            self._checks.lost()
-        decoded = None if whole is None else self._config.description.decode(whole)
+    def _wrench(self, whole: bytes, frame: Frame) -> CellSample | None:
+        """The wrench of these joined bytes, None where they are another answer. Raises `ForceError`."""
+        decoded = self._config.description.decode(whole)
         if decoded is None:
             return None
         counts, full_scale = decoded
@@ -316,7 +311,8 @@ class CanWrench:
         )
 
     def _stamp_ns(self, frame: Frame) -> int:
-        arrival_ns = self.clock.now_ns() if self.clock.simulated else frame.arrival_ns
+        clock = self.clock
+        arrival_ns = clock.now_ns() if clock.simulated else frame.arrival_ns
         if self._config.stamps == "arrival":
             delay_s = self._config.shortest_delay_s + self._config.latency_s
             # those that were taken together came one after the other

@@ -6,6 +6,7 @@ from __future__ import annotations
 import select
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 from tactile_resonance.clock import Clock, Demand
@@ -22,10 +23,17 @@ from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.rtde_stream import RtdeStream
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_exchange import NOTHING, SPEED, STOP, Seen, UrCommand
+from tactile_resonance.drivers.ur_exchange import (
+    FAULTY,
+    FRESH,
+    NOTHING,
+    REVIVED,
+    SPEED,
+    STOP,
+    UrCommand,
+)
 from tactile_resonance.drivers.ur_motion import REST
-from tactile_resonance.drivers.ur_safety import PROGRAM_PLAYING, stop_fault
-from tactile_resonance.drivers.ur_states import StateReader
+from tactile_resonance.drivers.ur_states import PROGRAM_PLAYING, StateReader, stop_fault
 from tactile_resonance.drivers.ur_time import ArmTime
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
@@ -64,8 +72,8 @@ class UrArm:
         self._stream: RtdeStream | None = None
         self._states: StateReader | None = None
         self._number = 0
-        # kind and time [s] of commands without an answer yet
-        self._sent: dict[int, tuple[bytes, float]] = {}
+        # number, kind and time [s] of commands without an answer yet
+        self._sent: deque[tuple[int, bytes, float]] = deque()
         self._refused = 0
         self._looked_ns = 0
         self._reading = threading.Lock()
@@ -373,7 +381,7 @@ class UrArm:
         assert self._client is not None
         self._number += 1
         command = UrCommand(kind, self._number, 0, 0, twist, acceleration_m_s2)
-        self._sent[self._number] = (kind, time.monotonic())
+        self._sent.append((self._number, kind, time.monotonic()))
         if self._time.led is not None:
             self._pending = command  # with the next word on the time
         else:
@@ -409,16 +417,15 @@ class UrArm:
         self._looked_ns = 0
         if self._client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        self._client.look()
+        client, states, config = self._client, self._states, self.config
         self._read()
-        states, config = self._states, self.config
         sample = states.sample
         assert sample is not None
         age_s = (self.clock.now_ns() - sample.time_ns) * 1e-9
-        seen = Seen.FRESH if age_s <= config.max_state_age_s else Seen(0)
+        seen = FRESH if age_s <= config.max_state_age_s else 0
         if states.fault is not None:
-            seen |= Seen.FAULTY | (Seen.REVIVED if states.revived else Seen(0))
-        self._client.exchange.beat(seen)
+            seen |= FAULTY | REVIVED if states.revived else FAULTY
+        client.look(seen)
         if age_s > GIVE_UP_S:
             self._client.end()
             self._forget()
@@ -438,21 +445,20 @@ class UrArm:
         if not self._sent:
             return
         exchange, sent = self._client.exchange, self._sent
-        done = exchange.done
-        for number in [number for number in sent if number <= done]:
-            name = {SPEED: "speed", STOP: "stop"}[sent.pop(number)[0]]
-            if number != exchange.refused or number <= self._refused:
+        done, refused = exchange.done, exchange.refused
+        while sent and sent[0][0] <= done:
+            number, kind, _ = sent.popleft()
+            if number != refused or number <= self._refused:
                 continue
             self._refused = number
             if self._states.fault is not None:
                 return  # because of a stop, which the state reports
+            name = {SPEED: "speed", STOP: "stop"}[kind]
             said = self._client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
-        if self._time.led is None and sent:
-            oldest_s = next(iter(sent.values()))[1]
-            if time.monotonic() - oldest_s > ANSWER_S:
-                text = f"no answer to a command after {ANSWER_S:g} s"
-                raise ArmError(ArmFault.COMMAND_REFUSED, text)
+        if self._time.led is None and sent and time.monotonic() - sent[0][2] > ANSWER_S:
+            text = f"no answer to a command after {ANSWER_S:g} s"
+            raise ArmError(ArmFault.COMMAND_REFUSED, text)
 
     def _forget_commands(self) -> None:
         self._sent.clear()

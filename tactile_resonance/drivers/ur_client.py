@@ -31,10 +31,12 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import (
     EXIT_BROKEN,
     EXIT_ORDERLY,
+    FAULTY,
+    FRESH,
+    REVIVED,
     SPEED,
     STOP,
     Exchange,
-    Seen,
     UrCommand,
 )
 from tactile_resonance.drivers.ur_session import Session
@@ -198,8 +200,12 @@ class Client:
     @property
     def _healthy(self) -> bool:
         """Whether the owner lives and sees a robot that may be given commands."""
-        seen_s = self._exchange.silence_s()
-        return seen_s < HEALTHY_S and Seen.FRESH in self._exchange.seen
+        return bool(self._exchange.seen & FRESH) and self._exchange.silence_s() < HEALTHY_S
+
+    @property
+    def _faulty(self) -> bool:
+        """Whether the owner sees that the robot's state forbids motion."""
+        return bool(self._exchange.seen & FAULTY) and self._healthy
 
     def _do(self, action: Callable[[], bool]) -> bool:
         try:
@@ -217,22 +223,21 @@ class Client:
         if self._owed is None or not self._healthy:
             return
         (number, deceleration), seen = self._owed, self._exchange.seen
-        if Seen.FAULTY not in seen:
+        if not seen & FAULTY:
             done = self._do(lambda: session.motion.stop(deceleration))
             self._exchange.report(number, done)
             if done:
                 self._owed = None
             return
         self._exchange.report(number, True)  # nothing runs that could be stopped
-        if Seen.REVIVED in seen and self._do(lambda: session.motion.stop(deceleration)):
+        if seen & REVIVED and self._do(lambda: session.motion.stop(deceleration)):
             # a program that went on, or began, without us finds the old velocity in its register
             self._owed = None
 
     def _keep_alive(self, session: Session) -> None:
         """Keep the watchdog quiet while nothing moves or the owner lives."""
         config, motion = session.config, session.motion
-        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
-        if faulty and self._owed is None and motion.commanded:
+        if self._owed is None and motion.commanded and self._faulty:
             # what was under way is not to go on, should the program do so
             motion.rest(config.max_acceleration_m_s2)
             self._owed = 0, config.max_acceleration_m_s2
@@ -250,8 +255,7 @@ class Client:
 
     def _feed(self, session: Session) -> None:
         """Keep the watchdog quiet, where the program runs that has one."""
-        faulty = self._healthy and Seen.FAULTY in self._exchange.seen
-        if not faulty and session.listening:
+        if not self._faulty and session.listening:
             with contextlib.suppress(Exception):
                 session.motion.feed()
 

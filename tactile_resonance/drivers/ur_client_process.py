@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import socket
 import subprocess
@@ -77,13 +78,21 @@ class ClientProcess:
         """Of the process."""
         return self._process.pid
 
-    def look(self) -> None:
-        """Give the client a sign of life; raise `ArmError` where the client is gone."""
+    def look(self, seen: int | None = None) -> None:
+        """Give the client a sign of life and what is seen of the robot; `ArmError` where the client is gone."""
         with self._using:
-            if not self._ended and self._process.poll() is None:
-                self.exchange.beat()
+            if not self._ended and self._runs():
+                self.exchange.beat(seen)
                 return
         raise self._death()
+
+    def _runs(self) -> bool:
+        """Whether the process has not ended; one call of the system, and it stays to be waited for."""
+        how = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        try:
+            return self._process.returncode is None and os.waitid(os.P_PID, self.pid, how) is None
+        except ChildProcessError:  # another thread has waited for it just now
+            return False
 
     def send(self, command: UrCommand) -> None:
         """Send a command and do not wait. Raises ArmError where the client is gone."""

@@ -178,7 +178,8 @@ class ContactThread:
             while self._running:
                 self.loop.wait()
                 with self._lock:
-                    self._lock.wait_for(lambda: not self._connecting)
+                    while self._connecting:
+                        self._lock.wait()
                     if not self._running:
                         break
                     if self._led is not None and self._time_passed:

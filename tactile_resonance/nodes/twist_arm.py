@@ -32,8 +32,14 @@ from tactile_resonance.contact.vectors import (
     vector,
     vector_from_turn,
 )
-from tactile_resonance.drivers.twist_config import TwistConfig
-from tactile_resonance.drivers.twist_motion import REST, Following, ToolPose, towards, velocity_of
+from tactile_resonance.drivers.twist import (
+    REST,
+    Following,
+    ToolPose,
+    TwistConfig,
+    towards,
+    velocity_of,
+)
 from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.drivers.twist_config import RANGES, read_twist_config
+from tactile_resonance.drivers.twist import RANGES, read_twist_config
 
 GIVEN = yaml.safe_load(share_path("config/devices/twist.yaml").read_text(encoding="utf-8"))
 

@@ -12,7 +12,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.twist_config import read_twist_config
+from tactile_resonance.drivers.twist import read_twist_config
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.nodes import contact_devices

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.drivers.twist_config import read_twist_config
+from tactile_resonance.drivers.twist import read_twist_config
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES, initialised

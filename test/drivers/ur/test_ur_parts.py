@@ -13,17 +13,17 @@ from tactile_resonance.contact.interfaces import ArmFault
 from tactile_resonance.drivers.rtde_stream import RobotState
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
+    FRESH,
     NOTHING,
+    REVIVED,
     SIZE,
     SPEED,
     STOP,
     Exchange,
-    Seen,
     UrCommand,
 )
 from tactile_resonance.drivers.ur_motion import REST, UrMotion
-from tactile_resonance.drivers.ur_safety import motion_fault
-from tactile_resonance.drivers.ur_states import StateReader
+from tactile_resonance.drivers.ur_states import StateReader, motion_fault
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 
@@ -56,18 +56,18 @@ def test_commands_arrive_as_they_were_said(command):
 
 def test_each_side_of_the_page_reads_what_the_other_wrote_and_its_own_stays(exchanges):
     client, owner = exchanges
-    assert (owner.done, owner.refused, owner.heard_ns, client.seen) == (0, 0, 0, Seen(0))
-    owner.beat(Seen.FRESH | Seen.REVIVED)
+    assert (owner.done, owner.refused, owner.heard_ns, client.seen) == (0, 0, 0, 0)
+    owner.beat(FRESH | REVIVED)
     client.hear(1 << 61)
     client.report(5, True)
     assert (owner.done, owner.refused, owner.heard_ns) == (5, 0, 1 << 61)
-    assert client.seen == Seen.FRESH | Seen.REVIVED
+    assert client.seen == FRESH | REVIVED
     client.report(6, False)
     assert (owner.done, owner.refused) == (6, 6)
     client.report(4, True)  # a stop that could only be done now: later commands stay answered
     assert (owner.done, owner.refused) == (6, 6)
     owner.beat()
-    assert client.seen == Seen.FRESH | Seen.REVIVED
+    assert client.seen == FRESH | REVIVED
 
 
 def test_sign_of_life_ages_until_the_next(exchanges):
@@ -77,7 +77,7 @@ def test_sign_of_life_ages_until_the_next(exchanges):
     assert 0 <= first <= client.silence_s()
     owner._write(0, 0)  # as if given when this machine began
     assert client.silence_s() > 0.01
-    owner.beat(Seen.FRESH)
+    owner.beat(FRESH)
     assert client.silence_s() < first + 60.0
 
 
