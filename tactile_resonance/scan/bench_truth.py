@@ -13,8 +13,7 @@ from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
-from tactile_resonance.scan.recorded import file_of
-from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.run_content import RunContent, file_of
 
 SAME_MIDDLE_NS = 50_000_000  # a quarter of what one block more makes
 FloatArray = npt.NDArray[np.float64]
