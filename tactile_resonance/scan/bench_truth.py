@@ -47,13 +47,9 @@ def truths_of(run: RunContent) -> dict[int, PointTruth]:
     ValueError
         If a file is damaged.
     """
-    found = {}
-    for result in run.latest:
-        if result.simulated and result.outcome is PointOutcome.DONE:
-            truth = _truth_of(run, result)
-            if truth is not None:
-                found[result.index] = truth
-    return found
+    simulated = [r for r in run.latest if r.simulated and r.outcome is PointOutcome.DONE]
+    truths = {result.index: _truth_of(run, result) for result in simulated}
+    return {index: truth for index, truth in truths.items() if truth is not None}
 
 
 def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:
