@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from tactile_resonance.files import write_whole
 
 SIMULATED = "simulated, not measured"
+PROBABILITY = 0.95
+"""With which an ellipse holds the truth."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -47,17 +49,16 @@ def draw_ellipse(
     axes: Axes,
     centre: npt.ArrayLike,
     covariance: npt.NDArray[np.float64],
-    probability: float = 0.95,
     **style: Any,
 ) -> None:
-    """Ellipse that holds the truth with the given probability if errors are Gaussian.
+    """Ellipse that holds the truth with `PROBABILITY` if errors are Gaussian.
 
     Parameters
     ----------
     centre : (2,) float
     covariance : (2, 2) float
     """
-    radius = np.sqrt(-2 * np.log1p(-probability))  # chi-square with two degrees of freedom
+    radius = np.sqrt(-2 * np.log1p(-PROBABILITY))  # chi-square with two degrees of freedom
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.stack([np.cos(angle), np.sin(angle)])  # (2, 100)

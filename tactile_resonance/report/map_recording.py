@@ -25,7 +25,6 @@ from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages_of_type
 from tactile_resonance.scan.point_result import TYPE, from_message
 from tactile_resonance.scan.pole_map import PoleMap
-from tactile_resonance.scan.recorded import files_in_order
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.tissue.classify import UNKNOWN
 
@@ -78,7 +77,7 @@ def write_map_recording(run: RunContent) -> Path | None:
 def _states(run: RunContent) -> Iterator[tuple[int, PoleMap]]:
     """The map after each result that changed it, and when it was recorded [ns]."""
     pole_map = PoleMap()
-    for path in files_in_order(run):
+    for path in run.paths_in_order:
         for time_ns, _, message in read_messages_of_type(path, TYPE):
             before, pole_map = pole_map, pole_map.with_result(from_message(message))
             if pole_map is not before:
@@ -110,7 +109,7 @@ def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
         turn = quaternion_from_vector(vector(pose.rotation_rad))
         frame = _transform(base, frame_id, start_ns, vector(pose.position_m), turn)
         _write(writer, "/tf_static", start_ns, make_message(_TF, transforms=[frame]), _LATCHED)
-    for path in files_in_order(run):
+    for path in run.paths_in_order:
         for time_ns, _, message in read_messages_of_type(path, _POSE):
             at, turn = message.pose.position, message.pose.orientation
             position, quaternion = (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
-from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
+from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, draw_ellipse, new_figure
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface, PoleMap
 
 COLOURS = LinearSegmentedColormap.from_list(
@@ -19,7 +19,7 @@ MM = 1e3
 _MARKS = "osD^vP*X"
 
 
-def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float = 0.95) -> Figure:
+def draw_pole_map(pole_map: PoleMap, title: str) -> Figure:
     """Map of f0 with ellipses and failures, its uncertainty between the points, and the poles.
 
     Parameters
@@ -55,15 +55,15 @@ def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float
         zorder=3,
     )
     figure.colorbar(dots, ax=above, label="natural frequency f0 [Hz]", shrink=0.9)
-    scale = pole_map.ellipse_scale(probability)
-    lines = pole_map.ellipses(scale, probability)[..., :2] * MM  # (e, segments, 2, 2)
+    scale = pole_map.ellipse_scale(PROBABILITY)
+    lines = pole_map.ellipses(scale, PROBABILITY)[..., :2] * MM  # (e, segments, 2, 2)
     above.add_collection(
         LineCollection(list(lines.reshape(-1, 2, 2)), colors="black", linewidths=0.9, zorder=4)
     )
     _draw_failures(above, pole_map)
     _label(
         above,
-        f"f0 and {100 * probability:g} % ellipses: 1 mm along x = {1e-3 / scale.m_per_hz:.2g} Hz of f0,\n"
+        f"f0 and {100 * PROBABILITY:g} % ellipses: 1 mm along x = {1e-3 / scale.m_per_hz:.2g} Hz of f0,\n"
         f"along y = {1e-3 / scale.m_per_damping:.2g} of the damping ratio",
     )
     if surface is None:
@@ -76,7 +76,7 @@ def draw_pole_map(pole_map: PoleMap, title: str = "Pole map", probability: float
         unsure.plot(*where.T[:2], ".", color="white", ms=4)
         _label(unsure, "uncertainty of f0 between the points")
         unsure.set(xlim=above.get_xlim(), ylim=above.get_ylim())
-    _draw_plane(plane, pole_map, probability)
+    _draw_plane(plane, pole_map)
     return figure
 
 
@@ -95,7 +95,7 @@ def _draw_failures(axes: Axes, pole_map: PoleMap) -> None:
         axes.legend(loc="upper right")
 
 
-def _draw_plane(axes: Axes, pole_map: PoleMap, probability: float) -> None:
+def _draw_plane(axes: Axes, pole_map: PoleMap) -> None:
     """Poles by tissue class."""
     groups = pole_map.classes() or ("",)
     for k, name in enumerate(groups):
@@ -104,9 +104,9 @@ def _draw_plane(axes: Axes, pole_map: PoleMap, probability: float) -> None:
         axes.plot(*x.T, _MARKS[k % len(_MARKS)], color=f"C{k}", ms=4, label=name or "poles")
         for p in points:
             if np.all(np.isfinite(p.covariance)):
-                draw_ellipse(axes, p.estimate, p.covariance, probability, color=f"C{k}", lw=0.8)
+                draw_ellipse(axes, p.estimate, p.covariance, color=f"C{k}", lw=0.8)
     axes.set(xlabel="f0 [Hz]", ylabel="damping ratio")
-    axes.set_title(f"measured poles, {100 * probability:g} % ellipses", fontsize="medium")
+    axes.set_title(f"measured poles, {100 * PROBABILITY:g} % ellipses", fontsize="medium")
     axes.ticklabel_format(useOffset=False)
     axes.legend(loc="upper left")
 

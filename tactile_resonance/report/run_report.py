@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import html
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import reduce
 from typing import Any
 
@@ -35,7 +35,8 @@ td.text, th.text { text-align: left } tr.failed td { color: #b00 } .mark { color
 pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px }
 """
 Truths = Mapping[int, PointTruth]
-_COLUMNS = (
+Columns = Sequence[tuple[str, Callable[[PointResult], str]]]
+_COLUMNS: Columns = (
     ("point", lambda r: f"{r.index + 1}" + (f" (attempt {r.attempt + 1})" if r.attempt else "")),
     ("x [mm]", lambda r: _number(1e3 * r.x_m, 2)),
     ("y [mm]", lambda r: _number(1e3 * r.y_m, 2)),
@@ -57,13 +58,12 @@ _COLUMNS = (
 )
 # Facts of the run that have a place of their own on the page.
 _SHOWN = {"skipped", "notes", "surface"}
-_AIR_COLUMNS = (
+_AIR_COLUMNS: Columns = (
     ("point", lambda r: f"{r.index + 1}"),
     ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
     ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
     ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
 )
-_TRUTH_COLUMNS = ("true f0 [Hz]", "off by [std]", "true damping", "off by [std]")
 _TEXT = {"tissue", "repeats", "outcome"}
 
 
@@ -93,9 +93,9 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
         "Silent record": _bullets(silent_lines(run)),
         "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),
         "Surface, found by touch": _touches(run.facts.get("surface")),
-        "Points": _point_table(run.latest) + _paragraphs(table_notes(run.latest, truths)),
-        f"Against free air{' and the truth of the simulation' if truths else ''}": _air_table(
-            measured, truths
+        "Points": _results(_COLUMNS, run.latest) + _paragraphs(table_notes(run.latest, truths)),
+        f"Against free air{' and the truth of the simulation' if truths else ''}": _results(
+            (*_AIR_COLUMNS, *_truth_columns(truths)), measured
         ),
         "Left out": _bullets(skipped_lines(run)),
         "Damaged files": _bullets(run.problems),
@@ -223,35 +223,28 @@ def _table(names: Sequence[str], rows: Iterable[str]) -> str:
     return f'<div class="wide"><table>{_row("th", names, names)}{"".join(rows)}</table></div>'
 
 
-def _point_table(results: Sequence[PointResult]) -> str:
-    names, rows = [name for name, _ in _COLUMNS], []
+def _results(columns: Columns, results: Iterable[PointResult]) -> str:
+    names, rows = [name for name, _ in columns], []
     for result in results:
         css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
-        rows.append(_row("td", names, [show(result) for _, show in _COLUMNS], css))
+        rows.append(_row("td", names, [show(result) for _, show in columns], css))
     return _table(names, rows)
 
 
-def _air_table(results: Sequence[PointResult], truths: Truths) -> str:
-    names, rows = [name for name, _ in _AIR_COLUMNS] + list(_TRUTH_COLUMNS if truths else ()), []
-    for result in results:
-        texts = [show(result) for _, show in _AIR_COLUMNS] + _against_truth(result, truths)
-        rows.append(_row("td", names, texts))
-    return _table(names, rows)
-
-
-def _against_truth(result: PointResult, truths: Truths) -> list[str]:
+def _truth_columns(truths: Truths) -> Columns:
+    """What the simulated bench knew; none of it for hardware."""
     if not truths:
-        return []
-    truth = truths.get(result.index)
-    if truth is None:
-        return ["-"] * len(_TRUTH_COLUMNS)
-    off = deviation(result, truth)
-    return [
-        _number(truth.estimate[0], 3),
-        f"{off[0]:+.1f}",
-        _number(truth.estimate[1], 5),
-        f"{off[1]:+.1f}",
-    ]
+        return ()
+
+    def known(show: Callable[[PointResult, PointTruth], str]) -> Callable[[PointResult], str]:
+        return lambda r: show(r, truths[r.index]) if r.index in truths else "-"
+
+    return (
+        ("true f0 [Hz]", known(lambda _, truth: _number(truth.estimate[0], 3))),
+        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[0]:+.1f}")),
+        ("true damping", known(lambda _, truth: _number(truth.estimate[1], 5))),
+        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[1]:+.1f}")),
+    )
 
 
 def _touches(surface: Mapping[str, Any] | None) -> str:

@@ -13,8 +13,7 @@ from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
-from tactile_resonance.scan.recorded import file_of
-from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.run_content import RunContent, file_of
 
 SAME_MIDDLE_NS = 50_000_000  # a quarter of what one block more makes
 FloatArray = npt.NDArray[np.float64]
@@ -48,13 +47,9 @@ def truths_of(run: RunContent) -> dict[int, PointTruth]:
     ValueError
         If a file is damaged.
     """
-    found = {}
-    for result in run.latest:
-        if result.simulated and result.outcome is PointOutcome.DONE:
-            truth = _truth_of(run, result)
-            if truth is not None:
-                found[result.index] = truth
-    return found
+    simulated = [r for r in run.latest if r.simulated and r.outcome is PointOutcome.DONE]
+    truths = {result.index: _truth_of(run, result) for result in simulated}
+    return {index: truth for index, truth in truths.items() if truth is not None}
 
 
 def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:

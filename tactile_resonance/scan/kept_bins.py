@@ -26,8 +26,8 @@ from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.recording.store_recording import recording_of
 from tactile_resonance.rows_file import Rows, RowsWriter
 from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.recorded import file_of, measurements_of_file
-from tactile_resonance.scan.run_content import RECORDING, read_run
+from tactile_resonance.scan.recorded import measurements_of_file
+from tactile_resonance.scan.run_content import RECORDING, file_of, read_run
 
 NAME = "bins.npz"
 FORMAT = "tactile_resonance bins 1"

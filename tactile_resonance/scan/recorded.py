@@ -15,11 +15,10 @@ from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import (
     POLES_TYPE,
     TYPE,
-    PointResult,
     from_message,
     serialised,
 )
-from tactile_resonance.scan.run_content import RECORDING, RunContent, read_run
+from tactile_resonance.scan.run_content import RunContent, read_run
 
 EXCITATION = "tactile_resonance/msg/Excitation"
 RECORD = "tactile_resonance/msg/Record"
@@ -56,7 +55,7 @@ def run_entries(run: Path) -> list[StoredEntry]:
     """
     return [
         StoredEntry(key, path, _read)
-        for path in files_in_order(read_run(run))
+        for path in read_run(run).paths_in_order
         for key in _ids_of(path)
     ]
 
@@ -75,7 +74,7 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
 
     In runs of earlier versions references have none, and poles are the last ones in the file of the point.
     """
-    for path in files_in_order(run):
+    for path in run.paths_in_order:
         for _, _, message in read_messages_of_type(path, TYPE):
             poles = None
             for _, topic, poles_message in read_messages_of_type(path, POLES_TYPE):
@@ -107,18 +106,7 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
         yield StoredMeasurement.of(key, excitations[key], records[key], problems[key])
 
 
-def files_in_order(run: RunContent) -> list[Path]:
-    """Files of a run, in the order in which they were recorded."""
-    files = sorted(run.files, key=lambda file: (file.start_ns, file.name))
-    return [run.path / RECORDING / file.name for file in files]
-
-
 def _ids_of(path: Path) -> list[int]:
     """Measurements of a file, by its excitations."""
     messages = read_messages_of_type(path, EXCITATION)
     return list(dict.fromkeys(int(excitation.measurement_id) for _, _, excitation in messages))
-
-
-def file_of(run: Path, result: PointResult) -> Path:
-    """File of one attempt at a point."""
-    return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"

@@ -61,11 +61,22 @@ class RunContent:
         finished = {result.index for result in self.results}
         return next((point for point in self.points if point.index not in finished), None)
 
+    @property
+    def paths_in_order(self) -> list[Path]:
+        """Finished files, in the order in which they were recorded."""
+        files = sorted(self.files, key=lambda file: (file.start_ns, file.name))
+        return [self.path / RECORDING / file.name for file in files]
+
     def with_file(self, file: FileContent, result: PointResult | None) -> RunContent:
         """The same with one finished file more."""
         results = self.results if result is None else (*self.results, result)
         ordered = sorted(results, key=lambda r: (r.index, r.attempt))
         return replace(self, files=(*self.files, file), results=tuple(ordered))
+
+
+def file_of(run: Path, result: PointResult) -> Path:
+    """File of one attempt at a point."""
+    return Path(run) / RECORDING / f"point-{result.index:05d}-{result.attempt:02d}.mcap"
 
 
 def read_run(path: Path) -> RunContent:

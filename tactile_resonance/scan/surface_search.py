@@ -96,9 +96,9 @@ def find_surface(
             touches.append(_first_found(points, touch))
         except PointFailed as error:
             raise PointFailed(f"touch {index + 1}: {error}") from error
-    found = fit_touches(touches, request.form, ball_radius_m)
-    worst = int(np.argmax(np.abs(found.surface.residuals_m)))
-    off = float(found.surface.residuals_m[worst])
+    surface = fit_touches(touches, request.form, ball_radius_m)
+    worst = int(np.argmax(np.abs(surface.residuals_m)))
+    off = float(surface.residuals_m[worst])
     if abs(off) > request.tolerance_m:
         x, y = request.points_m[worst]
         raise ValueError(
@@ -106,10 +106,10 @@ def find_surface(
             f"the {request.form} through all; accepted are {1e3 * request.tolerance_m:g} mm (tolerance_m). "
             "Another form, or a touch that was none?"
         )
-    return found
+    return FoundSurface(surface, tuple(touches))
 
 
-def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> FoundSurface:
+def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> TouchedSurface:
     """Surface that all balls touch.
 
     A ball that comes down on a slope meets it beside its lowest point: one radius along the normal
@@ -121,7 +121,7 @@ def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> Fo
     for _ in range(_TURNS):
         surface = fit_surface(balls - ball_radius_m * normals, std, form)
         normals = surface.normal((balls - ball_radius_m * normals)[:, :2])
-    return FoundSurface(surface, tuple(touches))
+    return surface
 
 
 def _first_found(points: Sequence[ScanPoint], touch: Callable[[ScanPoint], Touch]) -> Touch:
@@ -145,7 +145,7 @@ def _expected(
     """Height at which the next touch is expected: on the plane through those before, else as configured."""
     if len(touches) >= 3:
         try:
-            return float(fit_touches(touches, "plane", ball_radius_m).surface.height_m(xy_m))
+            return float(fit_touches(touches, "plane", ball_radius_m).height_m(xy_m))
         except ValueError:  # on one line: no plane yet
             pass
     if touches:

@@ -17,17 +17,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import number, require
+from tactile_resonance.fields import check_above_zero, check_within, number, require
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import SensorUse
 from tactile_resonance.scan.surface import TouchRequest, check_search
-from tactile_resonance.scan.surface_search import (
-    LEAST_TOUCH_STD_M,
-    FoundSurface,
-    find_surface,
-    fit_touches,
-)
+from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, find_surface, fit_touches
 from tactile_resonance.scan.touch import TouchedSurface, fit_surface
 
 FloatArray = npt.NDArray[np.float64]
@@ -53,14 +48,10 @@ class CalibrationRequest:
             SensorUse(name=self.sensor)
         except ValueError as error:
             raise ValueError(f"sensor: {error}") from error
-        for name in ("force_n", "search_m", "flatness_m", "most_tilt_rad", "heading_rad"):
-            number(getattr(self, name), name)
-        require(self.force_n > 0, "force_n", self.force_n, "a number above 0")
+        check_above_zero(self, "force_n")
         check_search(self.search_m, "search_m")
-        require(0 <= self.flatness_m <= 1e-3, "flatness_m", self.flatness_m, "0 to 0.001 [m]")
-        require(
-            0 < self.most_tilt_rad <= 0.2, "most_tilt_rad", self.most_tilt_rad, "up to 0.2 [rad]"
-        )
+        check_within(self, flatness_m=(0.0, 1e-3), most_tilt_rad=(1e-6, 0.2))
+        number(self.heading_rad, "heading_rad")
         require(len(self.points_m) >= 3, "points", len(self.points_m), "three points or more")
         for index, point in enumerate(self.points_m):
             for value, name in zip(point, "xyz", strict=True):
@@ -180,11 +171,10 @@ def table_from_touches(
         accepted.
     """
     wider = [replace(t, std_m=math.hypot(t.std_m, request.flatness_m)) for t in touches]
-    found = fit_touches(wider, "plane", ball_radius_m)
-    surface = found.surface
+    surface = fit_touches(wider, "plane", ball_radius_m)
     covariance = _covariance(surface, request.height_m)
     if not surface.consistent:
-        raise ValueError(f"touches: {_contradiction(found, ball_radius_m)}")
+        raise ValueError(f"touches: {_contradiction(surface, wider, ball_radius_m)}")
     slope_x, slope_y = surface.coefficients_m[1:] / surface.scale_m
     slope = math.hypot(slope_x, slope_y)
     tilt = math.atan(slope)
@@ -231,20 +221,20 @@ def _covariance(surface: TouchedSurface, height_m: float) -> FloatArray:
     return covariance
 
 
-def _contradiction(found: FoundSurface, ball_radius_m: float) -> str:
+def _contradiction(
+    surface: TouchedSurface, touches: Sequence[Touch], ball_radius_m: float
+) -> str:
     """What residuals that are improbably large mean: the one touch without which the others lie on a plane."""
-    touches = found.touches
-    worst = float(np.max(np.abs(found.surface.residuals_m)))
+    worst = float(np.max(np.abs(surface.residuals_m)))
     text = f"they lie up to {1e3 * worst:.3f} mm off a plane, which their standard deviations do not explain"
     alone = []
     for index, touch in enumerate(touches if len(touches) > 4 else ()):
-        others = (*touches[:index], *touches[index + 1 :])
+        others = [*touches[:index], *touches[index + 1 :]]
         try:
-            rest = fit_touches(others, "plane", ball_radius_m)
+            plane = fit_touches(others, "plane", ball_radius_m)
         except ValueError:  # they lie on one line
             continue
-        if rest.surface.consistent:
-            plane = rest.surface
+        if plane.consistent:
             foot = touch.ball_m - ball_radius_m * plane.normal(touch.ball_m[:2])
             alone.append((index, float(foot[2] - plane.height_m(foot[:2]))))
     if len(alone) == 1:

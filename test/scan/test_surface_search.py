@@ -55,11 +55,11 @@ def test_a_dome_is_found_as_the_quadric_that_it_is():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     balls = np.c_[foot, height] + RADIUS_M * normal
     touches = [Touch(tuple(ball), 2e-5, 0.005) for ball in balls]
-    surface = fit_touches(touches, "quadric", RADIUS_M).surface
+    surface = fit_touches(touches, "quadric", RADIUS_M)
     np.testing.assert_allclose(surface.height_m(foot), height, atol=2e-8)
     np.testing.assert_allclose(surface.normal(foot), normal, atol=1e-5)
     # taken for points of a plane it is off by far more than such touches are
-    assert np.max(np.abs(fit_touches(touches, "plane", RADIUS_M).surface.residuals_m)) > 1e-4
+    assert np.max(np.abs(fit_touches(touches, "plane", RADIUS_M).residuals_m)) > 1e-4
 
 
 def test_each_touch_is_expected_where_those_before_tell():

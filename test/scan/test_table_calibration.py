@@ -220,7 +220,7 @@ LINE = tuple((x, 2 * x + 1e-4 * (x > 0.01)) for x in (0.0, 0.01, 0.02, 0.03))
         (tuple((0.1 * x, 0.1 * y) for x, y in TRIANGLE), {}, "points further apart"),
         (TRIANGLE, {"force_n": 0.0}, "force_n: got 0.0; accepted is a number above 0"),
         (TRIANGLE, {"search_m": 0.1}, "search_m: got 0.1; accepted is a number from 0 to 0.02"),
-        (TRIANGLE, {"search_m": math.nan}, "search_m: got nan; accepted is a finite number"),
+        (TRIANGLE, {"search_m": math.nan}, "search_m: got nan; accepted is a number from 0 to 0.02"),
         (TRIANGLE, {"sensor": "nose"}, "name: got 'nose'; accepted is one of config/sensors"),
         (TRIANGLE, {"most_tilt_rad": 1.0}, "most_tilt_rad: got 1.0"),
         (((0.0, math.inf), *TRIANGLE), {}, r"points\[0\].y: got inf"),
