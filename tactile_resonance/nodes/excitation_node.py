@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 from rclpy.action.server import ServerGoalHandle
 
@@ -53,9 +54,10 @@ class Cancelled(Exception):
 class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched), `record`; of a run it replays `point_result`.
 
-    Every record is on disk before it is published. Records carry the place of the tip and the mean force
-    over the block, where the device is no replay; they never wait long for it. The device is read in a
-    thread of its own, so that its blocking calls never hold up the executor.
+    Every record is in its file before it is published, and on the disk before the next is read. Records carry
+    the place of the tip and the mean force over the block, where the device is no replay; they never wait
+    long for it. The device is read in a thread of its own, so that its blocking calls never hold up the
+    executor.
     """
 
     def __init__(self) -> None:
@@ -206,9 +208,11 @@ class ExcitationNode(ManagedNode):
                         raise Cancelled from error
                     raise
                 record = self._record(block, excitation, info)
-                if store is not None:
-                    store.add_record(record)
-                self._records.publish(record_to_message(record))
+                hand_out = partial(self._records.publish, record_to_message(record))
+                if store is None:
+                    hand_out()
+                else:  # what is written no kill of this node can lose; the disk takes its time
+                    store.add_record(record, hand_out)
                 result.blocks += 1
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
