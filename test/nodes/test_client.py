@@ -22,7 +22,6 @@ from tactile_resonance.msg import PointResult
 
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goal_conduct, scan_node
-from tactile_resonance.nodes.frames import Found
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import ScanNode
@@ -231,10 +230,10 @@ def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypat
 
     async def look_up(node, base, names, stamp):
         if not names:
-            return Found()
+            return {}, ""
         asked.append((base, names, stamp))
         await over
-        return Found(missing="there is none")
+        return {}, "there is none"
 
     monkeypatch.setattr(scan_node, "look_up", look_up)
     stack.activate()
