@@ -4,11 +4,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+PART = ".part"
+"""After the name of a file that is being written; whole where its writer was killed waiting for the disk."""
 
-def write_whole(path: Path, content: bytes) -> None:
+
+def write_whole(path: Path, content: bytes, written: Callable[[], None] = lambda: None) -> None:
     """Write a file that is there whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    content : bytes
+    written : callable
+        Called once the end of this process cannot lose the content any more, before the disk has it.
 
     Raises
     ------
@@ -16,12 +27,15 @@ def write_whole(path: Path, content: bytes) -> None:
         If something other than a regular file stands there: a device would be replaced.
     """
     if path.exists() and not path.is_file():
-        raise ValueError(f"output: {path} is not a regular file, expected a new one or one to replace")
-    part = path.with_name(path.name + ".part")
+        raise ValueError(
+            f"output: {path} is not a regular file, expected a new one or one to replace"
+        )
+    part = path.with_name(path.name + PART)
     try:
         with part.open("wb") as file:
             file.write(content)
             file.flush()
+            written()
             os.fsync(file.fileno())
         part.replace(path)
     finally:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from rclpy.client import Client
 from std_srvs.srv import Trigger
@@ -14,6 +15,7 @@ from tactile_resonance import msg
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.multisine import Excitation
+from tactile_resonance.nodes.goals import answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS
@@ -22,8 +24,6 @@ from tactile_resonance.recording.messages import record_from_message, time_from_
 from tactile_resonance.srv import Play
 
 ANSWER_TIMEOUT_S = 10.0
-POLL_S = 5e-4
-ASK_AGAIN_S = 2.0
 
 
 class BenchDevice:
@@ -147,18 +147,9 @@ class BenchDevice:
             self._check()
             raise DeviceError(f"device: {error}") from error
 
-    def _call(self, client: Client, request: object):
-        """Call a service from a worker thread while the executor's thread spins.
-
-        An answer that the bench gives before it has discovered this client is lost: it is asked again.
-        """
-        deadline = time.monotonic() + self._answer_s
-        while time.monotonic() < deadline:
-            future = client.call_async(request)
-            again = min(deadline, time.monotonic() + ASK_AGAIN_S)
-            while time.monotonic() < again:
-                if future.done():
-                    return future.result()
-                time.sleep(POLL_S)
-            client.remove_pending_request(future)
-        raise DeviceError(f"device: no answer on {client.srv_name}")
+    def _call(self, client: Client, request: object) -> Any:
+        """Answer of the bench, asked from a worker thread while the executor's thread spins."""
+        answer = answer_of(client, request, self._answer_s)
+        if answer is None:
+            raise DeviceError(f"device: no answer on {client.srv_name}")
+        return answer

@@ -13,9 +13,8 @@ from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.task import Future
 
-from tactile_resonance.nodes.goals import ASK_AGAIN_S, Goals
+from tactile_resonance.nodes.goals import Goals, answer_of
 from tactile_resonance.scan.hands import NodeAway, ScanEnded
 
 if TYPE_CHECKING:
@@ -75,28 +74,20 @@ class NodeClient(ABC):
         while not done():
             self._check()
             if time.monotonic() > deadline:
-                why = self.why()
-                raise NoAnswer(f"waited {timeout_s:g} s for {what}{f' ({why})' if why else ''}")
+                raise self._no_answer(timeout_s, what)
             self.spin(0.05)
 
     def answer(self, service: Client, request: Any, timeout_s: float = HANGS_S) -> Any:
-        """Answer of a service, which is waited for.
+        """Answer of a service, which is waited for."""
+        check, spin = self._check, self.spin
+        answer = answer_of(service, request, timeout_s, check=check, pause=spin)
+        if answer is None:
+            raise self._no_answer(timeout_s, f"an answer of {service.srv_name}")
+        return answer
 
-        A server that does not know its client yet drops the answer: it is asked again.
-        """
-        self.wait(service.service_is_ready, timeout_s, service.srv_name)
-        answers: list[Future] = []
-        asked_s = 0.0
-
-        def answered() -> bool:
-            nonlocal asked_s
-            if not answers or time.monotonic() - asked_s > ASK_AGAIN_S:
-                answers.append(service.call_async(request))
-                asked_s = time.monotonic()
-            return any(answer.done() for answer in answers)
-
-        self.wait(answered, timeout_s, f"an answer of {service.srv_name}")
-        return next(answer.result() for answer in answers if answer.done())
+    def _no_answer(self, timeout_s: float, what: str) -> NoAnswer:
+        why = self.why()
+        return NoAnswer(f"waited {timeout_s:g} s for {what}{f' ({why})' if why else ''}")
 
     def begin(
         self,

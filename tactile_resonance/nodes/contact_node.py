@@ -129,7 +129,7 @@ class ContactNode(ManagedNode):
         if from_poles:
             clock = self._arm.clock
             began_ns = clock.ros_ns(clock.now_ns())
-            self._touch = TouchFromPoles(false_alarm, self._tell_touch, began_ns)
+            self._touch = TouchFromPoles(false_alarm, began_ns)
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
@@ -309,9 +309,6 @@ class ContactNode(ManagedNode):
         if result is not None and over:
             self._finish(result)
 
-    def _tell_touch(self) -> bool:
-        return self._thread is not None and self._thread.tell_touch()
-
     def _finish(self, result: ContactResult | None) -> None:
         if self._finished is not None and not self._finished.done():
             self._finished.set_result(result)
@@ -322,7 +319,8 @@ class ContactNode(ManagedNode):
             return
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
-            if self._touch.hear(message, thread.controller.state, now_ns):
+            touched = self._touch.hear(message, thread.controller.state, now_ns)
+            if touched and thread.tell_touch():
                 self.get_logger().info("the resonance detects the first contact")
         except ValueError as error:
             self.health.error(f"poles: {error}")

@@ -78,9 +78,7 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         from tactile_resonance.drivers.replay import ReplayDevice
 
         return ReplayDevice(path, speed, _entries_of(path))
-    if device == "nidaqmx":
-        return NiDaqDevice(read_nidaq_config(path))
-    raise ValueError(f"device: {device!r}, accepted are bench, replay, nidaqmx")
+    return NiDaqDevice(read_nidaq_config(path))
 
 
 def replayed_results(node: ManagedNode) -> tuple[bytes, ...]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 from rclpy.action.server import ServerGoalHandle
 
@@ -24,7 +25,7 @@ from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, Manage
 from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
-from tactile_resonance.record import Contact, Origin, Record
+from tactile_resonance.record import Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
 PARAMETERS = (
@@ -37,7 +38,6 @@ PARAMETERS = (
 )
 
 
-# How long a client may take to fetch a result.
 # A device that is read shows life within this beyond the length of a block.
 HUNG_S = 2.0
 
@@ -53,9 +53,10 @@ class Cancelled(Exception):
 class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched), `record`; of a run it replays `point_result`.
 
-    Every record is on disk before it is published. Records carry the place of the tip and the mean force
-    over the block, where the device is no replay; they never wait long for it. The device is read in a
-    thread of its own, so that its blocking calls never hold up the executor.
+    Every record is in its file before it is published, and on the disk before the next is read. Records carry
+    the place of the tip and the mean force over the block, where the device is no replay; they never wait
+    long for it. The device is read in a thread of its own, so that its blocking calls never hold up the
+    executor.
     """
 
     def __init__(self) -> None:
@@ -75,7 +76,6 @@ class ExcitationNode(ManagedNode):
         self._store: RecordStore | None = None
         self._has_store = False
         self._contact = contact_source.make_contact_source(self)
-        self._busy = threading.Lock()
         self._cancelled = threading.Event()
         self._measured: ServerGoalHandle | None = None
         self._measurements = 0
@@ -99,7 +99,16 @@ class ExcitationNode(ManagedNode):
 
     async def _on_goal(self, goal: ServerGoalHandle) -> Measure.Result:
         """Measure in a thread; the executor goes on meanwhile."""
-        result = await in_thread(self, lambda: self._measure(goal), "measure")
+        if self._measured is not None:
+            goal.abort()
+            busy = "a measurement is running, cancel it or wait for its result"
+            return Measure.Result(outcome=Measure.Result.NOT_READY, message=busy)
+        self._cancelled.clear()
+        self._measured = goal
+        try:
+            result = await in_thread(self, lambda: self._measure(goal), "measure")
+        finally:
+            self._measured = None
         # in this thread and at once: a goal that is over may expire before its result is taken
         end = {Measure.Result.DONE: goal.succeed, Measure.Result.CANCELLED: goal.canceled}
         end.get(result.outcome, goal.abort)()
@@ -107,12 +116,6 @@ class ExcitationNode(ManagedNode):
 
     def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
         result = Measure.Result()
-        if not self._busy.acquire(blocking=False):
-            result.outcome = Measure.Result.NOT_READY
-            result.message = "a measurement is running, cancel it or wait for its result"
-            return result
-        self._cancelled.clear()
-        self._measured = goal
         try:
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
@@ -122,7 +125,6 @@ class ExcitationNode(ManagedNode):
             if store is not None:
                 store.begin(excitations)
         except (ValueError, OSError, DeviceError) as error:
-            self._busy.release()
             result.outcome = Measure.Result.REFUSED
             if isinstance(error, NotReady):
                 result.outcome = Measure.Result.NOT_READY
@@ -141,8 +143,6 @@ class ExcitationNode(ManagedNode):
             result.outcome = Measure.Result.FAILED
             result.message = _reason(error)
             self.health.error(f"failed: {result.message}")
-        finally:
-            self._busy.release()
         return result
 
     def _ready_device(self, sample_rate_hz: float) -> DeviceInfo:
@@ -206,9 +206,11 @@ class ExcitationNode(ManagedNode):
                         raise Cancelled from error
                     raise
                 record = self._record(block, excitation, info)
-                if store is not None:
-                    store.add_record(record)
-                self._records.publish(record_to_message(record))
+                hand_out = partial(self._records.publish, record_to_message(record))
+                if store is None:
+                    hand_out()
+                else:  # what is written no kill of this node can lose; the disk takes its time
+                    store.add_record(record, hand_out)
                 result.blocks += 1
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
@@ -232,6 +234,7 @@ class ExcitationNode(ManagedNode):
     def _record(self, block: AcquiredBlock, excitation: Excitation, info: DeviceInfo) -> Record:
         last_period = block.index == excitation.periods - 1
         last_realisation = excitation.realisation == excitation.realisations - 1
+        end_ns = block.time_ns + round(excitation.period_s * 1e9)
         return Record(
             actuator=block.actuator,
             sensor=block.sensor,
@@ -251,12 +254,9 @@ class ExcitationNode(ManagedNode):
                 frame_id=info.frame_id or self._frame_id,
                 label=excitation.label,
                 simulated=info.simulated,
-                contact=block.contact or self._contact_over(block.time_ns, excitation.period_s),
+                contact=block.contact or self._contact.over(block.time_ns, end_ns),
             ),
         )
-
-    def _contact_over(self, start_ns: int, length_s: float) -> Contact:
-        return self._contact.over(start_ns, start_ns + round(length_s * 1e9))
 
 
 def _reason(error: Exception) -> str:

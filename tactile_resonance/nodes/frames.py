@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,22 +52,9 @@ LOOK_EVERY_S = 0.05
 TF = QoSProfile(depth=100)
 
 
-@dataclass(frozen=True)
-class Found:
-    """Where frames stand.
-
-    Attributes
-    ----------
-    poses : dict of str to Pose
-    missing : str
-        Why others are not among them; empty where all are.
-    """
-
-    poses: dict[str, Pose] = field(default_factory=dict)
-    missing: str = ""
-
-
-async def look_up(node: ManagedNode, base: str, names: Sequence[str], stamp: TimeMessage) -> Found:
+async def look_up(
+    node: ManagedNode, base: str, names: Sequence[str], stamp: TimeMessage
+) -> tuple[dict[str, Pose], str]:
     """Look frames up in a base, while the executor goes on.
 
     It listens to TF only meanwhile: idle, each message would cost processor time.
@@ -80,10 +66,16 @@ async def look_up(node: ManagedNode, base: str, names: Sequence[str], stamp: Tim
     names : sequence of str
     stamp : builtin_interfaces.msg.Time
         When they stood there; 0: the newest that is known.
+
+    Returns
+    -------
+    poses : dict of str to Pose
+    missing : str
+        Why others are not among them; empty where all are.
     """
     tf2 = _tf2() if names else None
     if tf2 is None:
-        return Found(missing=ABSENT if names else "")
+        return {}, ABSENT if names else ""
     buffer, over, when = tf2.Buffer(), Future(), Time.from_msg(stamp)
     listener = tf2.TransformListener(buffer, node)
     end_s = time.monotonic() + LOOK_WITHIN_S
@@ -102,7 +94,9 @@ async def look_up(node: ManagedNode, base: str, names: Sequence[str], stamp: Tim
         listener.unregister()
 
 
-def _found(tf2: Any, buffer: Any, base: str, names: Sequence[str], when: Time) -> Found:
+def _found(
+    tf2: Any, buffer: Any, base: str, names: Sequence[str], when: Time
+) -> tuple[dict[str, Pose], str]:
     poses, reasons = {}, []
     for name in names:
         try:
@@ -110,10 +104,10 @@ def _found(tf2: Any, buffer: Any, base: str, names: Sequence[str], when: Time) -
         except tf2.TransformException as error:
             reasons.append(" ".join(str(error).split()))
     if not reasons:
-        return Found(poses)
+        return poses, ""
     tree = yaml.safe_load(buffer.all_frames_as_yaml()) or {}
     known = sorted({*tree, *(of["parent"] for of in tree.values())})
-    return Found(poses, f"tf2: {' '.join(reasons)}; it knows {', '.join(known) or 'none'}")
+    return poses, f"tf2: {' '.join(reasons)}; it knows {', '.join(known) or 'none'}"
 
 
 def broadcast_fixed(node: ManagedNode, parent: str, children: Mapping[str, Pose]) -> None:

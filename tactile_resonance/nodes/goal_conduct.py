@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.action.client import ClientGoalHandle
-from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -94,27 +93,22 @@ class AskedGoal:
 
 
 class GoalConduct:
-    """Conducts one goal at a time, in the executor that spins the node.
+    """Conducts one goal at a time, in the executor that spins the node: one step with each tick of a timer.
 
     Parameters
     ----------
     node : Node
     group : CallbackGroup
-        Of the clients of goals and rejection.
+        Of the clients of goals and rejection; its callbacks exclude each other.
     rejection : callable
         Asks why the newest goal was not accepted; a future of a `Trigger.Response`.
     """
 
     def __init__(self, node: Node, group: CallbackGroup, rejection: Callable[[], Future]) -> None:
-        self._node = node
-        self._rejection = rejection
-        self._begin = node.create_guard_condition(self._conduct, ReentrantCallbackGroup())
+        self._node, self._rejection = node, rejection
         self._timer = node.create_timer(TICK_S, self._on_tick, callback_group=group, clock=STEADY)
         self._timer.cancel()
-        self._tick = Future()
         self.asked: AskedGoal | None = None
-        self._waiting: AskedGoal | None = None  # until it is begun, once
-        self._claim = threading.Lock()
 
     def begin(self, asked: AskedGoal) -> Future:
         """Ask for a goal; return the future of its outcome."""
@@ -122,9 +116,9 @@ class GoalConduct:
             raise RuntimeError(
                 "goal: one of this client is under way; cancel it or await its outcome"
             )
-        self.asked = self._waiting = asked
+        self._steps = self._conduct(asked)
+        self.asked = asked
         self._timer.reset()
-        self._begin.trigger()
         return asked.future
 
     def cancel(self) -> None:
@@ -135,46 +129,34 @@ class GoalConduct:
                 self.asked.handle.cancel_goal_async()
 
     def destroy(self) -> None:
-        """Take timer and guard condition off the node."""
+        """Take the timer off the node."""
         self._node.destroy_timer(self._timer)
-        self._node.destroy_guard_condition(self._begin)
 
     # in the executor
 
     def _on_tick(self) -> None:
-        tick, self._tick = self._tick, Future()
-        tick.set_result(None)
-
-    async def _until(self, holds: Callable[[], bool], within_s: float) -> bool:
-        """Let time pass until something holds, looked at with each tick; whether it does."""
-        deadline_s = time.monotonic() + within_s
-        while not holds():
-            if time.monotonic() > deadline_s:
-                return False
-            await self._tick
-        return True
-
-    async def _conduct(self) -> None:
-        """From the goal to the outcome; an executor of several threads may begin it more than once."""
-        with self._claim:
-            asked, self._waiting = self._waiting, None
-        if asked is None:
+        asked = self.asked
+        if asked is None:  # a timer may fire once more after it was cancelled
             return
         try:
-            ended = await self._send(asked)
-            outcome = await self._follow(asked) if ended is None else ended
-        finally:
+            next(self._steps)
+        except StopIteration as ended:
             self._timer.cancel()
             self.asked = None
-        asked.future.set_result(outcome)
+            asked.future.set_result(ended.value)
 
-    async def _send(self, asked: AskedGoal) -> Any:
+    def _conduct(self, asked: AskedGoal) -> Generator[None, None, Any]:
+        """From the goal to the outcome."""
+        ended = yield from self._send(asked)
+        return (yield from self._follow(asked)) if ended is None else ended
+
+    def _send(self, asked: AskedGoal) -> Generator[None, None, Any]:
         """Send the goal until it is accepted, or return the outcome where it is not; None where it is."""
         waited_for = "no scan_node is there"
         deadline_s = time.monotonic() + asked.wait_s
         while not asked.cancelled and time.monotonic() < deadline_s:
             if not asked.client.server_is_ready():
-                await self._tick
+                yield
                 continue
             # what was asked for may have begun: its answer is waited for even where it is wanted no more
             wanted_s = time.monotonic()
@@ -185,23 +167,25 @@ class GoalConduct:
                     except StopIteration as answered:
                         asked.handle = answered.value
                         break
-                    await self._tick
+                    yield
                     if not asked.cancelled and time.monotonic() < deadline_s:
                         wanted_s = time.monotonic()
                 else:
                     break
             if asked.handle is not None:
                 return None
-            why = self._rejection()
-            if await self._until(why.done, ASK_AGAIN_S) and why.result().success:
+            why, refused_s = self._rejection(), time.monotonic()
+            while not why.done() and time.monotonic() - refused_s < ASK_AGAIN_S:
+                yield
+            if why.done() and why.result().success:
                 return asked.kind(Ending.REJECTED, why.result().message)
             waited_for = "scan_node is not active"
-            await self._tick
+            yield
         if asked.cancelled:
             return asked.kind(Ending.CANCELLED, "cancelled before it was accepted")
         return asked.kind(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
 
-    async def _follow(self, asked: AskedGoal) -> Any:
+    def _follow(self, asked: AskedGoal) -> Generator[None, None, Any]:
         """Outcome of a goal that was accepted."""
         assert asked.handle is not None
         results = list[Future]()
@@ -219,4 +203,4 @@ class GoalConduct:
                     seen_s = time.monotonic()
                 if answer is not None or time.monotonic() - seen_s > GONE_S:
                     return asked.lost()
-                await self._tick
+                yield

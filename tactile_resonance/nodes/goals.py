@@ -20,6 +20,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
+from rclpy.client import Client
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
@@ -154,6 +155,46 @@ class Goals:
         while not future.done() and time.monotonic() < deadline:
             self.pause(POLL_S)
         return future.done()
+
+
+def answer_of(
+    service: Client,
+    request: Any,
+    within_s: float,
+    *,
+    check: Check = lambda: None,
+    pause: Callable[[float], None] = time.sleep,
+) -> Any:
+    """Answer of a service that may be asked twice; None where none comes in time.
+
+    A server that does not know its client yet drops the answer: it is asked again.
+
+    Parameters
+    ----------
+    service : Client
+    request : message
+    within_s : float
+        Longest wait, also for the service to be there [s].
+    check : callable
+        Called while waiting; raises where that has become pointless.
+    pause : callable
+        As that of `Goals`.
+    """
+    asked: list[Future] = []
+    asked_s, deadline_s = -math.inf, time.monotonic() + within_s
+    while (answer := next((each for each in asked if each.done()), None)) is None:
+        check()
+        now_s = time.monotonic()
+        if now_s > deadline_s:
+            break
+        if now_s - asked_s > ASK_AGAIN_S and service.service_is_ready():
+            asked.append(service.call_async(request))
+            asked_s = now_s
+        pause(POLL_S)
+    for each in asked:
+        if not each.done():
+            service.remove_pending_request(each)
+    return None if answer is None else answer.result()
 
 
 def offer(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -53,8 +52,7 @@ class NodeWatch:
 
     def __init__(self, node: ManagedNode, topics: Sequence[str], silent_s: float) -> None:
         self._node, self._topics, self._silent_s = node, tuple(topics), silent_s
-        self._lock = threading.Lock()
-        self._signs: dict[str, _Sign] = {}
+        self._signs: dict[str, _Sign] = {}  # replaced whole, by the executor's thread and the scan's
         self._behind: dict[str, set[str]] = {}  # newest publishers of a topic, which may have gone
         node.listen(msg.Heartbeat, "heartbeat", self._on_beat, BEATS)
 
@@ -65,8 +63,7 @@ class NodeWatch:
         has discovered those made before this watch: nothing that it publishes from then on is missed.
         """
         names = {name for topic in self._topics for name in self._publishers(topic)}
-        with self._lock:
-            return names <= self._signs.keys()
+        return names <= self._signs.keys()
 
     def missing(self) -> str | None:
         """A topic that no node at work publishes, as a sentence; None: all topics are published."""
@@ -102,14 +99,12 @@ class NodeWatch:
     def instances(self, topics: Sequence[str]) -> Instances:
         """Instances of the nodes behind topics that are at work now."""
         names = {name for topic in topics for name in self._publishers(topic)}
-        with self._lock:
-            return {name: self._signs[name].instance for name in names if name in self._signs}
+        return {name: self._signs[name].instance for name in names if name in self._signs}
 
     def changed(self, instances: Instances) -> str | None:
         """Why one of these is not at work any more, as a sentence; None: all are."""
         for name, instance in instances.items():
-            with self._lock:
-                sign = self._signs.get(name)
+            sign = self._signs.get(name)
             if sign is not None and sign.instance != instance:
                 return f"{name} was restarted"
             if problem := self._problem(name):
@@ -120,8 +115,7 @@ class NodeWatch:
         """One of these that is silent for a while, or waits for something itself, for people; empty: none."""
         now_s = time.monotonic()
         for name in instances:
-            with self._lock:
-                sign = self._signs.get(name)
+            sign = self._signs.get(name)
             if sign is None:
                 continue
             if now_s - sign.heard_s > SAID_AFTER_S:
@@ -136,20 +130,17 @@ class NodeWatch:
         try:
             yield
         except error:
-            with self._lock:
-                for name, sign in self._signs.items():
-                    self._signs[name] = _Sign(DOUBTED, sign.instance, sign.heard_s)
+            for name, sign in list(self._signs.items()):
+                self._signs[name] = _Sign(DOUBTED, sign.instance, sign.heard_s)
             raise
 
     def _deactivated(self, node: str) -> bool:
-        with self._lock:
-            sign = self._signs.get(node)
+        sign = self._signs.get(node)
         return sign is not None and sign.state == "inactive" and not self._silence(node)
 
     def _problem(self, node: str) -> str:
         """Why a node is not at work; empty where it is."""
-        with self._lock:
-            sign = self._signs.get(node)
+        sign = self._signs.get(node)
         if sign is None or sign.state == "active":
             return self._silence(node)
         if sign.state == DOUBTED:
@@ -158,8 +149,7 @@ class NodeWatch:
 
     def _silence(self, node: str) -> str:
         """A node, or what it waits for, is silent for too long, as a sentence; empty where neither is."""
-        with self._lock:
-            sign = self._signs.get(node)
+        sign = self._signs.get(node)
         if sign is None:
             return ""
         now_s = time.monotonic()
@@ -181,11 +171,10 @@ class NodeWatch:
 
     def _on_beat(self, message: msg.Heartbeat) -> None:
         now_s, since_s = time.monotonic(), 0.0
-        with self._lock:
-            before = self._signs.get(message.node)
-            if message.waiting_for:
-                same = before is not None and before.waiting_for == message.waiting_for
-                since_s = before.waiting_since_s if same and before is not None else now_s
-            self._signs[message.node] = _Sign(
-                message.state, message.instance, now_s, message.waiting_for, since_s
-            )
+        before = self._signs.get(message.node)
+        if message.waiting_for:
+            same = before is not None and before.waiting_for == message.waiting_for
+            since_s = before.waiting_since_s if same and before is not None else now_s
+        self._signs[message.node] = _Sign(
+            message.state, message.instance, now_s, message.waiting_for, since_s
+        )

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractContextManager
-from functools import partial
 from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
@@ -44,7 +43,6 @@ class OneGoal:
         self._node, self._around = node, around
         self.handle: ServerGoalHandle | None = None
         self.controls: Controls | None = None
-        self._found: dict[int, Any] = {}  # by the check of a goal, by its message
         self._asked = self._rejection = ""
         node.serve(Trigger, rejection, self._on_rejection)
 
@@ -72,7 +70,44 @@ class OneGoal:
         busy : message
             Result of a goal that was accepted beside another one.
         """
-        serve, refusal = partial(self._on_goal, work, done, busy), partial(self._refusal, check)
+        found: dict[int, Any] = {}  # by the check of a goal, by its message
+
+        async def refusal(message: Any) -> str:
+            self._asked = asked = str(message)
+            reason = ""
+            try:
+                self._require_free()
+                checked = await check(message)
+                self._require_free()
+                found[id(message)] = checked
+            except (ValueError, OSError) as error:
+                reason = " ".join(str(error).split())
+                self._node.get_logger().warning(f"goal rejected: {reason}")
+            if self._asked == asked:  # no other came while this one was checked
+                self._rejection = reason
+            return reason
+
+        async def serve(goal: ServerGoalHandle) -> Any:
+            checked = found.pop(id(goal.request))
+            if self.handle is not None:
+                goal.abort()
+                return busy
+            self.handle, self.controls = goal, Controls()
+            if goal.is_cancel_requested:  # before there were controls
+                self.cancel()
+            try:
+                with self._around():
+                    result = await in_thread(self._node, lambda: work(goal, checked), "goal")
+            finally:
+                self.handle = self.controls = None
+            if result.outcome == done:
+                goal.succeed()
+            elif goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+            return result
+
         self._node.act(kind, name, serve, lambda _: self.cancel(), refusal)
 
     def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
@@ -98,22 +133,6 @@ class OneGoal:
         """From now on nothing was rejected."""
         self._rejection = ""
 
-    async def _refusal(self, check: Callable[[Any], Awaitable[Any]], message: Any) -> str:
-        """Why a goal is rejected, kept for who asks; empty where it is accepted."""
-        reason = ""
-        self._asked = asked = str(message)
-        try:
-            self._require_free()
-            found = await check(message)
-            self._require_free()
-            self._found[id(message)] = found
-        except (ValueError, OSError) as error:
-            reason = " ".join(str(error).split())
-            self._node.get_logger().warning(f"goal rejected: {reason}")
-        if self._asked == asked:  # no other came while this one was checked
-            self._rejection = reason
-        return reason
-
     def _require_free(self) -> None:
         if self.handle is not None:
             raise ValueError(RUNNING)
@@ -121,36 +140,3 @@ class OneGoal:
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = bool(self._rejection), self._rejection
         return response
-
-    async def _on_goal(
-        self,
-        work: Callable[[ServerGoalHandle, Any], Any],
-        done: int,
-        busy: Any,
-        goal: ServerGoalHandle,
-    ) -> Any:
-        found = self._found.pop(id(goal.request))
-        if self.handle is not None:
-            goal.abort()
-            return busy
-        self.handle, self.controls = goal, Controls()
-        if goal.is_cancel_requested:  # before there were controls
-            self.cancel()
-        try:
-            with self._around():
-                result = await in_thread(self._node, lambda: self._work(work, goal, found), "goal")
-        finally:
-            self.handle = None
-        if result.outcome == done:
-            goal.succeed()
-        elif goal.is_cancel_requested:
-            goal.canceled()
-        else:
-            goal.abort()
-        return result
-
-    def _work(self, work: Callable[[ServerGoalHandle, Any], Any], goal: Any, found: Any) -> Any:
-        try:
-            return work(goal, found)
-        finally:
-            self.controls = None

@@ -148,8 +148,8 @@ class ScanNode(ManagedNode):
         stamp = message.poses.header.stamp
         good = stamp.sec >= 0 and stamp.nanosec < 1_000_000_000
         require(good, "poses.header.stamp", (stamp.sec, stamp.nanosec), "a time, or 0")
-        found = await look_up(self, frames.base, named_frames(goal, frames), stamp)
-        frames = replace(frames, others=found.poses, no_others=found.missing)
+        poses, missing = await look_up(self, frames.base, named_frames(goal, frames), stamp)
+        frames = replace(frames, others=poses, no_others=missing)
         new_run(goal, frames, self._files, forces=self._hands.free_air)
         return frames
 

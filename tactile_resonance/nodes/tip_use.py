@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import time
-
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.nodes.goals import POLL_S
+from tactile_resonance.nodes.goals import answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.scan.clearance import TipUse
 from tactile_resonance.sensor import sensor_named
@@ -32,18 +30,10 @@ class TipUseClient:
 
     def ask(self, sensor: str) -> TipUse | None:
         """The use of a sensor of ``config/sensors``; None where no node of ours answers in time."""
-        deadline = time.monotonic() + ANSWERED_WITHIN_S
-        while not self._client.service_is_ready():
-            if time.monotonic() > deadline:
-                return None
-            time.sleep(POLL_S)
-        answer = self._client.call_async(GetParameters.Request(names=NAMES))
-        while not answer.done():
-            if time.monotonic() > deadline:
-                self._client.remove_pending_request(answer)
-                return None
-            time.sleep(POLL_S)
-        told = [parameter_value_to_python(value) for value in answer.result().values]
+        answer = answer_of(self._client, GetParameters.Request(names=NAMES), ANSWERED_WITHIN_S)
+        if answer is None:
+            return None
+        told = [parameter_value_to_python(value) for value in answer.values]
         if len(told) != len(NAMES) or None in told:
             return None
         values = dict(zip((name.rpartition(".")[2] for name in NAMES), told, strict=True))

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
@@ -30,17 +28,12 @@ class TouchFromPoles:
     ----------
     false_alarm_probability : float
         Of one block.
-    tell : callable
-        Passes a touch on; whether it was new and of use.
     now_ns : int
         ROS time now [ns]: of what was before nothing is known.
     """
 
-    def __init__(
-        self, false_alarm_probability: float, tell: Callable[[], bool], now_ns: int
-    ) -> None:
+    def __init__(self, false_alarm_probability: float, now_ns: int) -> None:
         self._touch = PolesTouch(false_alarm_probability)
-        self._tell = tell
         self._air_ns = self._clear_ns = now_ns
 
     def moved(self, state: State, now_ns: int) -> None:
@@ -69,7 +62,7 @@ class TouchFromPoles:
             return False
         if state is not State.APPROACH or not self._touch.ready or began_ns < self._clear_ns:
             return False
-        return self._touch.touched(*_pole(poles)) and self._tell()
+        return self._touch.touched(*_pole(poles))
 
 
 def _pole(poles: Poles) -> tuple[FloatArray, FloatArray]:

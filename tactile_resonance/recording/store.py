@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tactile_resonance.files import PART
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.stored_file import read_stored, sync_folder, write_stored
@@ -81,11 +82,14 @@ class RecordStore:
         folder = self._folder_of(excitation.measurement_id)
         write_stored(folder / f"excitation-{excitation.realisation:05d}.npz", excitation)
 
-    def add_record(self, record: Record) -> None:
-        """Write one block; OSError where that fails."""
+    def add_record(self, record: Record, written: Callable[[], None] = lambda: None) -> None:
+        """Write one block; OSError where that fails.
+
+        `written` is called once a kill of this process cannot lose it any more, before the disk has it.
+        """
         folder = self._folder_of(record.origin.measurement_id)
         name = f"record-{record.realisation:05d}-{record.block_index:07d}.npz"
-        write_stored(folder / name, record)
+        write_stored(folder / name, record, written)
 
     def _folder_of(self, measurement_id: int) -> Path:
         if measurement_id not in self._measurements:
@@ -124,7 +128,10 @@ class StoredMeasurement:
         """From excitations and records in any order; of those of one place the last counts."""
         played = {excitation.realisation: excitation for excitation in excitations}
         taken = {(record.realisation, record.block_index): record for record in records}
-        in_order = tuple(played[m] for m in sorted(played)), tuple(taken[at] for at in sorted(taken))
+        in_order = (
+            tuple(played[m] for m in sorted(played)),
+            tuple(taken[at] for at in sorted(taken)),
+        )
         return cls(measurement_id, *in_order, tuple(problems))
 
     @property
@@ -190,15 +197,14 @@ def _read(entry: StoredEntry) -> StoredMeasurement:
     records: list[Record] = []
     problems: list[str] = []
     for path in sorted(entry.path.iterdir()):
-        if path.name.endswith(".npz.part"):
-            continue  # being written when its writer was killed; nobody has seen it
+        name = path.name.removesuffix(PART)
         try:
-            if match := _EXCITATION.fullmatch(path.name):
+            if match := _EXCITATION.fullmatch(name):
                 excitation = read_stored(path, Excitation)
                 found: tuple[int, ...] = (excitation.measurement_id, excitation.realisation)
                 _check_name(path, found, (entry.measurement_id, int(match[1])))
                 excitations.append(excitation)
-            elif match := _RECORD.fullmatch(path.name):
+            elif match := _RECORD.fullmatch(name):
                 record = read_stored(path, Record)
                 found = (record.origin.measurement_id, record.realisation, record.block_index)
                 _check_name(path, found, (entry.measurement_id, int(match[1]), int(match[2])))
@@ -206,7 +212,10 @@ def _read(entry: StoredEntry) -> StoredMeasurement:
             else:
                 raise ValueError(f"{path.name}: neither excitation nor record")
         except ValueError as error:
-            problems.append(f"{entry.path.name}/{error}")
+            if (
+                name == path.name
+            ):  # else it was being written when its writer ended; nobody has seen it
+                problems.append(f"{entry.path.name}/{error}")
     return StoredMeasurement.of(entry.measurement_id, excitations, records, problems)
 
 

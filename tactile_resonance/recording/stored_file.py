@@ -8,7 +8,7 @@ import os
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -30,7 +30,9 @@ _DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedErr
            SyntaxError, MemoryError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 
 
-def write_stored(path: Path, value: Excitation | Record) -> None:
+def write_stored(
+    path: Path, value: Excitation | Record, written: Callable[[], None] = lambda: None
+) -> None:
     """Write one object durably: a reader, or a power cut, finds the whole file or none.
 
     Parameters
@@ -40,6 +42,8 @@ def write_stored(path: Path, value: Excitation | Record) -> None:
     value : Excitation or Record
         Each field becomes one array named after it (``origin.contact.force_n``). Integer arrays are
         held in the smallest signed type that holds them exactly.
+    written : callable
+        See `write_whole`.
 
     Raises
     ------
@@ -54,7 +58,7 @@ def write_stored(path: Path, value: Excitation | Record) -> None:
     content["fields"] = np.array(sorted(content))
     buffer = io.BytesIO()
     np.savez(buffer, **content)  # type: ignore[arg-type]
-    write_whole(path, buffer.getvalue())
+    write_whole(path, buffer.getvalue(), written)
     sync_folder(path.parent)
 
 

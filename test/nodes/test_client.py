@@ -6,7 +6,6 @@ import math
 import os
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -23,7 +22,6 @@ from tactile_resonance.msg import PointResult
 
 from tactile_resonance.client import Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goal_conduct, scan_node
-from tactile_resonance.nodes.frames import Found
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import ScanNode
@@ -142,28 +140,20 @@ def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
     assert stack.ended(future).ending is Ending.CANCELLED
 
 
-def test_a_goal_is_sent_once_however_often_an_executor_begins(stack, monkeypatch):
-    """One of several threads takes a guard condition that is still triggered."""
+def test_a_goal_is_sent_once_whatever_the_executor(stack, monkeypatch):
     stack.activate()
-    trigger, heard = stack.client._conduct._begin.trigger, []
-    monkeypatch.setattr(
-        stack.client._conduct, "_begin", SimpleNamespace(trigger=lambda: [trigger() for _ in range(9)])
-    )
-    begun = []
-    conduct = stack.client._conduct._send
+    sent, heard = [], []
+    send = stack.client._scans.send_goal_async
 
-    def counted(asked):
-        begun.append(asked)
-        return conduct(asked)
+    def counted(*arguments, **options):
+        sent.append(options["goal_uuid"])
+        return send(*arguments, **options)
 
-    monkeypatch.setattr(stack.client._conduct, "_send", counted)
+    monkeypatch.setattr(stack.client._scans, "send_goal_async", counted)
     future = stack.begin(heard)
-    for _ in range(9):
-        trigger()
     said = len(heard)
     stack.until(lambda: len(heard) > said + 3)
-    assert len(begun) == 1
-    monkeypatch.undo()
+    assert len({bytes(goal_id.uuid) for goal_id in sent}) == 1
     stack.client.cancel()
     assert stack.ended(future).ending is Ending.CANCELLED
 
@@ -240,10 +230,10 @@ def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypat
 
     async def look_up(node, base, names, stamp):
         if not names:
-            return Found()
+            return {}, ""
         asked.append((base, names, stamp))
         await over
-        return Found(missing="there is none")
+        return {}, "there is none"
 
     monkeypatch.setattr(scan_node, "look_up", look_up)
     stack.activate()

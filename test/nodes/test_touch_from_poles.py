@@ -43,13 +43,9 @@ class Listener:
     def __init__(self, references=3):
         self.told, self.now_ns = 0, BEGAN_NS + 2 * SECOND_NS
         self.rng = np.random.default_rng(2)
-        self.touch = TouchFromPoles(1e-6, self._tell, BEGAN_NS)
+        self.touch = TouchFromPoles(1e-6, BEGAN_NS)
         for _ in range(references):
             self.hear(AIR, State.IDLE)
-
-    def _tell(self):
-        self.told += 1
-        return True
 
     def hear(self, pole, state, length_s=0.8, passed=False, **fields):
         """Let a measurement of so long go by, unless it has passed, and hear of it at its end."""
@@ -57,7 +53,9 @@ class Listener:
         self.touch.moved(state, self.now_ns)
         pole = np.array(pole) + STD * self.rng.standard_normal(2)
         middle_ns = self.now_ns - length_s * SECOND_NS / 2
-        return self.touch.hear(poles(pole, middle_ns, **fields), state, self.now_ns)
+        touched = self.touch.hear(poles(pole, middle_ns, **fields), state, self.now_ns)
+        self.told += touched
+        return touched
 
     def stay(self, state, seconds):
         for _ in range(round(seconds / 0.1)):

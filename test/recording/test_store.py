@@ -248,8 +248,7 @@ store = RecordStore(Path(sys.argv[2]))
 store.begin([excitation])
 store.add_excitation(excitation)
 for block in range(excitation.periods):
-    store.add_record(stores.record(excitation, block))
-    print(block, flush=True)
+    store.add_record(stores.record(excitation, block), lambda: print(block, flush=True))
 """
 
 

@@ -15,9 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from tactile_resonance import msg
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.measure_client import ScanRecorder
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initialised
-from tactile_resonance.nodes.scan_recorder import ScanRecorder
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
