@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.poles.likelihood import Arrays, planes
+from tactile_resonance.poles.likelihood import BLOCK, Arrays, planes
 from tactile_resonance.poles.tables import Tables, compiled, from_planes, in_blocks
 
 FloatArray = npt.NDArray[np.float64]
@@ -147,12 +147,16 @@ class BinData:
     @property
     def y_driven(self) -> ComplexArray:
         """(points, M, K_driven) on driven bins."""
-        return self.y[..., self.undriven :]
+        return from_planes(self.y_planes[:, :, -self._driven_blocks :], 0, self.driven)
 
     @property
     def u_driven(self) -> ComplexArray:
         """(points, M, K_driven)."""
-        return self.u[..., self.undriven :]
+        return from_planes(self.u_planes[:, :, -self._driven_blocks :], 0, self.driven)
+
+    @property
+    def _driven_blocks(self) -> int:
+        return -(-self.driven // BLOCK)
 
     @cached_property
     def arrays(self) -> Arrays:

@@ -24,8 +24,6 @@ from tactile_resonance.poles.result import PolesBatch
 
 ComplexArray = npt.NDArray[np.complex128]
 
-# Points whose arrays fit the cache.
-CHUNK = 250
 METHOD = "joint maximum likelihood of poles and transient"
 
 
@@ -84,9 +82,7 @@ class JointPlan(JointLayout):
         u, y = self._checked(u, y)
         shape = y.shape[:-1]
         flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
-        starts = range(0, max(flat_u.shape[0], 1), CHUNK)
-        parts = [fit_bins(self, flat_u[k : k + CHUNK], flat_y[k : k + CHUNK]) for k in starts]
-        return result_of(self, JointFit.joined(parts), shape, METHOD, self.level_known)
+        return result_of(self, fit_bins(self, flat_u, flat_y), shape, METHOD, self.level_known)
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Bins of both channels, of one shape (..., K)."""

@@ -25,6 +25,8 @@ BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
+# Points that are fitted together: enough for what a call costs, few enough for the cache.
+CHUNK = 1000
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
 # How often the noise is taken anew, and the change of its variance below which it is the same.
@@ -118,7 +120,7 @@ class _Level:
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
-    """Fit of a few points.
+    """Fits of points.
 
     Parameters
     ----------
@@ -132,17 +134,27 @@ def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
     the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
     its level is taken once more, from where the fit ended.
     """
-    fit = _fit(layout, u, y)
+    fit = _in_chunks(layout, u, y)
     doubtful = np.full(u.shape[0], layout.other_bins.size > 0)
     for _ in range(MOST_RETURNS):
         doubtful &= (fit.suspect | (fit.kind != KINDS[0])) & _may_return(fit)
         if not doubtful.any():
             break
         before = fit.noise[:, 0]
-        again = _fit(layout, u[doubtful], y[doubtful], fit.theta[doubtful])
+        again = _in_chunks(layout, u[doubtful], y[doubtful], fit.theta[doubtful])
         fit = fit.replaced(doubtful, again)
         doubtful &= np.abs(fit.noise[:, 0] - before) > SAME_LEVEL * before
     return fit
+
+
+def _in_chunks(
+    layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
+) -> JointFit:
+    """`_fit` of all points, some at a time."""
+    parts = [slice(k, k + CHUNK) for k in range(0, max(len(u), 1), CHUNK)]
+    return JointFit.joined(
+        [_fit(layout, u[part], y[part], None if start is None else start[part]) for part in parts]
+    )
 
 
 def _may_return(fit: JointFit | Solution) -> BoolArray:
@@ -154,7 +166,7 @@ def _may_return(fit: JointFit | Solution) -> BoolArray:
 def _fit(
     layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
 ) -> JointFit:
-    """The fit from coefficients (batch, n) that are near it, or from start values."""
+    """The fit of a few points from coefficients (batch, n) that are near it, or from start values."""
     batch = u.shape[0]
     # finite as a whole only where every bin is
     usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
@@ -196,9 +208,9 @@ def _fit(
         )
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
-        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * mean_power(
-            data.y_driven[:, 0]
-        )
+        rows = np.flatnonzero(suspect)
+        of_noise = (level.scale * data.variance_y.min(axis=(1, 2)))[rows]
+        suspect[rows] = of_noise > ROUNDED * mean_power(data.rows(rows).y_driven[:, 0])
         lacking[~suspect] = np.nan
     systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
     wrong = suspect

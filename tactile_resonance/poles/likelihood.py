@@ -313,12 +313,12 @@ def _turn(u, flat):
 
 
 @njit(**OPTIONS)
-def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, errors, sums, size):
+def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, errors, powers):
     """Sums over the undriven or driven bins of a record; the cost.
 
     Written are, where they are not empty, the normal matrix with half the gradient as a flat (n, n + 1)
     matrix; errors (K,), of undriven bins as they are, of driven ones weighted and turned by the phase of the
-    input; and added to are `sums`, see `undriven_powers`.
+    input; and added to are `powers`, see `_add_power`.
     """
     bins, last, basis, row, place, products, weight, target = part
     y, u, rest, variance_y, variance_u, covariance_yu = data
@@ -346,8 +346,8 @@ def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, err
             cost += _weigh_undriven(here, flat)
         if gram.size > 0:
             _add_up(products, weight, target, block, rows, gram)
-        if sums.size > 0:
-            _add_power(its, BLOCK * block, bins, size, rows, sums)
+        if powers.size > 0:
+            _add_power(its, block, rows, powers)
         if errors.size > 0:
             out, first = ROW_E, BLOCK * block
             if driven:
@@ -372,11 +372,9 @@ def _gram(tables, data, point, theta, kind, memory, gram, cost):
         at = theta[m]
         if undriven.bins > 0:
             cost[0] += _of_part(
-                undriven, False, data, point, m, at, kind, block, gram[m, 0], none, sums, 1
+                undriven, False, data, point, m, at, kind, block, gram[m, 0], none, sums
             )
-        cost[1] += _of_part(
-            driven, True, data, point, m, at, kind, block, gram[m, 1], none, sums, 1
-        )
+        cost[1] += _of_part(driven, True, data, point, m, at, kind, block, gram[m, 1], none, sums)
     return cost[0] + cost[1]
 
 
@@ -487,7 +485,7 @@ def _memory(records, c, n):
     """Memory of a block, a gram, what `_solve` computes in, coefficients, a step, costs."""
     rows = np.zeros((ROWS, BLOCK))
     return (
-        (rows.reshape(-1), rows, np.empty(0, np.complex128), np.empty((4, 0))),
+        (rows.reshape(-1), rows, np.empty(0, np.complex128), np.empty((4, 0, BLOCK))),
         np.zeros((records, 2, n * (n + 1) + 1)),
         np.empty((records, n, n + 1)),
         np.empty((n - c, n - c + 1)),
@@ -548,25 +546,34 @@ def linear_fit(tables, data, theta, kind):
 
 
 @njit(**OPTIONS)
-def _add_power(u, first, bins, size, rows, sums):
-    """Add the powers of a block of undriven bins to `sums`; see `undriven_powers`."""
-    pieces = sums.shape[1]
-    end = min(BLOCK, bins - first)
-    piece, k = min(first // size, pieces - 1), 0
-    while k < end:
-        until = min(end, (piece + 1) * size - first) if piece < pieces - 1 else end
-        of_error = of_u = cross_re = cross_im = 0.0
-        for i in range(k, until):
-            e_re, e_im, u_re, u_im = rows[ROW_E, i], rows[ROW_E + 1, i], u[0, i], u[1, i]
-            of_error += e_re * e_re + e_im * e_im
-            of_u += u_re * u_re + u_im * u_im
-            cross_re += e_re * u_re + e_im * u_im
-            cross_im += e_im * u_re - e_re * u_im
-        sums[0, piece] += of_error
-        sums[1, piece] += of_u
-        sums[2, piece] += cross_re
-        sums[3, piece] += cross_im
-        piece, k = piece + 1, until
+def _add_power(u, block, rows, powers):
+    """Add to powers (4, blocks, BLOCK) of bins those of a block of undriven ones; see `undriven_powers`.
+
+    One loop for each: more than one that is written to would not use vector instructions.
+    """
+    for k in range(BLOCK):
+        e_re, e_im = rows[ROW_E, k], rows[ROW_E + 1, k]
+        powers[0, block, k] += e_re * e_re + e_im * e_im
+    for k in range(BLOCK):
+        powers[1, block, k] += u[0, k] * u[0, k] + u[1, k] * u[1, k]
+    for k in range(BLOCK):
+        powers[2, block, k] += rows[ROW_E, k] * u[0, k] + rows[ROW_E + 1, k] * u[1, k]
+    for k in range(BLOCK):
+        powers[3, block, k] += rows[ROW_E + 1, k] * u[0, k] - rows[ROW_E, k] * u[1, k]
+
+
+@njit(**OPTIONS)
+def _in_pieces(powers, bins, size, out):
+    """Powers (4, blocks, BLOCK) of bins as sums (4, pieces) over `size` of them, the last piece longer."""
+    pieces = out.shape[1]
+    for i in range(4):
+        of_bins = powers[i].reshape(-1)
+        for piece in range(pieces):
+            end = bins if piece == pieces - 1 else (piece + 1) * size
+            its, total = of_bins[piece * size : end], 0.0
+            for k in range(its.size):
+                total += its[k]
+            out[i, piece] = total
 
 
 @_entry
@@ -589,14 +596,14 @@ def undriven_powers(tables, data, theta, size, pieces):
     points, records, n = theta.shape
     memory, _, _, _, at, _, _ = _memory(records, tables.c, n)
     part, none = tables.undriven, np.empty(0)
-    out = np.zeros((points, 4, pieces))
+    out, powers = np.empty((points, 4, pieces)), np.empty((4, part.last.shape[0], BLOCK))
     for point in range(points):
         _inside(theta[point], tables.c, at)
+        powers[:] = 0.0
         for m in range(records):
-            sums = out[point]
-            _of_part(
-                part, False, data, point, m, at[m], EXACT, memory[:2], none, memory[2], sums, size
-            )
+            now, block = at[m], memory[:2]
+            _of_part(part, False, data, point, m, now, EXACT, block, none, memory[2], powers)
+        _in_pieces(powers, part.bins, size, out[point])
     return out
 
 
@@ -637,7 +644,8 @@ def begin(tables, of_driven, data, chance, size, pieces):
     variance_y, variance_u = np.ones((points, 1, 1, 1, 1)), np.zeros((points, 1, 1, 1, 1))
     weighted = Arrays(y, u, rest, variance_y, variance_u, covariance)
     theta, powers = np.full((points, records, n), np.nan), np.zeros((points, 4, pieces))
-    sums, no_gram = np.zeros((4, 1)), np.empty(0)
+    no_gram, whole = np.empty(0), np.empty((4, 1))
+    part, of_bins = tables.undriven, np.empty((4, tables.undriven.last.shape[0], BLOCK))
     for point in range(points):
         found = True
         for kind in (LINEAR_UNWEIGHTED, LINEAR):
@@ -646,49 +654,42 @@ def begin(tables, of_driven, data, chance, size, pieces):
                 if of_driven:
                     here[:] = 0.0
                 else:
-                    _of_part(
-                        tables.undriven, False, data, point, m, now, kind, block, here, none, nothing, 1
-                    )  # fmt: skip
+                    _of_part(part, False, data, point, m, now, kind, block, here, none, nothing)
                 here = gram[m, 1]
-                _of_part(
-                    tables.driven, True, data, point, m, now, kind, block, here, none, nothing, 1
-                )
+                _of_part(tables.driven, True, data, point, m, now, kind, block, here, none, nothing)
             found = found and np.isfinite(_solve(gram, c, n, 0.0, systems, total, step))
             for m in range(records):
                 for i in range(n):
                     at[m, i] = -step[m, i]
         if not found:
             continue
-        sums[:] = 0.0
+        of_bins[:] = 0.0
         for m in range(records):
             here, now = gram[m, 0], at[m]
-            _of_part(
-                tables.undriven, False, data, point, m, now, EXACT, block, here, none, sums,
-                tables.undriven.bins,
-            )  # fmt: skip
-        of_error, of_u = sums[0, 0], sums[1, 0]
-        cross = sums[2, 0] ** 2 + sums[3, 0] ** 2
+            _of_part(part, False, data, point, m, now, EXACT, block, here, none, of_bins)
+        _in_pieces(of_bins, part.bins, part.bins, whole)
+        of_error, of_u = whole[0, 0], whole[1, 0]
+        cross = whole[2, 0] ** 2 + whole[3, 0] ** 2
         if of_error > TINY:
-            variance_y[point] = of_error / (records * tables.undriven.bins)
+            variance_y[point] = of_error / (records * part.bins)
         if not cross > chance * of_error * of_u:
-            variance_u[point] = of_u / (records * tables.undriven.bins)
+            variance_u[point] = of_u / (records * part.bins)
         for m in range(records):
             here, now, factor = gram[m, 0], at[m], 1 / variance_y[point, 0, 0, 0, 0]
             for i in range(here.size):
                 here[i] *= factor
             here = gram[m, 1]
             _of_part(
-                tables.driven, True, weighted, point, m, now, EXACT, block, here, none, nothing, 1
+                tables.driven, True, weighted, point, m, now, EXACT, block, here, none, nothing
             )
         if np.isfinite(_solve(gram, c, n, 0.0, systems, total, step)):
             for m in range(records):
                 for i in range(n):
                     at[m, i] -= step[m, i]
+        of_bins[:] = 0.0
         for m in range(records):
-            now, its = at[m], powers[point]
-            _of_part(
-                tables.undriven, False, data, point, m, now, EXACT, block, no_gram, none, its, size
-            )  # fmt: skip
+            _of_part(part, False, data, point, m, at[m], EXACT, block, no_gram, none, of_bins)
+        _in_pieces(of_bins, part.bins, size, powers[point])
         _outside(at, c, theta[point])
     return theta, powers
 
@@ -705,9 +706,7 @@ def undriven_errors(tables, data, theta):
         _inside(theta[point], tables.c, at)
         for m in range(records):
             here = out[point, m]
-            _of_part(
-                part, False, data, point, m, at[m], EXACT, memory[:2], none, here, memory[3], 1
-            )
+            _of_part(part, False, data, point, m, at[m], EXACT, memory[:2], none, here, memory[3])
     return out
 
 
@@ -784,7 +783,7 @@ def minimise(tables, data, start, iterations, tolerance, rounding):
         part_cost[point] = part_now
         for m in range(records):
             errors, block = residual[point, m], memory[:2]
-            _of_part(driven, True, data, point, m, at[m], EXACT, block, none, errors, memory[3], 1)
+            _of_part(driven, True, data, point, m, at[m], EXACT, block, none, errors, memory[3])
         _unpacked(here, c, gradient, normal[point])
         _outside(at, c, theta[point])
     return theta, normal, cost, part_cost, residual, converged

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.poles.joint import CHUNK, ComplexArray, JointPlan, result_of
-from tactile_resonance.poles.joint_fit import JointFit
+from tactile_resonance.poles.joint import ComplexArray, JointPlan, result_of
+from tactile_resonance.poles.joint_fit import CHUNK, JointFit
 from tactile_resonance.poles.joint_layout import IntArray, JointLayout
 from tactile_resonance.poles.model_error import richer
 from tactile_resonance.poles.realisations_fit import fit_realisations
