@@ -17,25 +17,34 @@ from typing import Protocol, TypeVar
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import Six, six
+from tactile_resonance.fields import check_within
+
+COMMAND_RANGES: dict[str, tuple[float, float]] = {
+    "max_speed_m_s": (1e-4, 1.5),
+    "max_turn_rad_s": (1e-4, math.pi),
+    "max_acceleration_m_s2": (1e-3, 20.0),
+}
+"""Accepted range of each number of `CommandLimits`, ends included."""
 
 
-class CommandLimits(Protocol):
-    """Fields that the configuration of every arm has."""
+@dataclass(frozen=True, kw_only=True)
+class CommandLimits:
+    """What the configuration of every arm allows of a command; faster ones are refused.
 
-    @property
-    def max_speed_m_s(self) -> float:
-        """Of the tip [m/s]."""
-        ...
+    Attributes
+    ----------
+    max_speed_m_s, max_turn_rad_s : float
+        Of the tip [m/s], [rad/s].
+    max_acceleration_m_s2 : float
+        Of a command or a stop [m/s2].
+    """
 
-    @property
-    def max_turn_rad_s(self) -> float:
-        """Of the tip [rad/s]."""
-        ...
+    max_speed_m_s: float = 0.25
+    max_turn_rad_s: float = 1.0
+    max_acceleration_m_s2: float = 2.0
 
-    @property
-    def max_acceleration_m_s2(self) -> float:
-        """Of a command or a stop [m/s2]."""
-        ...
+    def __post_init__(self) -> None:
+        check_within(self, **COMMAND_RANGES)
 
 
 def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:

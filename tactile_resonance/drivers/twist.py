@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from tactile_resonance.contact.interfaces import CommandLimits
 from tactile_resonance.contact.samples import PoseOfSix
 from tactile_resonance.contact.vectors import (
     ZERO,
@@ -39,15 +40,12 @@ RANGES: dict[str, tuple[float, float]] = {
     "max_command_gap_s": (0.004, 0.5),
     "follow_s": (0.005, 0.5),
     "follow_m": (1e-4, 0.01),
-    "max_speed_m_s": (1e-4, 1.5),
-    "max_turn_rad_s": (1e-4, math.pi),
-    "max_acceleration_m_s2": (1e-3, 20.0),
 }
-"""Accepted range of each number of `TwistConfig`, ends included."""
+"""Accepted range of each number of its own of `TwistConfig`, ends included."""
 
 
 @dataclass(frozen=True)
-class TwistConfig:
+class TwistConfig(CommandLimits):
     """What `TwistArm` needs to know; see ``config/devices/twist.yaml``.
 
     Attributes
@@ -67,8 +65,6 @@ class TwistConfig:
     follow_s, follow_m : float
         The tip is where it was commanded to be within `follow_s`, give or take `follow_m`, over the last
         second.
-    max_speed_m_s, max_turn_rad_s, max_acceleration_m_s2 : float
-        Faster commands are refused.
     lockstep : bool
         Time is that of a simulated controller: each of its steps is answered by one command.
     """
@@ -82,12 +78,10 @@ class TwistConfig:
     max_command_gap_s: float = 0.040
     follow_s: float = 0.100
     follow_m: float = 1e-3
-    max_speed_m_s: float = 0.25
-    max_turn_rad_s: float = 1.0
-    max_acceleration_m_s2: float = 2.0
     lockstep: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("command_topic", "pose_topic"):
             value = getattr(self, name)
             good = re.fullmatch(TOPIC, value) is not None

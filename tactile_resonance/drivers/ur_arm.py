@@ -34,7 +34,7 @@ from tactile_resonance.drivers.ur_exchange import (
 )
 from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_states import PROGRAM_PLAYING, StateReader, stop_fault
-from tactile_resonance.drivers.ur_time import ArmTime
+from tactile_resonance.drivers.ur_time import ArmTime, LedClock
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
@@ -207,8 +207,6 @@ class UrArm:
         """Simulated time, led from now on; None on the wall clock. See `contact.interfaces.NodeArm`."""
         if not self._time.address:
             return None
-        from tactile_resonance.drivers.led_clock import LedClock  # it needs python-can
-
         return LedClock(self, cell, while_waiting)
 
     def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:

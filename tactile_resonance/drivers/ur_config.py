@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from tactile_resonance.contact.interfaces import CommandLimits
 from tactile_resonance.contact.samples import Pose, PoseOfSix
 from tactile_resonance.fields import check_within, read_dataclass, read_file, require
 
@@ -23,7 +23,7 @@ def _is_loopback(host: str) -> bool:
 
 
 @dataclass(frozen=True)
-class UrArmConfig:
+class UrArmConfig(CommandLimits):
     """What `UrArm` needs to know; see ``config/devices/ur5e.yaml``.
 
     Attributes
@@ -48,8 +48,6 @@ class UrArmConfig:
         its watchdog.
     connect_timeout_s : float
         For the whole of `UrArm.connect`.
-    max_speed_m_s, max_turn_rad_s, max_acceleration_m_s2 : float
-        Faster commands are refused.
     check_dashboard : bool
         Ask the dashboard server for remote control and modes; PolyScope X has none.
     realtime_priority : int
@@ -67,14 +65,12 @@ class UrArmConfig:
     max_state_age_s: float = 0.020
     owner_timeout_s: float = 0.100
     connect_timeout_s: float = 15.0
-    max_speed_m_s: float = 0.25
-    max_turn_rad_s: float = 1.0
-    max_acceleration_m_s2: float = 2.0
     check_dashboard: bool = True
     realtime_priority: int = 0
     kind: Literal["ur"] = "ur"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(bool(self.host), "host", self.host, "a name or an address")
         check_within(
             self,
@@ -83,9 +79,6 @@ class UrArmConfig:
             max_state_age_s=(0.004, 1.0),
             owner_timeout_s=(0.005, 1.0),
             connect_timeout_s=(1.0, 120.0),
-            max_speed_m_s=(1e-4, 1.5),
-            max_turn_rad_s=(1e-4, math.pi),
-            max_acceleration_m_s2=(1e-3, 20.0),
             realtime_priority=(0, 99),
             payload_kg=(0.0, 50.0),
         )

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.interfaces import COMMAND_RANGES
 from tactile_resonance.drivers.twist import RANGES, read_twist_config
 
 GIVEN = yaml.safe_load(share_path("config/devices/twist.yaml").read_text(encoding="utf-8"))
@@ -38,7 +39,7 @@ def test_the_place_of_the_tip_in_the_tool_is_read(read):
     assert read(tip_in_tool=offset).tip_in_tool.vector.tolist() == offset
 
 
-@pytest.mark.parametrize(("name", "limits"), RANGES.items())
+@pytest.mark.parametrize(("name", "limits"), {**RANGES, **COMMAND_RANGES}.items())
 def test_numbers_out_of_range_are_named(read, name, limits):
     low, high = limits
     for value in (0.99 * low, 1.01 * high):
