@@ -185,6 +185,11 @@ class ExcitationNode(ManagedNode):
         planned: int,
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
+
+        def hand_out(record: Record) -> None:
+            self._records.publish(record_to_message(record))
+            result.blocks += 1
+
         if store is not None:
             store.add_excitation(excitation)
         self._excitations.publish(
@@ -201,12 +206,10 @@ class ExcitationNode(ManagedNode):
                         raise Cancelled from error
                     raise
                 record = self._record(block, excitation, info)
-                hand_out = partial(self._records.publish, record_to_message(record))
                 if store is None:
-                    hand_out()
+                    hand_out(record)
                 else:  # what is written no kill of this node can lose; the disk takes its time
-                    store.add_record(record, hand_out)
-                result.blocks += 1
+                    store.add_record(record, partial(hand_out, record))
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
                 )
