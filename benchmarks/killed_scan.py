@@ -99,7 +99,7 @@ class KilledScan:
         self.kills: list[Kill] = []
 
     def __enter__(self) -> KilledScan:
-        from tactile_resonance.nodes.scan_client import ScanClient
+        from tactile_resonance.nodes.client import ScanClient
 
         self._processes = NodeProcesses(self._folder / "log")
         self._client = ScanClient(self._processes.check)

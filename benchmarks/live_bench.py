@@ -20,10 +20,9 @@ from benchmarks.processor import children, cpu_s
 from tactile_resonance import msg
 from tactile_resonance.commands.bench_scan import NODES, Job, node_parameters
 from tactile_resonance.contact.vectors import quaternion_from_vector
-from tactile_resonance.nodes.client import NoAnswer
+from tactile_resonance.nodes.client import NoAnswer, ScanClient
 from tactile_resonance.nodes.goals import Goals
 from tactile_resonance.nodes.running import NEWEST
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.hands import NodeAway
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE

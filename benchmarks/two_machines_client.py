@@ -13,8 +13,8 @@ from rclpy.action import ActionClient
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
+from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.nodes.running import RESULTS
-from tactile_resonance.nodes.scan_client import ScanClient
 
 UP_WITHIN_S = 240.0
 COUNTED = {"record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}

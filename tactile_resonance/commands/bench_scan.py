@@ -223,7 +223,7 @@ def node_parameters(
 def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     # only here: the command answers --help, and reports what is missing, without ROS
     from tactile_resonance.client import Ending
-    from tactile_resonance.nodes.scan_client import ScanClient
+    from tactile_resonance.nodes.client import ScanClient
 
     goal: dict[str, Any] = {"run_directory": job.output, "resume": job.resume}
     if not job.resume:

@@ -121,7 +121,7 @@ def ask(
     from geometry_msgs.msg import Point
 
     from tactile_resonance.client import Ending
-    from tactile_resonance.nodes.scan_client import ScanClient
+    from tactile_resonance.nodes.client import ScanClient
 
     said = [-1]
 

@@ -26,7 +26,7 @@ class _Flow:
 
     total: int = 0
     reported: int = 0
-    last_s: float = field(default=float("nan"))
+    last_s: float = float("nan")
     took_s: list[float] = field(default_factory=list)
 
 

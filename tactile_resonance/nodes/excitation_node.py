@@ -115,7 +115,7 @@ class ExcitationNode(ManagedNode):
         return result
 
     def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
-        result = Measure.Result()
+        result = Measure.Result(outcome=Measure.Result.REFUSED)
         try:
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
@@ -124,25 +124,20 @@ class ExcitationNode(ManagedNode):
             store = self._open_store()
             if store is not None:
                 store.begin(excitations)
-        except (ValueError, OSError, DeviceError) as error:
-            result.outcome = Measure.Result.REFUSED
-            if isinstance(error, NotReady):
-                result.outcome = Measure.Result.NOT_READY
-            result.message = _reason(error)
-            self.health.error(f"refused: {result.message}")
-            return result
-        planned = sum(excitation.periods for excitation in excitations)
-        try:
+            planned = sum(excitation.periods for excitation in excitations)
+            result.outcome = Measure.Result.FAILED  # what an error means from now on
             for excitation in excitations:
                 self._play(goal, excitation, info, store, result, planned)
             result.outcome = Measure.Result.DONE
         except Cancelled:
             result.outcome = Measure.Result.CANCELLED
             result.message = f"cancelled after {result.blocks} blocks"
-        except (OSError, DeviceError) as error:
-            result.outcome = Measure.Result.FAILED
+        except (ValueError, OSError, DeviceError) as error:
+            if isinstance(error, NotReady):
+                result.outcome = Measure.Result.NOT_READY
             result.message = _reason(error)
-            self.health.error(f"failed: {result.message}")
+            failed = result.outcome == Measure.Result.FAILED
+            self.health.error(f"{'failed' if failed else 'refused'}: {result.message}")
         return result
 
     def _ready_device(self, sample_rate_hz: float) -> DeviceInfo:
@@ -190,6 +185,11 @@ class ExcitationNode(ManagedNode):
         planned: int,
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
+
+        def hand_out(record: Record) -> None:
+            self._records.publish(record_to_message(record))
+            result.blocks += 1
+
         if store is not None:
             store.add_excitation(excitation)
         self._excitations.publish(
@@ -206,12 +206,10 @@ class ExcitationNode(ManagedNode):
                         raise Cancelled from error
                     raise
                 record = self._record(block, excitation, info)
-                hand_out = partial(self._records.publish, record_to_message(record))
                 if store is None:
-                    hand_out()
+                    hand_out(record)
                 else:  # what is written no kill of this node can lose; the disk takes its time
-                    store.add_record(record, hand_out)
-                result.blocks += 1
+                    store.add_record(record, partial(hand_out, record))
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
                 )

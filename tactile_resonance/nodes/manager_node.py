@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -72,7 +73,7 @@ class _Managed:
     held: bool = False  # somebody else has deactivated it
     sure_s: float | None = None  # from when on an answer counts that it is not active any more
     due: bool = False  # its turn came while a question was under way
-    next_try_s: float = field(default=0.0)
+    next_try_s: float = 0.0
 
 
 class ManagerNode(Node):
@@ -94,8 +95,8 @@ class ManagerNode(Node):
         self._wanted_up = True
         self._was_up = False
         self.health = Health(self, self._summary, self._details)
-        self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/shut_down", self._on_shut_down)
+        self.create_service(Trigger, "~/start", partial(self._want, True))
+        self.create_service(Trigger, "~/shut_down", partial(self._want, False))
         self.create_timer(QUIET_S, self._tick, clock=STEADY)
         self._often = self.create_timer(TICK_S, self._tick, clock=STEADY)  # until all are up
 
@@ -105,20 +106,11 @@ class ManagerNode(Node):
             self.create_client(GetState, f"{name}/get_state"),
             self.create_client(ChangeState, f"{name}/change_state"),
         )
-
-        def on_event(event: TransitionEvent) -> None:
-            self._on_event(node, event.goal_state.id)
-
+        on_event = partial(self._on_event, node)
         self.create_subscription(TransitionEvent, f"{name}/transition_event", on_event, 10)
         return node
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._want(True, response)
-
-    def _on_shut_down(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._want(False, response)
-
-    def _want(self, up: bool, response: Trigger.Response) -> Trigger.Response:
+    def _want(self, up: bool, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._wanted_up = up
         for node in self._nodes:
             node.refusals, node.next_try_s = 0, 0.0
@@ -127,8 +119,9 @@ class ManagerNode(Node):
         response.message = f"asked; see /diagnostics of {self.get_fully_qualified_name()}"
         return response
 
-    def _on_event(self, node: _Managed, state: int) -> None:
+    def _on_event(self, node: _Managed, event: TransitionEvent) -> None:
         """A node has changed, asked by this one or by somebody else."""
+        state = event.goal_state.id
         if state not in _NAMES:  # it is on its way
             return
         if node.client is node.get and node.pending is not None:

@@ -10,9 +10,8 @@ from rclpy.executors import ExternalShutdownException
 
 from tactile_resonance.action import Scan
 from tactile_resonance.client import Ending, ScanOutcome
-from tactile_resonance.nodes.client import NoAnswer
+from tactile_resonance.nodes.client import NoAnswer, ScanClient
 from tactile_resonance.nodes.parameters import Parameter, declare, values
-from tactile_resonance.nodes.scan_client import ScanClient
 
 PARAMETERS = (
     Parameter(

@@ -42,7 +42,7 @@ class ScanTime:
     def conducted(self) -> Iterator[None]:
         """Conduct; a bench that cannot be reached now is tried again by `go`."""
         if self.simulated:
-            with contextlib.suppress(ClockLostError):
+            with self._while_there():
                 self._join()
         try:
             yield
@@ -64,32 +64,32 @@ class ScanTime:
         if not self.simulated:
             return time.monotonic()
         if self._clock is not None:
-            try:
+            with self._while_there():
                 self._last_ns = self._clock.ask_ns() + self._offset_ns
-            except ClockLostError:
-                self._end()
         return self._last_ns * 1e-9
 
     def go(self) -> None:
         """Let time go on while something needs it, until a device hands a result over."""
         if not self.simulated:
             return
-        with contextlib.suppress(ClockLostError):
-            if self._clock is None:
-                self._join()
-            assert self._clock is not None
-            self._clock.go()
-            return
-        self._end()
+        with self._while_there():
+            (self._clock or self._join()).go()
 
     def seed(self, *integers: int) -> None:
         """Let the noise of the bench follow from integers, three at most, from now on."""
         if self._clock is not None:
-            try:
+            with self._while_there():
                 self._clock.seed(*integers)
-            except ClockLostError:
-                self._end()
 
-    def _join(self) -> None:
+    def _join(self) -> SimulatedClock:
         clock = self._clock = SimulatedClock(self._server, "scan_node", conducts=True)
         self._offset_ns = max(self._offset_ns, self._last_ns - clock.now_ns())
+        return clock
+
+    @contextlib.contextmanager
+    def _while_there(self) -> Iterator[None]:
+        """Conduct no more where the bench has ended."""
+        try:
+            yield
+        except ClockLostError:
+            self._end()

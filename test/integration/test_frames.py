@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.client import Ending
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.ur_config import read_ur_config
-from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 

@@ -17,9 +17,8 @@ from tactile_resonance.action import Measure
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
 from tactile_resonance.configuration import share_path
-from tactile_resonance.nodes.client import HANGS_S
+from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import EXCITATIONS, LATCHED, POINT_RESULTS, POLES, RESULTS
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import PointKind, PointOutcome
 from tactile_resonance.scan.run_content import read_run

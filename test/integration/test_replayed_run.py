@@ -21,9 +21,8 @@ from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.client import Ending
-from tactile_resonance.nodes.client import HANGS_S
+from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 

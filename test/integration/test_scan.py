@@ -18,9 +18,8 @@ from tactile_resonance.action import Scan
 from tactile_resonance import msg
 from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
-from tactile_resonance.nodes.client import HANGS_S
+from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import POINT_RESULTS
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.report.run_report import read_silent
 from tactile_resonance.scan.point_result import PointOutcome

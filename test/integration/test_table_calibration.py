@@ -21,10 +21,9 @@ from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, TRUTH, true_table
 from tactile_resonance.configuration import share_path
-from tactile_resonance.nodes.client import HANGS_S
+from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import STREAM
-from tactile_resonance.nodes.scan_client import ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.table_file import read_table
 

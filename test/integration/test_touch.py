@@ -14,8 +14,7 @@ from tactile_resonance.action import Scan
 
 from tactile_resonance.client import Ending
 from tactile_resonance.commands.bench_scan import NODES
-from tactile_resonance.nodes.client import HANGS_S
-from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE

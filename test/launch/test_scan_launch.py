@@ -25,7 +25,7 @@ from tactile_resonance.msg import ContactState
 
 from launch import LaunchDescription
 from tactile_resonance.client import Ending
-from tactile_resonance.nodes.scan_client import ScanClient
+from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import read_run
 
