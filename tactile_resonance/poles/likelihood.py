@@ -181,7 +181,7 @@ def _combine(basis, row, place, block, coefficients, linear, rows):
 
 
 @njit(**OPTIONS)
-def _weigh_linear(y, u, last, block, weighted, flat):
+def _weigh_linear(y, u, point, m, at, last, block, weighted, flat):
     """Weights of ``A Y - B U - C`` over ``|A|``, or over 1, with the derivatives at 0."""
     for k in range(BLOCK):
         re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
@@ -189,8 +189,8 @@ def _weigh_linear(y, u, last, block, weighted, flat):
         if weighted:
             w /= re * re + im * im
         l_re, l_im = last[block, 0, k], -last[block, 1, k]
-        y_re, y_im = y[0, k], y[1, k]
-        u_re, u_im = u[0, k], u[1, k]
+        y_re, y_im = y[point, m, at, 0, k], y[point, m, at, 1, k]
+        u_re, u_im = u[point, m, at, 0, k], u[point, m, at, 1, k]
         squared, x_re, x_im = w * (y_re * y_re + y_im * y_im), -w * y_re, w * y_im
         z_re, z_im = x_re * l_re - x_im * l_im, x_re * l_im + x_im * l_re
         flat[ROW_AA * BLOCK + k] = squared
@@ -210,7 +210,7 @@ def _weigh_linear(y, u, last, block, weighted, flat):
 
 
 @njit(**OPTIONS)
-def _weigh_undriven(y, flat):
+def _weigh_undriven(y, point, m, at, flat):
     """Errors and weights of a block of undriven bins; its cost."""
     cost = 0.0
     for k in range(BLOCK):
@@ -220,7 +220,7 @@ def _weigh_undriven(y, flat):
         i_re, i_im = re * squared, -im * squared
         c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
         m_re, m_im = c_re * i_re - c_im * i_im, c_re * i_im + c_im * i_re
-        e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
+        e_re, e_im = y[point, m, at, 0, k] - m_re, y[point, m, at, 1, k] - m_im
         w = v * squared
         z_re, z_im = v * (e_re * i_re + e_im * i_im), v * (e_re * i_im - e_im * i_re)
         cost += v * (e_re * e_re + e_im * e_im)
@@ -235,7 +235,7 @@ def _weigh_undriven(y, flat):
 
 
 @njit(**OPTIONS)
-def _weigh_driven(y, u, flat):
+def _weigh_driven(y, u, point, m, at, flat):
     """Errors and weights of a block of driven bins; its cost.
 
     The variance of the error depends on the response: the gradient has its derivative too.
@@ -247,11 +247,11 @@ def _weigh_driven(y, u, flat):
         i_re, i_im = re * squared, -im * squared
         b_re, b_im = flat[ROW_B * BLOCK + k], flat[(ROW_B + 1) * BLOCK + k]
         g_re, g_im = b_re * i_re - b_im * i_im, b_re * i_im + b_im * i_re
-        u_re, u_im = u[0, k], u[1, k]
+        u_re, u_im = u[point, m, at, 0, k], u[point, m, at, 1, k]
         c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
         m_re = c_re * i_re - c_im * i_im + g_re * u_re - g_im * u_im
         m_im = c_re * i_im + c_im * i_re + g_re * u_im + g_im * u_re
-        e_re, e_im = y[0, k] - m_re, y[1, k] - m_im
+        e_re, e_im = y[point, m, at, 0, k] - m_re, y[point, m, at, 1, k] - m_im
         s_re, s_im = flat[ROW_COV * BLOCK + k], flat[(ROW_COV + 1) * BLOCK + k]
         # half the derivative of the variance by g
         d_re = flat[ROW_VU * BLOCK + k] * g_re - s_re
@@ -299,10 +299,10 @@ def _add_up(products, weight, target, block, rows, gram):
 
 
 @njit(**OPTIONS)
-def _turn(u, flat):
+def _turn(u, point, m, at, flat):
     """Weighted errors, turned by the phase of the input, in place of the weights of A with C."""
     for k in range(BLOCK):
-        re, im = u[0, k], u[1, k]
+        re, im = u[point, m, at, 0, k], u[point, m, at, 1, k]
         e_re, e_im = flat[ROW_E * BLOCK + k], flat[(ROW_E + 1) * BLOCK + k]
         squared = re * re + im * im
         nothing = not squared > 0
@@ -332,26 +332,26 @@ def _of_part(part, driven, data, point, m, coefficients, kind, memory, gram, err
     cost = 0.0
     before = y.shape[2] - last.shape[0] if driven else 0
     for block in range(last.shape[0]):
-        here, its = y[point, m, before + block], u[point, m, before + block]
+        at = before + block
         _fill(variance, block, ROW_VY, 1, rows)
         if kind != LINEAR_UNWEIGHTED:
             _combine(basis, row, place, block, coefficients, kind == LINEAR, rows)
         if kind != EXACT:
-            _weigh_linear(here, its, last, block, kind == LINEAR, flat)
+            _weigh_linear(y, u, point, m, at, last, block, kind == LINEAR, flat)
         elif driven:
             _fill(of_input, block, ROW_VU, 1, rows)
             _fill(covariance, block, ROW_COV, 2, rows)
-            cost += _weigh_driven(here, its, flat)
+            cost += _weigh_driven(y, u, point, m, at, flat)
         else:
-            cost += _weigh_undriven(here, flat)
+            cost += _weigh_undriven(y, point, m, at, flat)
         if gram.size > 0:
             _add_up(products, weight, target, block, rows, gram)
         if powers.size > 0:
-            _add_power(its, block, rows, powers)
+            _add_power(u, point, m, block, rows, powers)
         if errors.size > 0:
             out, first = ROW_E, BLOCK * block
             if driven:
-                _turn(its, flat)
+                _turn(u, point, m, at, flat)
                 out = ROW_AC
             for k in range(min(BLOCK, bins - first)):
                 errors[first + k] = complex(rows[out, k], rows[out + 1, k])
@@ -546,7 +546,7 @@ def linear_fit(tables, data, theta, kind):
 
 
 @njit(**OPTIONS)
-def _add_power(u, block, rows, powers):
+def _add_power(u, point, m, block, rows, powers):
     """Add to powers (4, blocks, BLOCK) of bins those of a block of undriven ones; see `undriven_powers`.
 
     One loop for each: more than one that is written to would not use vector instructions.
@@ -555,11 +555,14 @@ def _add_power(u, block, rows, powers):
         e_re, e_im = rows[ROW_E, k], rows[ROW_E + 1, k]
         powers[0, block, k] += e_re * e_re + e_im * e_im
     for k in range(BLOCK):
-        powers[1, block, k] += u[0, k] * u[0, k] + u[1, k] * u[1, k]
+        re, im = u[point, m, block, 0, k], u[point, m, block, 1, k]
+        powers[1, block, k] += re * re + im * im
     for k in range(BLOCK):
-        powers[2, block, k] += rows[ROW_E, k] * u[0, k] + rows[ROW_E + 1, k] * u[1, k]
+        re, im = u[point, m, block, 0, k], u[point, m, block, 1, k]
+        powers[2, block, k] += rows[ROW_E, k] * re + rows[ROW_E + 1, k] * im
     for k in range(BLOCK):
-        powers[3, block, k] += rows[ROW_E + 1, k] * u[0, k] - rows[ROW_E, k] * u[1, k]
+        re, im = u[point, m, block, 0, k], u[point, m, block, 1, k]
+        powers[3, block, k] += rows[ROW_E + 1, k] * re - rows[ROW_E, k] * im
 
 
 @njit(**OPTIONS)

@@ -35,6 +35,8 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
+CACHE_LINE = 64  # bytes
+
 # Weight of the products of two kinds of coefficients, of C, A and B in this order.
 WEIGHTS = {
     (0, 0): ROW_CC,
@@ -152,7 +154,12 @@ def _numbers(pairs: list[tuple]) -> tuple[IntArray, IntArray]:
 def _blocks(rows: list[FloatArray], blocks: int) -> FloatArray:
     """(blocks, rows, BLOCK) of rows (blocks BLOCK,)."""
     values = np.array(rows, float).reshape(len(rows), blocks, BLOCK)
-    return np.ascontiguousarray(values.swapaxes(0, 1))
+    # from a multiple of a cache line on: vectors as long as one would otherwise be read in two halves
+    memory = np.empty(values.nbytes + CACHE_LINE, np.uint8)
+    first = -memory.ctypes.data % CACHE_LINE
+    aligned = memory[first : first + values.nbytes].view(float).reshape(blocks, len(rows), BLOCK)
+    aligned[:] = values.swapaxes(0, 1)
+    return aligned
 
 
 class Tables(NamedTuple):

@@ -308,10 +308,11 @@ def _fill_modes(
 
 
 def _as_csv(rows: npt.NDArray, run: str) -> str:
-    """Lines of a table; numbers with all their digits. The run is the first column, the status the last one."""
+    """Lines of a table, numbers with twelve digits. The run is the first column, the status the last one."""
     if any(mark in run for mark in ',"\n\r'):
         run = '"{}"'.format(run.replace('"', '""'))
-    numbers = ",".join(["%r"] * (len(rows.dtype.names or ()) - 2))
+    kinds = [rows.dtype[name].kind for name in (rows.dtype.names or ())[1:-1]]
+    numbers = ",".join("%.12g" if kind == "f" else "%d" for kind in kinds)
     line = f"{run.replace('%', '%%')},{numbers},%s\n"
     return "".join([line % (*row[1:-1], _STATUSES[row[-1]]) for row in rows.tolist()])
 
@@ -349,3 +350,5 @@ def _begin_process() -> None:
     # an interrupt reaches the whole group; the parent ends its processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # The allocator keeps what a process has once used; pages that are new each time take longer than the sums.
+    np.ones(4_000_000)

@@ -185,7 +185,7 @@ def test_the_npz_holds_the_same_and_several_runs_go_into_one(runs, tmp_path):
     assert [row["run"] for row in rows] == names[points["run"]].tolist()
     assert [row["poles_status"] for row in rows] == statuses[points["poles_status"]].tolist()
     for name in set(points.dtype.names) - {"run", "poles_status"}:
-        np.testing.assert_array_equal(points[name], [float(row[name]) for row in rows])
+        np.testing.assert_allclose([float(row[name]) for row in rows], points[name], rtol=1e-11)
     assert [row["run"] for row in rows].count(str(runs[1])) == 2
 
 
