@@ -78,7 +78,7 @@ def analyse(
         See `frf.estimate.frf_of_record`.
     poles_method : {"auto", "joint", "frf"}
         Poles from all bins of the band together with the transients (`poles.joint`, of
-        several realisations `poles.realisations`), or from the FRF. ``auto`` takes the
+        several realisations `PoleEstimator` there), or from the FRF. ``auto`` takes the
         first unless there is a channel delay to be taken out.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.

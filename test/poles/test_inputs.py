@@ -150,7 +150,7 @@ def test_leading_axes_that_do_not_fit_are_named():
 
 def test_harmonics_kept_with_bins_are_whole_too():
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
-    u, y = (plan.transform(x)[None] for x in record())
+    u, y = (x[None] for x in plan.transform(*record()))
     bins = BandBins(int(plan.bins[0]), u, y, HARMONICS + 0.5, RATE_HZ, SAMPLES, PERIODS)
     with pytest.raises(ValueError, match="harmonics: "):
         identify_poles_from_bins(bins, (200, 300), BARE)
@@ -192,7 +192,7 @@ def test_single_precision_and_read_only_data():
     low = identify_poles(frf(g=g.astype(np.complex64)), structure=BARE)
     assert low.f0_hz == pytest.approx(one.f0_hz, rel=1e-7)
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
-    u, y = (plan.transform(x) for x in record())
+    u, y = plan.transform(*record())
     result = plan.from_bins(u.astype(np.complex64), y.astype(np.complex64))
     assert result.f0_hz == pytest.approx(plan.from_bins(u, y).f0_hz, rel=1e-6)
 

@@ -152,7 +152,9 @@ def test_hum_at_minus_60_db_leaves_the_ellipse_honest(periods):
         return u, y + sum(hum)
 
     found = [p for p in runs([plant], 60, disturb) if p.status is PolesStatus.OK]
-    assert len(found) >= 57  # of 40 lines three are hum: some hide each other, and stay a model error
+    assert (
+        len(found) >= 57
+    )  # of 40 lines three are hum: some hide each other, and stay a model error
     inside = np.count_nonzero(distances(found) < -2 * np.log(0.05))
     assert inside >= 49  # 57 expected, fewer than 49 once in a thousand at the most
 

@@ -21,8 +21,7 @@ from poles.mode_at_250_hz import (
 from scipy import stats
 
 from tactile_resonance.poles.identify import identify_batch, identify_poles
-from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
@@ -43,7 +42,7 @@ def from_records(order, realisations=None):
         kind, shape = PoleEstimator, (RUNS, realisations)
     plan = kind(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), ModelStructure(order, order))
     rng = np.random.default_rng(2)
-    u, y = (plan.transform(x) for x in record(noise=0.0))
+    u, y = plan.transform(*record(noise=0.0))
     variance = 1e-6 / (SAMPLES * PERIODS)
     u, y = (x + circular(rng, (*shape, x.size), v) for x, v in ((u, variance / 100), (y, variance)))
     return plan.from_bins(u, y)
