@@ -64,49 +64,27 @@ class PolynomialBasis:
         """Of the last polynomial."""
         return self.hessenberg.shape[1]
 
-    def at(self, x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    def at(self, x: ComplexArray, derivatives: int = 1) -> ComplexArray:
         """Values and derivatives at other points.
 
         Parameters
         ----------
         x : (...,) complex
+        derivatives : int
 
         Returns
         -------
-        values, derivatives : (..., n + 1) complex
+        (1 + derivatives, ..., n + 1) complex
+            Values, first derivatives, and so on.
         """
-        shape = np.shape(x)
-        values = np.zeros((*shape, self.degree + 1), complex)
-        slopes = np.zeros_like(values)
-        values[..., 0] = 1.0
+        out = np.zeros((1 + derivatives, *np.shape(x), self.degree + 1), complex)
+        out[0, ..., 0] = 1.0
         for k in range(self.degree):
-            column = self.hessenberg[: k + 1, k]
-            scale = self.hessenberg[k + 1, k]
-            values[..., k + 1] = (x * values[..., k] - values[..., : k + 1] @ column) / scale
-            slopes[..., k + 1] = (
-                values[..., k] + x * slopes[..., k] - slopes[..., : k + 1] @ column
-            ) / scale
-        return values, slopes
-
-    def values_at(self, x: ComplexArray) -> ComplexArray:
-        """(..., n + 1) values at other points x (...), without derivatives."""
-        values = np.zeros((*np.shape(x), self.degree + 1), complex)
-        values[..., 0] = 1.0
-        for k in range(self.degree):
-            new = x * values[..., k] - values[..., : k + 1] @ self.hessenberg[: k + 1, k]
-            values[..., k + 1] = new / self.hessenberg[k + 1, k]
-        return values
-
-    def second_derivative(self, x: ComplexArray) -> ComplexArray:
-        """(..., n + 1) second derivatives at points x (...)."""
-        _, slopes = self.at(x)
-        bends = np.zeros_like(slopes)
-        for k in range(self.degree):
-            column = self.hessenberg[: k + 1, k]
-            bends[..., k + 1] = (
-                2 * slopes[..., k] + x * bends[..., k] - bends[..., : k + 1] @ column
-            ) / self.hessenberg[k + 1, k]
-        return bends
+            new = x * out[..., k] - out[..., : k + 1] @ self.hessenberg[: k + 1, k]
+            for order in range(1, 1 + derivatives):
+                new[order] += order * out[order - 1, ..., k]
+            out[..., k + 1] = new / self.hessenberg[k + 1, k]
+        return out
 
     def roots(self, coefficients: FloatArray) -> ComplexArray:
         """Roots of ``sum_k coefficients[k] p_k``, by the eigenvalues of its comrade matrix.

@@ -33,7 +33,7 @@ from tactile_resonance.poles.whiteness import are_smooth
 ROUNDED = 1e-22
 
 
-def identify_poles(
+def identify_frf(
     frf: FRF, band_hz: tuple[float, float] | None = None, structure: ModelStructure | None = None
 ) -> Poles:
     """Poles of a rational model fitted to the lines of a band.
@@ -86,7 +86,7 @@ def identify_batch(
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
 ) -> PolesBatch:
-    """As `identify_poles` for FRFs of many points on the same lines.
+    """As `identify_frf` for FRFs of many points on the same lines.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def identify_spectra(
     dof : int
         Complex degrees of freedom of the covariance; 0 where it is exact.
     band_hz, structure
-        As for `identify_poles`.
+        As for `identify_frf`.
     pooled : bool
         Take both variances, and the correlation, from the whole band where a test finds each flat
         or sloped. A line on which one channel has no variance, where others have one, is left out.

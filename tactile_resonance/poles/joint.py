@@ -254,7 +254,7 @@ class JointPlan:
     @cached_property
     def numerator_on_bins(self) -> ComplexArray:
         """(K, b) values of `numerator_basis` on all bins."""
-        return self.numerator_basis.values_at(self._x)
+        return self.numerator_basis.at(self._x, 0)[0]
 
     @cached_property
     def transient_on_bins(self) -> ComplexArray:

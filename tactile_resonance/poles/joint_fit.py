@@ -9,6 +9,7 @@ record the cost and the smoothness of the residuals tell that, and a search for 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,6 +51,7 @@ class _Round:
 
     Attributes
     ----------
+    plan : JointPlan
     plain : BinData
         Without variances.
     data : BinData
@@ -63,6 +65,7 @@ class _Round:
         Of the variance weighted with that is noise; None where all of it is.
     """
 
+    plan: JointPlan
     plain: BinData
     data: BinData
     solution: Solution
@@ -71,14 +74,63 @@ class _Round:
     share: FloatArray | None = None
 
     def rows(self, which: IntArray) -> _Round:
-        """Some of the points."""
+        """Some of the points, of a round without `share`."""
+        if which.size == self.kind.size:
+            return self
         return _Round(
+            self.plan,
             self.plain.rows(which),
             self.data.rows(which),
             self.solution.rows(which),
             self.noise[which],
             self.kind[which],
         )
+
+    @cached_property
+    def response(self) -> ComplexArray:
+        """(batch, K_e) on excited lines."""
+        return self.plan.problem.response(self.solution.theta[:, 0])
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(batch, K_e) of the residuals of each realisation that is weighted with."""
+        return _variance(self.data, self.response)
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Of the excited lines, of M >= 2 realisations."""
+        return Pieces.of(self.data.driven, self.data.records - 1)
+
+    @cached_property
+    def levels(self) -> Levels:
+        """Of M >= 2 realisations."""
+        by_piece = (self.kind == 2) & (self.share is not None)
+        u = self.data.u_driven
+        return Levels.of(self.plan, self.solution, u, self.variance, self.pieces, by_piece)
+
+    def more_than_rounding(self, level: FloatArray) -> BoolArray:
+        """(batch,) whether a level of the residuals is more than rounding leaves of exact data."""
+        return np.asarray(level * self.variance.min(axis=-1) > ROUNDED * _mean_power(self.data))
+
+    def normal_of_excited(self, part: FloatArray) -> FloatArray:
+        """(batch, M, n, n) covariance of the gradient on excited lines.
+
+        Parameters
+        ----------
+        part : (batch, K_e) float
+            Their variance, of that weighted with.
+        """
+        variance = (self.variance / part)[:, None]
+        changed = replace(self.data, variance_y=variance, variance_u=None, covariance_yu=None)
+        tables = self.plan.problem.tables
+        return moments(tables, changed.arrays, self.solution.theta)[2][:, :, 1]
+
+    def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
+        noise = None
+        if self.share is not None and self.data.undriven:
+            noise = self.normal_of_excited(self.share)
+        return self.levels.covariances(suspect, noise)
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -91,9 +143,9 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     u, y : (batch, M, K) complex
         At its bins, of M records each.
     """
-    # finite as a whole only where every bin is
-    usable = np.asarray(np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2))))
-    if not usable.all():
+    usable = np.ones(len(y), bool)
+    if not np.isfinite(u.sum() + y.sum()):  # finite as a whole only where every bin is
+        usable = np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2)))
         u, y = (np.where(usable[:, None, None], v, 0) for v in (u, y))
     one = np.ones((len(y), 1, 1))
     others = plan.others_at.size
@@ -118,7 +170,7 @@ def _from_noise(plan: JointPlan, plain: BinData, start: FloatArray | None = None
         data, theta, found = with_noise(plan, plain, start)
         noise, kind = found.mean_variances, found.kind
     solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
-    return _Round(plain, data, solution, noise, kind)
+    return _Round(plan, plain, data, solution, noise, kind)
 
 
 def _may_return(fit: Judged | Solution) -> BoolArray:
@@ -166,8 +218,8 @@ def _judged_alone(plan: JointPlan, fitted: _Round, usable: BoolArray, last: bool
         lacking[rows] = lacking_terms(plan, part, theta[rows], inverse[rows], solution.cost[rows])
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
-        least = ROUNDED * _mean_power(data)
-        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > least
+        power = _mean_power(data)
+        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * power
         lacking[~suspect] = np.nan
     wrong = suspect if last else suspect & ~_may_return(solution)  # others are fitted once more
     # real and imaginary part of a circular complex error have half its variance each
@@ -212,49 +264,33 @@ def _mean_power(data: BinData) -> FloatArray:
 
 def _several(plan: JointPlan, plain: BinData, usable: BoolArray) -> Judged:
     """Points of M >= 2 realisations of the phases each: one system, transients of their own."""
-    pieces = Pieces.of(plan.excited_at.size, plain.records - 1)
     first = _from_noise(plan, plain)
-    levels = _levels(plan, first, pieces)
-    changed = _weighted_wrongly(plan, first, levels, pieces)
-    if not changed.any():
-        return _judged(plan, first, first, pieces, usable)
+    changed = _weighted_wrongly(first)
     rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
-    second = before = first.rows(rows)
-    for _ in range(REWEIGHTINGS):
-        second = _from_scatter(plan, second, pieces)
-    judged = _judged(plan, second, before, pieces, usable[rows])
-    if not rest.size:
-        return judged
-    part = first.rows(rest)
-    others = _judged(plan, part, part, pieces, usable[rest])
-    order = np.argsort(np.concatenate([rows, rest]))
-    return Judged.joined([judged, others]).rows(order)
+    parts = []
+    if rows.size:
+        second = before = first.rows(rows)
+        for _ in range(REWEIGHTINGS):
+            second = _from_scatter(second)
+        parts.append(_judged(second, before, usable[rows]))
+    if rest.size or not rows.size:
+        part = first.rows(rest)
+        parts.append(_judged(part, part, usable[rest]))
+    return Judged.joined(parts).rows(np.argsort(np.concatenate([rows, rest])))
 
 
-def _levels(plan: JointPlan, fitted: _Round, pieces: Pieces) -> Levels:
-    by_piece = (fitted.kind == 2) & (fitted.share is not None)
-    variance = _residual_variance(plan, fitted)
-    return Levels.of(plan, fitted.solution, fitted.data.u_driven, variance, pieces, by_piece)
-
-
-def _weighted_wrongly(plan: JointPlan, fitted: _Round, levels: Levels, pieces: Pieces) -> BoolArray:
+def _weighted_wrongly(fitted: _Round) -> BoolArray:
     """(batch,) where realisations differ on excited lines by more than the variances weighted with say.
 
     By more than chance, on the whole or from line to line.
     """
+    plan, levels, pieces = fitted.plan, fitted.levels, fitted.pieces
     changed = levels.distorted()
     if pieces.starts.size > 1:
         changed = changed | ~are_flat(pieces.means(levels.line_variance), pieces.dof)
-    if plan.others_at.size == 0 and plan.input_noise_ratio is None:
+    if fitted.data.undriven == 0 and plan.input_noise_ratio is None:
         changed[:] = True  # nothing is known of the weights but what realisations differ by
-    variance = _residual_variance(plan, fitted)
-    least = ROUNDED * _mean_power(fitted.data)
-    return changed & (levels.excited * variance.min(axis=-1) > least)
-
-
-def _residual_variance(plan: JointPlan, fitted: _Round) -> FloatArray:
-    """(batch, K_e) variance of the residuals of each realisation that is weighted with."""
-    return _variance(fitted.data, _response(plan, fitted))
+    return changed & fitted.more_than_rounding(levels.excited)
 
 
 def _variance(data: BinData, g: ComplexArray) -> FloatArray:
@@ -262,20 +298,12 @@ def _variance(data: BinData, g: ComplexArray) -> FloatArray:
     return np.broadcast_to(data.residual_variance(g)[:, 0], g.shape)
 
 
-def _response(plan: JointPlan, fitted: _Round) -> ComplexArray:
-    """(batch, K_e)."""
-    return plan.problem.response(fitted.solution.theta[:, 0])
-
-
-def _from_scatter(plan: JointPlan, fitted: _Round, pieces: Pieces) -> _Round:
+def _from_scatter(fitted: _Round) -> _Round:
     """Excited lines weighted with what realisations differ by, and fitted again."""
-    theta = fitted.solution.theta
-    g = _response(plan, fitted)
+    plan, levels, theta, g = fitted.plan, fitted.levels, fitted.solution.theta, fitted.response
     gain = g.real**2 + g.imag**2
-    levels = _levels(plan, fitted, pieces)
-    sample = levels.line_variance * _residual_variance(plan, fitted)
-    total, kind = smooth_variance(sample, gain, pieces)
-    if plan.others_at.size:
+    total, kind = smooth_variance(levels.line_variance * fitted.variance, gain, fitted.pieces)
+    if fitted.data.undriven:
         # of distorted lines with too large weights the transients were wrong, and so the noise
         data, _, found = with_noise(plan, fitted.plain, theta)
         noise = found.mean_variances
@@ -294,24 +322,20 @@ def _from_scatter(plan: JointPlan, fitted: _Round, pieces: Pieces) -> _Round:
         noise = np.stack([rest.mean(axis=-1), input_noise[:, 0]], axis=-1)
         share = np.ones_like(total)
     solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
-    return _Round(fitted.plain, data, solution, noise, kind, share)
+    return _Round(plan, fitted.plain, data, solution, noise, kind, share)
 
 
-def _judged(
-    plan: JointPlan, fitted: _Round, first: _Round, pieces: Pieces, usable: BoolArray
-) -> Judged:
+def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
     """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
-    solution, data = fitted.solution, fitted.data
+    plan, solution, levels = fitted.plan, fitted.solution, fitted.levels
     batch, _, _ = solution.theta.shape
     a, b, _ = plan.problem.sizes
-    levels = _levels(plan, fitted, pieces)
     common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
     suspect = are_smooth(common, plan.structure.parameters)
-    if suspect.any():  # what rounding leaves of exact data says nothing
-        variance = levels.excited[:, None] * _residual_variance(plan, fitted)
-        suspect &= variance.min(axis=-1) > ROUNDED * _mean_power(data)
+    if suspect.any():
+        suspect &= fitted.more_than_rounding(levels.excited)
     suspect |= levels.contradicts
-    covariance, total = _covariances(plan, fitted, levels, suspect)
+    covariance, total = fitted.covariances(suspect)
     theta = solution.theta
     judged = Judged(
         theta=np.concatenate(
@@ -329,14 +353,14 @@ def _judged(
         kind=fitted.kind,
         level_known=np.ones(batch, bool),
         noise=fitted.noise * levels.noise_level(suspect)[:, None],
-        systematic=_systematic(plan, data, theta, suspect),
+        systematic=_systematic(plan, fitted.data, theta, suspect),
         lacking=np.full((batch, 3), np.nan),
         remark=np.full(batch, "", object),
     )
-    return _each_by_itself(plan, judged, first, pieces)
+    return _each_by_itself(judged, first)
 
 
-def _each_by_itself(plan: JointPlan, fit: Judged, first: _Round, pieces: Pieces) -> Judged:
+def _each_by_itself(fit: Judged, first: _Round) -> Judged:
     """With the scatter of the poles of each realisation in the total covariance.
 
     Where lines are distorted the resonator is not linear. Then its poles are the mean of those of all
@@ -344,20 +368,21 @@ def _each_by_itself(plan: JointPlan, fit: Judged, first: _Round, pieces: Pieces)
     a resonance that differs would count least, and the bins between harmonics most, where the ringing up
     of a resonator that is not linear tells of another system.
     """
-    theta = first.solution.theta
-    levels = _levels(plan, first, pieces)
+    theta, levels = first.solution.theta, first.levels
     # gradients as independent lines make them, each with the variance that it shows itself
-    inner = _normal_of_excited(plan, first, levels.line_variance)
-    if plan.others_at.size:
+    inner = first.normal_of_excited(levels.line_variance)
+    if first.data.undriven:
         inner = inner + levels.between[:, None, None, None] * first.solution.normal[:, :, 0]
-    spread = Spread.of(plan, first.data, theta, inner, levels.excited_dof)
+    spread = Spread.of(first.plan, first.data, theta, inner, levels.excited_dof)
     distorted = levels.distorted() & spread.known
     weight = np.where(distorted, 1.0, spread.weight)
-    of_first = _covariances(plan, first, levels, np.zeros(weight.size, bool))
-    covariance, total = (
-        np.where(distorted[:, None, None], one, other)
-        for one, other in zip(of_first, (fit.covariance, fit.total), strict=True)
-    )
+    covariance, total = fit.covariance, fit.total
+    if distorted.any():
+        of_first = first.covariances(np.zeros(weight.size, bool))
+        covariance, total = (
+            np.where(distorted[:, None, None], one, other)
+            for one, other in zip(of_first, (covariance, total), strict=True)
+        )
     changed, systematic = fit.theta.copy(), fit.systematic.copy()
     shared = total.shape[1]
     changed[distorted, :shared] = (theta[:, 0, :shared] + spread.step)[distorted]
@@ -376,32 +401,3 @@ def _each_by_itself(plan: JointPlan, fit: Judged, first: _Round, pieces: Pieces)
     )
     rows = np.flatnonzero(weight > 0)
     return fit.replaced(rows, differing.rows(rows))
-
-
-def _covariances(
-    plan: JointPlan, fitted: _Round, levels: Levels, suspect: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
-    noise_alone = fitted.share is None or not plan.others_at.size
-    return levels.covariances(suspect, None if noise_alone else _noise_normal(plan, fitted))
-
-
-def _noise_normal(plan: JointPlan, fitted: _Round) -> FloatArray:
-    """(batch, M, n, n) covariance of the gradient on excited lines from their noise alone."""
-    assert fitted.share is not None
-    return _normal_of_excited(plan, fitted, fitted.share)
-
-
-def _normal_of_excited(plan: JointPlan, fitted: _Round, part: FloatArray) -> FloatArray:
-    """(batch, M, n, n) covariance of the gradient on excited lines.
-
-    Parameters
-    ----------
-    part : (batch, K_e) float
-        Their variance, of that weighted with.
-    """
-    variance = _residual_variance(plan, fitted) / part
-    changed = replace(
-        fitted.data, variance_y=variance[:, None], variance_u=None, covariance_yu=None
-    )
-    return moments(plan.problem.tables, changed.arrays, fitted.solution.theta)[2][:, :, 1]

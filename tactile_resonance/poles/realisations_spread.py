@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.covariance import real_rows
 from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
@@ -159,6 +160,8 @@ class Spread:
     def remarks(self) -> tuple[BoolArray, npt.NDArray[np.object_]]:
         """(batch,) where one realisation contradicts the others, and what is to be told to people."""
         surely = self.chance < MODEL_ERROR_PROBABILITY
+        if not surely.any():
+            return surely, np.full(surely.size, "", object)
         odd, away = self._odd_one()
         size = np.sqrt(np.nan_to_num(self.ratio).max(axis=(1, 2), initial=0.0))
         remarks = np.full(size.size, "", object)
@@ -204,5 +207,4 @@ def _turn(plan: JointPlan, theta: FloatArray) -> FloatArray:
     """(batch, places, 2, a) derivative of (f0_hz, damping_ratio) by the denominator's coefficients."""
     poles = plan.poles_in_band(theta)
     _, sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)  # (batch, places, a)
-    stacked = np.stack([sensitivity.real, sensitivity.imag], axis=-2)
-    return np.asarray(natural_frequency_and_damping_jacobian(poles) @ stacked)
+    return np.asarray(natural_frequency_and_damping_jacobian(poles) @ real_rows(sensitivity))

@@ -226,23 +226,17 @@ class _Model:
 
         0 where a bin is not used.
         """
-        records = self._y.shape[0]
         used = self.excited | self.others
-        of_ab = np.concatenate(
+        by_shared = np.concatenate(
             [
                 -self._output[..., None] * self._p[:, :-1],
                 np.where(self.driven, self._u, 0)[..., None] * self._q,
             ],
             axis=-1,
         )  # (M, K, a + b)
-        c = self._t.shape[1]
-        shared = of_ab.shape[-1]
-        jacobian = np.zeros((records, self.bins.size, shared + records * c), complex)
-        jacobian[..., :shared] = of_ab
-        for m in range(records):
-            jacobian[m, :, shared + m * c : shared + (m + 1) * c] = self._t
         weight = used / np.sqrt(self.variance)
-        falls = falls_without_each(jacobian * (weight / self._a)[:, None], self.errors() * weight)
+        scale = (weight / self._a)[:, None]
+        falls = falls_without_each(by_shared * scale, self._t * scale, self.errors() * weight)
         return np.asarray(falls.mean(axis=0))
 
 
