@@ -23,7 +23,7 @@ from benchmarks.poles_plant import (
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
-from tactile_resonance.poles.identify import identify_batch, identify_poles
+from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.structure import ModelStructure
@@ -150,7 +150,7 @@ def compare_methods(quick: bool) -> list[Method]:
             ),
             Contestant(
                 f"FRF, {model}, single",
-                lambda s=structure: [identify_poles(f, structure=s) for f in few_frfs],
+                lambda s=structure: [identify_frf(f, structure=s) for f in few_frfs],
                 50,
             ),
         ]

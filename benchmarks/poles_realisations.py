@@ -20,7 +20,7 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
-from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.joint import PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -24,9 +24,8 @@ from benchmarks.cubic_resonator import (
     records,
 )
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_records
-from tactile_resonance.poles.realisations import PoleEstimator
 from tactile_resonance.poles.result import (
     Poles,
     PolesBatch,
@@ -96,7 +95,7 @@ def measure(
     count, bins = groups * realisations, list[tuple[FloatArray, FloatArray]]()
     for first in range(0, count, CHUNK):
         u, y = records(rng, min(CHUNK, count - first), periods, CUBIC[distortion_db], snr_db)
-        bins.append((alone.transform(u, "u"), alone.transform(y, "y")))
+        bins.append(alone.transform(u, y))
     u, y = (np.concatenate(c).reshape(groups, realisations, -1) for c in zip(*bins, strict=True))
     one = alone.from_bins(u, y)
     each = np.stack([one.f0_hz[..., 0], one.damping_ratio[..., 0]], axis=-1)  # (groups, M, 2)
@@ -168,8 +167,8 @@ def bench_table(count: int) -> list[str]:
     for k in tqdm(range(count), desc="records", disable=None):
         excitation = design_multisine(level_v=LEVEL_V, seed=k)
         block = bench.start(tissue, seed=k, effects=effects).block(Lines.of(excitation), 2)
-        for bins, channel in ((u, block.actuator), (y, block.sensor)):
-            bins[k] = plan.transform(channel.volts().reshape(2, -1))
+        volts = (channel.volts().reshape(2, -1) for channel in (block.actuator, block.sensor))
+        u[k], y[k] = plan.transform(*volts)
     alone = plan.from_bins(u, y)
     each = np.stack([alone.f0_hz[:, 0], alone.damping_ratio[:, 0]], axis=-1)
     lines = [

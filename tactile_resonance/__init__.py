@@ -20,7 +20,7 @@ _HOMES = {
     "multisine": ("Excitation", "Grid", "design_multisine"),
     "frf.result": ("FRF", "FrfStatus"),
     "poles.identify": ("identify_batch", "identify_spectra"),
-    "poles.realisations": ("PoleEstimator",),
+    "poles.joint": ("PoleEstimator",),
     "poles.result": ("Poles", "PolesBatch", "PolesStatus"),
     "poles.structure": ("ModelStructure",),
     "recording.recording": ("Recording", "make_recording"),

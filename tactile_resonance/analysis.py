@@ -21,7 +21,7 @@ from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.band import strongest_resonance_band
 from tactile_resonance.poles.estimator import POLES_METHODS, second_attempt
-from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -78,7 +78,7 @@ def analyse(
         See `frf.estimate.frf_of_record`.
     poles_method : {"auto", "joint", "frf"}
         Poles from all bins of the band together with the transients (`poles.joint`, of
-        several realisations `poles.realisations`), or from the FRF. ``auto`` takes the
+        several realisations `PoleEstimator` there), or from the FRF. ``auto`` takes the
         first unless there is a channel delay to be taken out.
     with_distortion : bool
         Estimate even and odd distortion too; needs an odd or odd random grid.
@@ -132,7 +132,7 @@ def analyse(
 
     def fit(structure: ModelStructure) -> Poles:
         if bins is None:
-            return identify_poles(silent, band_hz, structure)
+            return identify_frf(silent, band_hz, structure)
         poles = identify_poles_from_bins(bins, band_hz, structure)
         return second_attempt(poles, silent, band_hz, structure)
 

@@ -16,7 +16,7 @@ from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles import identify as poles_stage
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
@@ -213,5 +213,5 @@ def identify_poles(
     """
     _require(data, (Recording, FRF))
     if isinstance(data, FRF):
-        return poles_stage.identify_poles(data, band_hz, structure)
+        return identify_frf(data, band_hz, structure)
     return analyse(data, band_hz=band_hz, structure=structure).poles

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import special
+from scipy.ndimage import median_filter
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -83,7 +84,11 @@ def level_around(
     around = min(window, at.size)
     if around < FEWEST_AROUND:
         return np.zeros(power.size), 0
-    medians = np.median(np.lib.stride_tricks.sliding_window_view(power[at], around), axis=-1)
+    if around < window or window % 2 == 0:
+        medians = np.median(np.lib.stride_tricks.sliding_window_view(power[at], around), axis=-1)
+    else:
+        half = around // 2
+        medians = median_filter(power[at], around)[half : at.size - half]
     nearest = np.searchsorted(at, np.arange(power.size))
     first = np.clip(nearest - around // 2, 0, medians.size - 1)
     return medians[first] * (records / special.gammaincinv(records, 0.5)), around

@@ -41,7 +41,7 @@ class Spectrum:
     """
 
     def __init__(self, samples: FloatArray) -> None:
-        if samples.ndim < 3 or samples.shape[-3] != 2 or samples.size == 0:
+        if samples.ndim < 3 or samples.shape[-3] != 2 or 0 in samples.shape[-2:]:
             raise ValueError(f"samples: shape {samples.shape}, expected (..., 2, P, N)")
         self.samples = samples
 
@@ -49,7 +49,7 @@ class Spectrum:
     def of(cls, u: npt.ArrayLike, y: npt.ArrayLike) -> Spectrum:
         """Of actuator and sensor [V], (..., P, N) each; ValueError unless they are alike."""
         u, y = np.asarray(u), np.asarray(y)
-        if u.ndim < 2 or u.shape != y.shape or u.size == 0:
+        if u.ndim < 2 or u.shape != y.shape or 0 in u.shape[-2:]:
             raise ValueError(f"u, y: shapes {u.shape}, {y.shape}, expected the same (..., P, N)")
         return cls(np.stack([y, u], axis=-3, dtype=float))
 
@@ -69,7 +69,8 @@ class Spectrum:
 
         A cosine of peak a gives a/2. A sample that is missing makes all bins of its channel NaN.
         """
-        whole = self.samples.reshape(*self.samples.shape[:-2], -1)
+        size = self.periods * self.samples_per_period
+        whole = self.samples.reshape(*self.samples.shape[:-2], size)
         return np.asarray(scipy.fft.rfft(whole, axis=-1, norm="forward"))
 
     @cached_property

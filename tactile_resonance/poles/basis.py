@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real-coefficient polynomials that are orthonormal on the lines of the band.
+"""Real-coefficient polynomials that are orthonormal on the lines of the band, and those of transients.
 
 Powers of s over a narrow band are all but parallel; a basis orthonormal on the data makes the same
 polynomials well conditioned (Forsythe 1957; Brubeck, Nakatsukasa, Trefethen, *Vandermonde with
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from tactile_resonance.poles.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -62,49 +64,27 @@ class PolynomialBasis:
         """Of the last polynomial."""
         return self.hessenberg.shape[1]
 
-    def at(self, x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    def at(self, x: ComplexArray, derivatives: int = 1) -> ComplexArray:
         """Values and derivatives at other points.
 
         Parameters
         ----------
         x : (...,) complex
+        derivatives : int
 
         Returns
         -------
-        values, derivatives : (..., n + 1) complex
+        (1 + derivatives, ..., n + 1) complex
+            Values, first derivatives, and so on.
         """
-        shape = np.shape(x)
-        values = np.zeros((*shape, self.degree + 1), complex)
-        slopes = np.zeros_like(values)
-        values[..., 0] = 1.0
+        out = np.zeros((1 + derivatives, *np.shape(x), self.degree + 1), complex)
+        out[0, ..., 0] = 1.0
         for k in range(self.degree):
-            column = self.hessenberg[: k + 1, k]
-            scale = self.hessenberg[k + 1, k]
-            values[..., k + 1] = (x * values[..., k] - values[..., : k + 1] @ column) / scale
-            slopes[..., k + 1] = (
-                values[..., k] + x * slopes[..., k] - slopes[..., : k + 1] @ column
-            ) / scale
-        return values, slopes
-
-    def values_at(self, x: ComplexArray) -> ComplexArray:
-        """(..., n + 1) values at other points x (...), without derivatives."""
-        values = np.zeros((*np.shape(x), self.degree + 1), complex)
-        values[..., 0] = 1.0
-        for k in range(self.degree):
-            new = x * values[..., k] - values[..., : k + 1] @ self.hessenberg[: k + 1, k]
-            values[..., k + 1] = new / self.hessenberg[k + 1, k]
-        return values
-
-    def second_derivative(self, x: ComplexArray) -> ComplexArray:
-        """(..., n + 1) second derivatives at points x (...)."""
-        _, slopes = self.at(x)
-        bends = np.zeros_like(slopes)
-        for k in range(self.degree):
-            column = self.hessenberg[: k + 1, k]
-            bends[..., k + 1] = (
-                2 * slopes[..., k] + x * bends[..., k] - bends[..., : k + 1] @ column
-            ) / self.hessenberg[k + 1, k]
-        return bends
+            new = x * out[..., k] - out[..., : k + 1] @ self.hessenberg[: k + 1, k]
+            for order in range(1, 1 + derivatives):
+                new[order] += order * out[order - 1, ..., k]
+            out[..., k + 1] = new / self.hessenberg[k + 1, k]
+        return out
 
     def roots(self, coefficients: FloatArray) -> ComplexArray:
         """Roots of ``sum_k coefficients[k] p_k``, by the eigenvalues of its comrade matrix.
@@ -145,3 +125,45 @@ class PolynomialBasis:
         roots = np.linalg.eigvals(comrade).astype(complex)
         roots[~finite] = np.nan
         return roots
+
+
+def default_transient_terms(structure: ModelStructure) -> int:
+    """Length of the transient's numerator that suits a structure.
+
+    A transient of the model's own poles alone has `order` terms; every residual term beyond the
+    constant stands for modes outside the band, whose transients are as smooth as their responses.
+    Several modes have two more at least, for they need not lie where `transient_basis` takes them.
+    """
+    residual = min(structure.numerator_order - structure.order, 4)
+    return structure.order + max(residual, 2 if structure.order > 2 else 0)
+
+
+def transient_basis(
+    frequency_hz: FloatArray,
+    terms: int,
+    sample_rate_hz: float,
+    band_hz: tuple[float, float],
+    structure: ModelStructure,
+) -> ComplexArray:
+    """(K, terms) basis of the transient's numerator.
+
+    Samples of ``exp(p t)`` have the spectrum ``T / (1 - exp((p - s) T))``, aliases of ``1 / (s -
+    p)`` included: for n poles a polynomial of order n - 1 in 1/z over ``A(z)``, and ``A(s) / A(z)``
+    hardly depends on the poles. It is taken at pairs +-j w spread evenly over the band, one for each
+    two poles, and at 0 for a last single one.
+    """
+    interval_s = 1 / sample_rate_hz
+    s = 2j * np.pi * frequency_hz
+    basis = PolynomialBasis.on_lines(np.exp(-s * interval_s), terms - 1).values
+    if structure.domain == "z":
+        return basis * np.exp(s * interval_s * structure.order)[:, None]
+    pairs = structure.order // 2
+    low, high = band_hz
+    w = 2 * np.pi * (low + (high - low) * (np.arange(pairs) + 0.5) / max(pairs, 1))
+    factor = np.ones(s.shape, complex)
+    for pole in (*(1j * w), *(-1j * w), *[0.0] * (structure.order % 2)):
+        step = (s - pole) * interval_s
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = -step / np.expm1(-step)
+        factor *= np.where(np.abs(step) < 1e-12, 1.0, ratio)
+    return basis * factor[:, None]

@@ -60,8 +60,14 @@ def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatA
         Of which the first p belong to the sensitivity.
     """
     p = sensitivity.shape[-1]
-    stacked = np.stack([sensitivity.real, sensitivity.imag], axis=-2)  # (..., k, 2, p)
-    return stacked @ parameters[..., None, :p, :p] @ np.swapaxes(stacked, -1, -2)
+    stacked = real_rows(sensitivity)
+    return stacked @ parameters[..., None, :p, :p] @ stacked.swapaxes(-1, -2)
+
+
+def real_rows(values: ComplexArray) -> FloatArray:
+    """(..., 2, p) real and imaginary parts of (..., p)."""
+    parts = np.ascontiguousarray(values).view(float).reshape(*values.shape, 2)
+    return np.ascontiguousarray(parts.swapaxes(-1, -2))
 
 
 def f0_damping_covariance(poles_rad_s: ComplexArray, covariance: FloatArray) -> FloatArray:

@@ -26,8 +26,7 @@ from tactile_resonance.poles.covariance import f0_damping_covariance, real_covar
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.joint_fit import ROUNDED
-from tactile_resonance.poles.joint_noise import rough_noise
-from tactile_resonance.poles.joint_weights import noise_of, weighted
+from tactile_resonance.poles.joint_noise import rough_noise, with_noise
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.result import (
     Poles,
@@ -231,8 +230,7 @@ def _linearised(
         variance_y, variance_u = (v[:, None] for v in rough_noise(error, data.u[0, :, :others]))
         data = replace(data, rest=variance_y, variance_y=variance_y, variance_u=variance_u)
     else:
-        noise = noise_of(plan, data, theta[None, None], plan.noise_bands)
-        data = weighted(data, noise, plan.noise_bands)
+        data, _, _ = with_noise(plan, data, theta[None, None])
     costs, gradients, normals = moments(plan.problem.tables, data.arrays, theta[None, None])
     cost, gradient = float(costs.sum()), gradients[0, 0]
     at = Linearised.of(plan.problem, data, theta)

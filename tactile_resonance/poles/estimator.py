@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -53,7 +53,7 @@ def poles_of_frf(
     if method == "joint" and reason:
         raise ValueError(f"method: joint, but {reason}")
     if method == "frf" or frf.bins is None or reason:
-        poles = identify_poles(frf, band_hz, structure)
+        poles = identify_frf(frf, band_hz, structure)
         if method == "auto" and frf.bins is not None:
             message = "; ".join(filter(None, [poles.message, f"from the FRF: {reason}"]))
             poles = replace(poles, message=message)
@@ -107,7 +107,7 @@ def second_attempt(
     """
     if poles.status is not PolesStatus.NOT_CONVERGED:
         return poles
-    again = identify_poles(frf, band_hz, structure)
+    again = identify_frf(frf, band_hz, structure)
     if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
         also = f"from the FRF: {again.status.value}"
         return replace(poles, message="; ".join(filter(None, [poles.message, also])))

@@ -12,16 +12,11 @@ from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
-from tactile_resonance.poles.judgement import Evidence, assemble
+from tactile_resonance.poles.judgement import Judged, assemble
 from tactile_resonance.poles.line_tones import poles_without_tones
 from tactile_resonance.poles.line_weights import lines_of_frf, lines_of_spectra
 from tactile_resonance.poles.lines_fit import LinesFit, LinesPlan
-from tactile_resonance.poles.model_error import (
-    MODEL_ERROR_PROBABILITY,
-    difference_of_halves,
-    difference_of_models,
-    richer,
-)
+from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
 from tactile_resonance.poles.noise_level import KINDS, VarianceModel
 from tactile_resonance.poles.result import (
     ComplexArray,
@@ -38,7 +33,7 @@ from tactile_resonance.poles.whiteness import are_smooth
 ROUNDED = 1e-22
 
 
-def identify_poles(
+def identify_frf(
     frf: FRF, band_hz: tuple[float, float] | None = None, structure: ModelStructure | None = None
 ) -> Poles:
     """Poles of a rational model fitted to the lines of a band.
@@ -91,7 +86,7 @@ def identify_batch(
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
 ) -> PolesBatch:
-    """As `identify_poles` for FRFs of many points on the same lines.
+    """As `identify_frf` for FRFs of many points on the same lines.
 
     Parameters
     ----------
@@ -153,7 +148,7 @@ def identify_spectra(
     dof : int
         Complex degrees of freedom of the covariance; 0 where it is exact.
     band_hz, structure
-        As for `identify_poles`.
+        As for `identify_frf`.
     pooled : bool
         Take both variances, and the correlation, from the whole band where a test finds each flat
         or sloped. A line on which one channel has no variance, where others have one, is left out.
@@ -207,43 +202,81 @@ def _identify(
     lines = usable.sum(axis=-1)
     batch = lines.size
     parameters = structure.parameters
-    enough = lines >= structure.fewest_lines
     if frequency_hz.size < structure.fewest_lines or batch == 0:
         # bases need points: any will do, nothing is fitted
         places = max(structure.order, structure.numerator_order) + 1
-        nothing = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure)
-        return assemble(Evidence.empty(nothing, lines), structure, band_hz, shape, method)
-    plan = LinesPlan.on_lines(frequency_hz, structure)
+        plan = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure, band_hz)
+        nothing = _nothing(plan, lines)
+        return assemble(nothing, plan.model_of(nothing.theta), structure, band_hz, shape, method)
+    plan = LinesPlan.on_lines(frequency_hz, structure, band_hz)
     fit = plan.fit(data)
-    weighted = fit.covariance * known.information_correction[:, None, None]
-    covariance = weighted if noise is None else _propagated(plan, fit, data, noise)
+    covariance = fit.covariance * known.information_correction[:, None, None]
+    unknown = np.full_like(covariance, np.nan)
+    total = covariance if total_known else unknown
+    if noise is not None:
+        covariance = _propagated(plan, fit, data, noise)
     cost, expected = fit.cost, known.expected_cost(parameters)
-    suspect = level_known & (cost > known.cost_quantile(parameters, 1 - MODEL_ERROR_PROBABILITY))
+    suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
     suspect |= are_smooth(fit.residual, parameters)
-    unknown_total = np.full_like(weighted, np.nan)
-    total = weighted if total_known else unknown_total
-    kind = np.array(KINDS)[known.kind]
+    kind = known.kind
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
         level = fit.cost / np.maximum(lines - parameters / 2, 0.5)
-        weighted = _where(level_known, weighted, fit.covariance * level[:, None, None])
-        covariance = _where(level_known, covariance, unknown_total)
-        total = _where(level_known, total, weighted)
+        covariance = _where(level_known, covariance, unknown)
+        total = _where(level_known, total, fit.covariance * level[:, None, None])
         # what rounding leaves of exact data says nothing
         suspect &= level_known | (level > ROUNDED)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
-        kind = np.where(level_known, kind, "unknown")
-    evidence = Evidence(
-        fit, lines, enough, cost, expected, suspect, covariance, total, kind, level_known
+        kind = np.where(level_known, kind, len(KINDS))
+    systematic = np.zeros((batch, structure.order // 2, 2, 2))
+    if suspect.any():
+        rows = np.flatnonzero(suspect)
+        poles = modes_in_band(fit.model.poles_rad_s()[rows], band_hz)
+        systematic[rows] = systematic_of(plan, data.rows(rows), poles)
+    judged = Judged(
+        theta=fit.theta,
+        lines=lines,
+        condition=fit.condition_number,
+        converged=fit.converged,
+        residual=fit.residual,
+        cost=cost,
+        expected=expected,
+        suspect=suspect,
+        covariance=covariance,
+        total=total,
+        kind=kind,
+        level_known=level_known,
+        noise=np.full((batch, 2), np.nan),
+        systematic=systematic,
+        lacking=np.full((batch, 3), np.nan),
+        remark=np.full(batch, "", object),
     )
-    if suspect.any():
-        evidence = evidence.with_model_error(weighted)
-    result = assemble(evidence, structure, band_hz, shape, method)
-    if suspect.any():
-        systematic = _systematic(plan, fit, data, usable, np.flatnonzero(suspect), band_hz)
-        total = result.total_covariance.reshape((batch, *systematic.shape[1:]))
-        total[suspect] += systematic
-    return result
+    return assemble(judged, fit.model, structure, band_hz, shape, method)
+
+
+def _nothing(plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Judged:
+    """Of too few lines: NaN."""
+    batch, structure = lines.size, plan.structure
+    nan, no = np.full(batch, np.nan), np.zeros(batch, bool)
+    matrix = np.full((batch, structure.parameters, structure.parameters), np.nan)
+    return Judged(
+        theta=np.full((batch, sum(plan.problem.sizes)), np.nan),
+        lines=np.minimum(lines, structure.fewest_lines - 1),
+        condition=nan,
+        converged=no,
+        residual=np.zeros((batch, 0), complex),
+        cost=nan,
+        expected=nan,
+        suspect=no,
+        covariance=matrix,
+        total=matrix,
+        kind=np.full(batch, -1),
+        level_known=~no,
+        noise=np.full((batch, 2), np.nan),
+        systematic=np.zeros((batch, structure.order // 2, 2, 2)),
+        lacking=np.full((batch, 3), np.nan),
+        remark=np.full(batch, "", object),
+    )
 
 
 def _where(rows: npt.NDArray[np.bool_], those: FloatArray, others: FloatArray) -> FloatArray:
@@ -251,38 +284,12 @@ def _where(rows: npt.NDArray[np.bool_], those: FloatArray, others: FloatArray) -
     return np.where(rows[:, None, None], those, others)
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def _systematic(
-    plan: LinesPlan,
-    fit: LinesFit,
-    data: BinData,
-    usable: npt.NDArray[np.bool_],
-    rows: npt.NDArray[np.int64],
-    band_hz: tuple[float, float],
-) -> FloatArray:
-    """(rows, places, 2, 2) what halves of the lines, and one mode more, make of the poles."""
-    poles = []
-    part = data.rows(rows)
-    for parity in (0, 1):
-        left_out = np.arange(usable.shape[1]) % 2 == parity
-        half = replace(part, variance_y=np.where(left_out, np.inf, part.variance_y))
-        poles.append(modes_in_band(plan.compared(half), band_hz))
-    systematic = difference_of_halves(*poles)
-    structure = richer(plan.structure)
-    if usable[rows].sum(axis=-1).min() > structure.fewest_lines:
-        found = LinesPlan.on_lines(plan.frequency_hz, structure).compared(part)
-        systematic = systematic + difference_of_models(
-            modes_in_band(fit.model.poles_rad_s()[rows], band_hz), modes_in_band(found, band_hz)
-        )
-    return systematic
-
-
 def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
     """Covariance (batch, n, n) from a variance (batch, F) other than the one weighted with."""
     with np.errstate(divide="ignore", invalid="ignore"):
         finite, weighted = np.isfinite(data.variance_y), data.variance_y**2 / noise[:, None]
         changed = replace(data, variance_y=np.where(finite, weighted, np.inf))
-    inner = plan.weighted_normal(changed, plan.theta(fit.model))
+    inner = plan.weighted_normal(changed, fit.theta)
     n = inner.shape[-1]
     inverse = 2 * fit.covariance[:, :n, :n]
     return 0.5 * inverse @ inner @ inverse

@@ -1,40 +1,114 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poles and transient together, from all bins of the band of a whole record.
+"""Poles and transient together, from all bins of the band of whole records: plans, made once per kind.
 
 The DFT of P periods from any initial state is exactly ``Y = (B U + C) / A`` on every bin, excited
 or not: the transient is a numerator C over the denominator of the system. Estimating C costs two
 parameters a mode where removing the transient beforehand costs a quarter of the information
 (Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
 sections 6.3.2 and 9.12). The bins between harmonics bring the level of the noise on both channels.
+
+Several realisations of the phases tell stochastic nonlinear distortion from noise, and from errors of
+the model: the best linear approximation is what they have in common (ibid., chapter 4). Estimated are
+one A and B and M numerators C of transients.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from numbers import Integral, Real
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 
-from tactile_resonance.poles.joint_fit import JointFit, fit_bins
-from tactile_resonance.poles.joint_layout import JointLayout
-from tactile_resonance.poles.judgement import Evidence, assemble
-from tactile_resonance.poles.lines_fit import LinesFit
+from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.poles.basis import (
+    PolynomialBasis,
+    default_transient_terms,
+    transient_basis,
+)
+from tactile_resonance.poles.bins import BinData, Problem
+from tactile_resonance.poles.covariance import modes_in_band, pole_quantities
+from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.joint_fit import fit_records
+from tactile_resonance.poles.joint_noise import NoiseBands
+from tactile_resonance.poles.judgement import Judged, assemble
+from tactile_resonance.poles.lacking import Directions
+from tactile_resonance.poles.likelihood import invert
+from tactile_resonance.poles.model import RationalModel, Variable
+from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
 from tactile_resonance.poles.result import PolesBatch
+from tactile_resonance.poles.structure import ModelStructure
 
+FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
+# Records whose arrays fit the cache.
+CHUNK = 250
 METHOD = "joint maximum likelihood of poles and transient"
 
 
-class JointPlan(JointLayout):
-    """Poles from records of one kind; parameters are those of `JointLayout`.
+@dataclass(frozen=True, eq=False)
+class JointPlan:
+    """Poles from records of one kind, one a point: all that does not depend on the samples, made once.
+
+    Parameters
+    ----------
+    sample_rate_hz : float
+    samples_per_period : int
+        N.
+    periods : int
+        P.
+    harmonics : (F,) int or None
+        Excited multiples of ``sample_rate_hz / samples_per_period``; those outside the band are
+        ignored. None for an input that is not periodic: then all bins count as excited, and the
+        input as free of noise.
+    band_hz : (low, high)
+    structure : ModelStructure, optional
+        One mode and six residual terms when absent.
+    transient_terms : int, optional
+        Coefficients of the transient's numerator. When absent those of the model's own modes and of
+        as many residual terms as suit the structure: the transients of modes outside the band are
+        smooth over it, as their responses are.
+    input_noise_ratio : float, optional
+        Variance of the noise on a bin of U over that on a bin of Y. Needed for one period only:
+        with several it is estimated.
+    left_out : tuple of int
+        Bins that are neither: those of tones (`tones`).
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
 
     Examples
     --------
     >>> plan = JointPlan(50e3, 20000, 8, np.arange(4, 4001), (200.0, 300.0))
     >>> poles = plan(u, y)  # u, y: (..., 8, 20000)
     """
+
+    sample_rate_hz: float
+    samples_per_period: int
+    periods: int
+    harmonics: IntArray | None
+    band_hz: tuple[float, float]
+    structure: ModelStructure = field(default_factory=ModelStructure)
+    transient_terms: int | None = None
+    input_noise_ratio: float | None = None
+    left_out: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._check()
+        lines, fewest = self.excited_bins.size, self.structure.fewest_lines
+        if lines <= fewest:
+            raise ValueError(
+                f"band_hz: {self.band_hz} holds {lines} excited lines, "
+                f"{self.structure.parameters} parameters need more than {fewest}"
+            )
+        if self.structure.delay:
+            raise ValueError("structure: the joint estimator takes no delay")
 
     def __call__(self, u: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> PolesBatch:
         """Poles of records.
@@ -54,22 +128,24 @@ class JointPlan(JointLayout):
         ValueError
             If the shapes do not fit the plan.
         """
-        return self.from_bins(*(self.transform(x, name) for x, name in ((u, "u"), (y, "y"))))
+        return self.from_bins(*self.transform(u, y))
 
-    def transform(self, samples: npt.NDArray[np.floating], name: str = "samples") -> ComplexArray:
-        """(..., K) bins of the band of records (..., P, N), scaled by 1 / (P N)."""
-        samples = np.asarray(samples)
-        if samples.dtype.kind not in "iuf":
-            raise ValueError(f"{name}: values of type {samples.dtype}, expected real numbers")
-        shape = (self.periods, self.samples_per_period)
-        if samples.shape[-2:] != shape:
-            raise ValueError(
-                f"{name}: shape {samples.shape}, expected (..., {shape[0]}, {shape[1]})"
-            )
-        record = samples.reshape(*samples.shape[:-2], shape[0] * shape[1])
-        spectrum = scipy.fft.rfft(record, axis=-1)[..., self.bins[0] : self.bins[-1] + 1]
+    def transform(
+        self, u: npt.NDArray[np.floating], y: npt.NDArray[np.floating]
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """(..., K) bins of the band of records (..., P, N) of both channels, scaled by 1 / (P N)."""
+        expected = (self.periods, self.samples_per_period)
+        for name, samples in (("u", np.asarray(u)), ("y", np.asarray(y))):
+            if samples.dtype.kind not in "iuf":
+                raise ValueError(f"{name}: values of type {samples.dtype}, expected real numbers")
+            if samples.shape[-2:] != expected:
+                raise ValueError(
+                    f"{name}: shape {samples.shape}, expected (..., {expected[0]}, {expected[1]})"
+                )
+        record = Spectrum.of(*np.broadcast_arrays(u, y))
         with np.errstate(invalid="ignore", over="ignore"):  # the status tells of such samples
-            return np.asarray(spectrum / record.shape[-1], dtype=complex)
+            here = record.bins[..., self.bins[0] : self.bins[-1] + 1]
+        return here[..., 1, :], here[..., 0, :]
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
         """Poles from the bins of the band of the DFT of whole records.
@@ -80,9 +156,18 @@ class JointPlan(JointLayout):
             At ``bins``.
         """
         u, y = self._checked(u, y)
-        shape = y.shape[:-1]
-        flat_u, flat_y = u.reshape(-1, self.bins.size), y.reshape(-1, self.bins.size)
-        return result_of(self, fit_bins(self, flat_u, flat_y), shape, METHOD, self.level_known)
+        return self._poles(u[..., None, :], y[..., None, :], METHOD)
+
+    def _poles(self, u: ComplexArray, y: ComplexArray, method: str) -> PolesBatch:
+        *shape, records, size = y.shape
+        u, y = (values.reshape(-1, records, size) for values in (u, y))
+        chunk = max(1, CHUNK // records)
+        starts = range(0, max(len(y), 1), chunk)
+        judged = Judged.joined(
+            [fit_records(self, u[k : k + chunk], y[k : k + chunk]) for k in starts]
+        )
+        model = self.model_of(judged.theta)
+        return assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Bins of both channels, of one shape (..., K)."""
@@ -103,49 +188,282 @@ class JointPlan(JointLayout):
         whole = (*shape, self.bins.size)
         return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
 
+    @cached_property
+    def bins(self) -> IntArray:
+        """(K,) all of the band, ascending, of the DFT of the whole record."""
+        samples = self.samples_per_period * self.periods
+        first = max(1, int(np.ceil(self.band_hz[0] / self.resolution_hz - 1e-9)))
+        last = min((samples - 1) // 2, int(np.floor(self.band_hz[1] / self.resolution_hz + 1e-9)))
+        return np.arange(first, last + 1)
 
-def result_of(
-    layout: JointLayout, fit: JointFit, shape: tuple[int, ...], method: str, level_known: bool
-) -> PolesBatch:
-    """What a batch of fits is worth.
+    @cached_property
+    def driven(self) -> BoolArray:
+        """(K,) bins that are excited, left out or not."""
+        if self.harmonics is None:
+            return np.ones(self.bins.size, bool)
+        return np.isin(self.bins, whole_harmonics(self.harmonics) * self.periods)
 
-    Parameters
-    ----------
-    layout : JointLayout
-    fit : JointFit
-    shape : tuple of int
-        Leading axes, of as many points as the batch has.
-    method : str
-    level_known : bool
-        Whether the level of the noise is told by more than the residuals.
+    @cached_property
+    def _kept(self) -> BoolArray:
+        return ~np.isin(self.bins, self.left_out)
+
+    @cached_property
+    def excited_at(self) -> IntArray:
+        """(K_e,) places of the excited bins that are used among all."""
+        return np.flatnonzero(self.driven & self._kept)
+
+    @cached_property
+    def others_at(self) -> IntArray:
+        """(K_o,) places of the bins that show transient and noise alone."""
+        return np.flatnonzero(self._between & self._kept)
+
+    @property
+    def excited_bins(self) -> IntArray:
+        """(K_e,) of the DFT of the whole record."""
+        return self.bins[self.excited_at]
+
+    @property
+    def other_bins(self) -> IntArray:
+        """(K_o,)."""
+        return self.bins[self.others_at]
+
+    @cached_property
+    def order(self) -> IntArray:
+        """Places of the bins of `problem` among all: the others first, then the excited ones."""
+        return np.append(self.others_at, self.excited_at)
+
+    @cached_property
+    def variable(self) -> Variable:
+        """Of the polynomials."""
+        return Variable.for_lines(self.frequency_hz(self.bins), self.structure)
+
+    @cached_property
+    def _x(self) -> ComplexArray:
+        return self.variable.of_frequency(self.frequency_hz(self.bins))
+
+    @cached_property
+    def denominator_basis(self) -> PolynomialBasis:
+        """Orthonormal on all bins."""
+        return PolynomialBasis.on_lines(self._x, self.structure.order)
+
+    @cached_property
+    def numerator_basis(self) -> PolynomialBasis:
+        """Orthonormal on the excited bins."""
+        return PolynomialBasis.on_lines(self._x[self.excited_at], self.structure.numerator_order)
+
+    @cached_property
+    def numerator_on_bins(self) -> ComplexArray:
+        """(K, b) values of `numerator_basis` on all bins."""
+        return self.numerator_basis.at(self._x, 0)[0]
+
+    @cached_property
+    def transient_on_bins(self) -> ComplexArray:
+        """(K, c) basis of the transient's numerator on all bins."""
+        terms = self.transient_terms
+        if terms is None:
+            terms = default_transient_terms(self.structure)
+        return transient_basis(
+            self.frequency_hz(self.bins), terms, self.sample_rate_hz, self.band_hz, self.structure
+        )
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What the fit is made of."""
+        return Problem(
+            self.denominator_basis.values[self.order],
+            self.numerator_basis.values,
+            self.transient_on_bins[self.order],
+        )
+
+    @property
+    def level_known(self) -> bool:
+        """Whether the noise of one record is told by more than the residuals."""
+        return self.other_bins.size > 0 or self.input_noise_ratio is not None
+
+    @cached_property
+    def richer(self) -> JointPlan | None:
+        """With one mode more; None where the band holds too few lines for it."""
+        try:
+            plan = replace(self, structure=richer(self.structure), transient_terms=None)
+        except ValueError:
+            return None
+        return plan
+
+    def noise_bands(self, records: int) -> NoiseBands:
+        """Pieces of the band, for so many records of a point."""
+        if records not in self._noise_bands:
+            self._noise_bands[records] = NoiseBands.of(self.other_bins, self.excited_bins, records)
+        return self._noise_bands[records]
+
+    @cached_property
+    def _noise_bands(self) -> dict[int, NoiseBands]:
+        return {}
+
+    @property
+    def resolution_hz(self) -> float:
+        """Spacing of the bins: one over the duration of the record."""
+        return self.sample_rate_hz / (self.samples_per_period * self.periods)
+
+    def frequency_hz(self, bins: IntArray) -> FloatArray:
+        """Of bins."""
+        return np.asarray(bins * self.resolution_hz, float)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """What a richer model has in addition, on the excited bins."""
+        x = self._x[self.excited_at]
+        return Directions.on_lines(
+            self.frequency_hz(self.excited_bins), x, self.structure.numerator_order
+        )
+
+    @cached_property
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Bases of A, B and C on the excited bins."""
+        at = self.excited_at
+        of_a, of_c = self.denominator_basis.values[at], self.transient_on_bins[at]
+        return of_a, self.numerator_basis.values, of_c
+
+    def model_of(self, theta: FloatArray) -> RationalModel:
+        """The model of coefficients (batch, n)."""
+        a, b, _ = self.problem.sizes
+        return RationalModel(
+            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
+            numerator=theta[:, a : a + b],
+            transient=theta[:, a + b :],
+            variable=self.variable,
+            denominator_basis=self.denominator_basis,
+            numerator_basis=self.numerator_basis,
+        )
+
+    def poles_in_band(self, theta: FloatArray) -> ComplexArray:
+        """(batch, places) poles [rad/s] of coefficients (batch, n)."""
+        roots = self.denominator_basis.roots(self.problem.split(theta)[0])
+        return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
+
+    def compared(
+        self, data: BinData, start: FloatArray | None = None
+    ) -> tuple[ComplexArray, FloatArray | None]:
+        """Poles (points, places) of a fit that others are compared with, and their covariance.
+
+        The latter (points, places, 2, 2) is that of (f0_hz, damping_ratio), of one record each.
+        """
+        solution = minimise(self.problem, data, start, COMPARISON_ITERATIONS)
+        theta = solution.theta[:, 0]
+        if data.records > 1:
+            return self.poles_in_band(theta), None
+        inverse, _ = invert(solution.normal[:, 0].sum(axis=1))
+        dof = max(data.undriven + data.driven - inverse.shape[-1] / 2, 1)
+        covariance = inverse * (solution.cost / (2 * dof))[:, None, None]
+        quantities = pole_quantities(self.model_of(theta), self.band_hz, covariance)
+        return quantities["poles_rad_s"], quantities["covariance"]
+
+    @property
+    def _between(self) -> BoolArray:
+        """(K,) which bins show transient and noise alone."""
+        return ~self.driven
+
+    def _check(self) -> None:
+        for name, least in (("samples_per_period", 1), ("periods", 1), ("transient_terms", 1)):
+            value = getattr(self, name)
+            if name == "transient_terms" and value is None:
+                continue
+            if not (isinstance(value, Integral) and int(value) >= least):
+                raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
+        rate_hz = _number(self.sample_rate_hz)
+        if not 0 < rate_hz < np.inf:
+            raise ValueError(f"sample_rate_hz: {self.sample_rate_hz!r}, expected above 0, finite")
+        try:
+            low, high = (_number(edge) for edge in self.band_hz)
+        except (TypeError, ValueError):
+            low = high = np.nan
+        if not 0 <= low < high <= rate_hz / 2 * (1 + 1e-9):
+            raise ValueError(
+                f"band_hz: {self.band_hz!r}, expected (low, high) with 0 <= low < high <= "
+                f"{rate_hz / 2:g} Hz, half the sample rate"
+            )
+        if not isinstance(self.structure, ModelStructure):
+            raise ValueError(f"structure: {self.structure!r}, expected a ModelStructure")
+        if self.structure.domain == "z" and self.structure.sample_rate_hz != rate_hz:
+            raise ValueError(
+                f"structure.sample_rate_hz: {self.structure.sample_rate_hz:g}, expected that of "
+                f"the record, {rate_hz:g} Hz"
+            )
+        ratio = self.input_noise_ratio
+        if ratio is not None and not 0 <= _number(ratio) < np.inf:
+            raise ValueError(f"input_noise_ratio: {ratio!r}, expected 0 or above, finite")
+
+
+@dataclass(frozen=True, eq=False)
+class PoleEstimator(JointPlan):
+    """Poles from several records of one kind each; parameters are those of `JointPlan`.
+
+    Of one period each there are no bins between harmonics: realisations then tell noise and
+    distortion together, and `covariance` holds both. Input noise counts as none, or as
+    `input_noise_ratio` of that of the output where given. `total_covariance` holds also what the
+    poles of the realisations scatter by, see `realisations_spread`.
+
+    Harmonics of the period that are not excited carry distortion and are not used. A single
+    realisation cannot tell any of this, and is left to `JointPlan`.
+
+    Examples
+    --------
+    >>> plan = PoleEstimator(50e3, 20000, 8, np.arange(4, 4001), (200.0, 300.0))
+    >>> poles = plan(u, y)  # u, y: (..., M, 8, 20000)
     """
-    lines_fit = LinesFit(
-        layout.model_of(fit.theta),
-        fit.cost,
-        fit.covariance,
-        fit.condition,
-        fit.converged,
-        fit.residual,
-    )
-    evidence = Evidence(
-        lines_fit,
-        np.where(fit.usable, layout.excited_bins.size, 0),
-        fit.usable,
-        fit.cost,
-        fit.expected,
-        fit.suspect,
-        fit.covariance,
-        fit.total,
-        fit.kind,
-        level_known,
-        fit.noise,
-        fit.lacking,
-    )
-    if evidence.suspect.any():
-        known = np.isfinite(fit.total)
-        evidence = evidence.with_model_error(np.where(known, fit.total, fit.covariance))
-    result = assemble(evidence, layout.structure, layout.band_hz, shape, method)
-    if fit.systematic.any():
-        total = result.total_covariance
-        total += fit.systematic.reshape(total.shape)
-    return replace(result, remark=fit.remark.reshape(shape))
+
+    def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:
+        """Poles from the bins of the band of the DFTs of whole records.
+
+        Parameters
+        ----------
+        u, y : (..., M, K) complex
+            At ``bins``, of M realisations.
+
+        Returns
+        -------
+        PolesBatch
+            With the leading axes but the last one. Its `fit` holds the coefficients of the M
+            transients one after the other, its `coefficient_covariance` those of A and B alone.
+        """
+        u, y = self._checked(u, y)
+        if y.ndim < 2:
+            raise ValueError(f"u, y: shape {y.shape}, expected (..., M, {self.bins.size})")
+        records = y.shape[-2]
+        if records == 1:
+            return self._single.from_bins(u[..., 0, :], y[..., 0, :])
+        return self._poles(u, y, f"{METHOD}s, {records} realisations")
+
+    @cached_property
+    def _single(self) -> JointPlan:
+        return JointPlan(*(getattr(self, f.name) for f in fields(self) if f.init))
+
+    @property
+    def _between(self) -> BoolArray:
+        return np.asarray(~self.driven & (self.bins % self.periods != 0))
+
+
+def _number(value: object) -> float:
+    """NaN where it is none."""
+    return float(value) if isinstance(value, Real) else float("nan")
+
+
+def whole_harmonics(harmonics: npt.ArrayLike) -> IntArray:
+    """(F,) int.
+
+    Raises
+    ------
+    ValueError
+        If they are no whole numbers.
+    """
+    values = np.asarray(harmonics).ravel()
+    if values.size == 0:
+        return values.astype(np.int64)
+    whole = values.dtype.kind in "iu"
+    if values.dtype.kind == "f":
+        whole = bool(np.isfinite(values).all() and (values % 1 == 0).all())
+    if not whole:
+        raise ValueError(
+            f"harmonics: {values[:5].tolist()}... of type {values.dtype}, expected whole multiples "
+            "of the sample rate over the samples per period"
+        )
+    return values.astype(np.int64)

@@ -1,309 +1,403 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint estimator on the bins of a few points: coefficients, noise level, and what contradicts."""
+"""The joint estimator on the bins of a few points: weights, coefficients, levels, and what contradicts.
+
+Bins between harmonics tell the noise. What realisations differ by on excited lines tells noise and
+stochastic nonlinear distortion together, and what they have in common whether the model holds; of one
+record the cost and the smoothness of the residuals tell that, and a search for what the model lacks.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
 
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
-from tactile_resonance.poles.joint_layout import JointLayout
-from tactile_resonance.poles.joint_model_error import systematic_of
-from tactile_resonance.poles.joint_noise import BINS_PER_BAND, JointNoise
-from tactile_resonance.poles.joint_weights import begin, noise_of, weighted
+from tactile_resonance.poles.joint_noise import with_noise
+from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import asks, lacking_terms
-from tactile_resonance.poles.likelihood import invert
-from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
-from tactile_resonance.poles.noise_level import KINDS, f_quantile
+from tactile_resonance.poles.levels import Level, Levels
+from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.model_error import systematic_of
+from tactile_resonance.poles.noise_level import are_flat
+from tactile_resonance.poles.realisations_spread import Spread
+from tactile_resonance.poles.scatter import Pieces, smooth_variance
 from tactile_resonance.poles.whiteness import are_smooth
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
 
-# Points that are fitted together: enough for what a call costs, few enough for the cache.
-CHUNK = 1000
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
-# How often the noise is taken anew, and the change of its variance below which it is the same.
+# How often the noise of one record is taken anew, and the change of its variance below which it is the same.
 MOST_RETURNS = 4
 SAME_LEVEL = 0.1
+# The scatter of realisations and the noise are taken anew from a fit that they weigh.
+REWEIGHTINGS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class JointFit:
-    """Fits of a batch.
+class _Round:
+    """Data of points with the variances they were weighted with, and their fit.
 
     Attributes
     ----------
-    theta : (batch, n) float
-        Coefficients [A without its last, B, C]; of several records the C of each.
-    covariance : (batch, n, n) float
-        Of them, from noise; NaN where noise cannot be told from all else. Of several realisations
-        of the coefficients that they share.
-    total : same shape
-        From noise and distortion; NaN where nothing but noise is known.
-    condition : (batch,) float
-    converged, usable : (batch,) bool
-        Usable are points whose bins are all finite.
-    cost, expected : (batch,) float
-        Of the excited bins; NaN where the level is from the residuals themselves.
-    suspect : (batch,) bool
-        Whether cost or whiteness contradict the model.
+    plan : JointPlan
+    plain : BinData
+        Without variances.
+    data : BinData
+        With variances, and without what came through the input.
+    solution : Solution
     noise : (batch, 2) float
-        Variance of a bin of Y and of U.
-    kind : (batch,) str
-        What the variance was taken for.
-    residual : (batch, K_e) complex
-        Weighted, on the excited bins, turned by the phase of the input.
-    systematic : (batch, places, 2, 2) float
-        What a model error moves (f0_hz, damping_ratio) by, as an outer product; 0 where there is no
-        suspicion.
-    remark : (batch,) object
-        What else is to be told to people; empty: nothing.
-    lacking : (batch, 3) float
-        See `lacking.lacking_terms`; NaN where it was not asked, as for several realisations.
+        Mean variances of the noise on both channels that the weights stand for.
+    kind : (batch,) int
+        Index into `KINDS`.
+    share : (batch, K_e) float or None
+        Of the variance weighted with that is noise; None where all of it is.
     """
 
-    theta: FloatArray
-    covariance: FloatArray
-    total: FloatArray
-    condition: FloatArray
-    converged: BoolArray
-    usable: BoolArray
-    cost: FloatArray
-    expected: FloatArray
-    suspect: BoolArray
+    plan: JointPlan
+    plain: BinData
+    data: BinData
+    solution: Solution
     noise: FloatArray
-    kind: npt.NDArray[np.str_]
-    residual: ComplexArray
-    systematic: FloatArray
-    remark: npt.NDArray[np.object_]
-    lacking: FloatArray
+    kind: IntArray
+    share: FloatArray | None = None
 
-    def rows(self, which: npt.NDArray[np.int64]) -> JointFit:
-        """Some of the points."""
-        return JointFit(*(getattr(self, f.name)[which] for f in fields(JointFit)))
+    def rows(self, which: IntArray) -> _Round:
+        """Some of the points, of a round without `share`."""
+        if which.size == self.kind.size:
+            return self
+        return _Round(
+            self.plan,
+            self.plain.rows(which),
+            self.data.rows(which),
+            self.solution.rows(which),
+            self.noise[which],
+            self.kind[which],
+        )
 
-    @classmethod
-    def joined(cls, parts: list[JointFit]) -> JointFit:
-        """The batch of several."""
-        if len(parts) == 1:
-            return parts[0]
-        names = [f.name for f in fields(cls)]
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    @cached_property
+    def response(self) -> ComplexArray:
+        """(batch, K_e) on excited lines."""
+        return self.plan.problem.response(self.solution.theta[:, 0])
 
-    def replaced(self, rows: BoolArray, fit: JointFit) -> JointFit:
-        """With some points of another batch."""
-        arrays = {}
-        for name in (f.name for f in fields(self)):
-            arrays[name] = getattr(self, name).copy()
-            arrays[name][rows] = getattr(fit, name)
-        return JointFit(**arrays)
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(batch, K_e) of the residuals of each realisation that is weighted with."""
+        return _variance(self.data, self.response)
 
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Of the excited lines, of M >= 2 realisations."""
+        return Pieces.of(self.data.driven, self.data.records - 1)
 
-@dataclass(frozen=True, eq=False)
-class _Level:
-    """Noise level of a batch, in units of the variances weighted with; see `JointFit`."""
+    @cached_property
+    def levels(self) -> Levels:
+        """Of M >= 2 realisations."""
+        by_piece = (self.kind == 2) & (self.share is not None)
+        u = self.data.u_driven
+        return Levels.of(self.plan, self.solution, u, self.variance, self.pieces, by_piece)
 
-    scale: FloatArray
-    cost: FloatArray
-    expected: FloatArray
-    suspect: BoolArray
-    noise: FloatArray
-    correction: FloatArray
+    def more_than_rounding(self, level: FloatArray) -> BoolArray:
+        """(batch,) whether a level of the residuals is more than rounding leaves of exact data."""
+        return np.asarray(level * self.variance.min(axis=-1) > ROUNDED * _mean_power(self.data))
+
+    def normal_of_excited(self, part: FloatArray) -> FloatArray:
+        """(batch, M, n, n) covariance of the gradient on excited lines.
+
+        Parameters
+        ----------
+        part : (batch, K_e) float
+            Their variance, of that weighted with.
+        """
+        variance = (self.variance / part)[:, None]
+        changed = replace(self.data, variance_y=variance, variance_u=None, covariance_yu=None)
+        tables = self.plan.problem.tables
+        return moments(tables, changed.arrays, self.solution.theta)[2][:, :, 1]
+
+    def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
+        noise = None
+        if self.share is not None and self.data.undriven:
+            noise = self.normal_of_excited(self.share)
+        return self.levels.covariances(suspect, noise)
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
-def fit_bins(layout: JointLayout, u: ComplexArray, y: ComplexArray) -> JointFit:
-    """Fits of points.
+def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
+    """Fit of a few points.
 
     Parameters
     ----------
-    layout : JointLayout
-    u, y : (batch, K) complex
-        At its bins.
-
-    Notes
-    -----
-    One step from start values the residuals are all but noise, unless the input's noise is far above
-    the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
-    its level is taken once more, from where the fit ended.
+    plan : JointPlan
+    u, y : (batch, M, K) complex
+        At its bins, of M records each.
     """
-    fit = _in_chunks(layout, u, y)
-    doubtful = np.full(u.shape[0], layout.other_bins.size > 0)
-    for _ in range(MOST_RETURNS):
-        doubtful &= (fit.suspect | (fit.kind != KINDS[0])) & _may_return(fit)
-        if not doubtful.any():
-            break
-        before = fit.noise[:, 0]
-        again = _in_chunks(layout, u[doubtful], y[doubtful], fit.theta[doubtful])
-        fit = fit.replaced(doubtful, again)
-        doubtful &= np.abs(fit.noise[:, 0] - before) > SAME_LEVEL * before
-    return fit
+    usable = np.ones(len(y), bool)
+    if not np.isfinite(u.sum() + y.sum()):  # finite as a whole only where every bin is
+        usable = np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2)))
+        u, y = (np.where(usable[:, None, None], v, 0) for v in (u, y))
+    one = np.ones((len(y), 1, 1))
+    others = plan.others_at.size
+    rest = (None, None, one) if others else (None,)
+    plain = BinData.of(y, u, others, one, *rest, order=plan.order)
+    return (_several if plain.records > 1 else _alone)(plan, plain, usable)
 
 
-def _in_chunks(
-    layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
-) -> JointFit:
-    """`_fit` of all points, some at a time."""
-    parts = [slice(k, k + CHUNK) for k in range(0, max(len(u), 1), CHUNK)]
-    return JointFit.joined(
-        [_fit(layout, u[part], y[part], None if start is None else start[part]) for part in parts]
-    )
+def _from_noise(plan: JointPlan, plain: BinData, start: FloatArray | None = None) -> _Round:
+    """Weighted with the noise between harmonics or, without any, as the plan says.
+
+    From coefficients (batch, M, n) near the minimum, or from start values.
+    """
+    if plain.undriven == 0:
+        ratio = plan.input_noise_ratio or 0.0
+        data, theta = plain, start
+        if ratio:
+            data = replace(plain, variance_u=ratio * plain.variance_y)
+        noise = np.tile([1.0, ratio], (len(plain.y_planes), 1))
+        kind = np.zeros(len(noise), np.int64)
+    else:
+        data, theta, found = with_noise(plan, plain, start)
+        noise, kind = found.mean_variances, found.kind
+    solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
+    return _Round(plan, plain, data, solution, noise, kind)
 
 
-def _may_return(fit: JointFit | Solution) -> BoolArray:
+def _may_return(fit: Judged | Solution) -> BoolArray:
     """(batch,) whether a fit ended where another one may begin."""
     finite = np.isfinite(fit.theta).all(axis=tuple(range(1, fit.theta.ndim)))
     return np.asarray(fit.converged & finite)
 
 
-def _fit(
-    layout: JointLayout, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
-) -> JointFit:
-    """The fit of a few points from coefficients (batch, n) that are near it, or from start values."""
-    batch = u.shape[0]
-    # finite as a whole only where every bin is
-    usable = np.asarray(np.isfinite(u.sum(axis=-1) + y.sum(axis=-1)))
-    if not usable.all():
-        u, y = (np.where(usable[:, None], v, 0) for v in (u, y))
-    undriven, problem = layout.other_bins.size, layout.problem
-    u, y = u[:, None], y[:, None]  # of one record
-    one = np.ones((batch, 1, 1))
-    if undriven == 0:
-        kind = np.full(batch, "flat", "U8")
-        ratio = layout.input_noise_ratio or 0.0
-        data = BinData.of(y, u, 0, one, ratio * one if ratio else None, order=layout.order)
-        solution = minimise(problem, data)
-    else:
-        data = BinData.of(y, u, undriven, one, None, None, one, order=layout.order)
-        if start is None:
-            theta, noise = begin(layout, data, layout.noise_bands)
-        else:
-            theta = start[:, None]
-            noise = noise_of(layout, data, theta, layout.noise_bands)
-        kind, data = noise.kind, weighted(data, noise, layout.noise_bands)
-        solution = minimise(problem, data, theta)
-    solution = refit_failed(problem, solution, data)
-    theta = solution.theta[:, 0]
+def _alone(plan: JointPlan, plain: BinData, usable: BoolArray) -> Judged:
+    """Points of one record each.
+
+    One step from start values the residuals are all but noise, unless the input's noise is far above
+    the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
+    its level is taken once more, from where the fit ended.
+    """
+    returns = plain.undriven > 0
+    judged = _judged_alone(plan, _from_noise(plan, plain), usable, last=not returns)
+    doubtful = np.full(usable.size, returns)
+    for _ in range(MOST_RETURNS):
+        doubtful &= (judged.suspect | (judged.kind != 0)) & _may_return(judged)
+        if not doubtful.any():
+            break
+        rows, before = np.flatnonzero(doubtful), judged.noise[:, 0]
+        again = _from_noise(plan, plain.rows(rows), judged.theta[rows, None])
+        judged = judged.replaced(rows, _judged_alone(plan, again, usable[rows], last=True))
+        doubtful &= np.abs(judged.noise[:, 0] - before) > SAME_LEVEL * before
+    return judged
+
+
+def _judged_alone(plan: JointPlan, fitted: _Round, usable: BoolArray, last: bool) -> Judged:
+    """What a fit is worth; what it leaves out is compared with other fits where it is the `last` one."""
+    solution, data = fitted.solution, fitted.data
+    batch, theta = usable.size, solution.theta[:, 0]
     inverse, condition = invert(solution.normal[:, 0].sum(axis=1))
-    if undriven == 0:
-        level = _level_from_residuals(layout, solution)
-    else:
-        level = _level_from_others(layout, solution, inverse, noise)
+    level = Level.of(plan, solution, inverse, fitted.noise, fitted.kind == 2)
     residual = solution.residual[:, 0] / np.sqrt(level.scale)[:, None]
-    suspect = are_smooth(residual, layout.structure.parameters) | level.suspect
+    suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
     lacking = np.full((batch, 3), np.nan)
-    asked = suspect | (batch == 1) | asks(layout, level.cost, level.expected, residual)
-    asked = np.flatnonzero(asked & _may_return(solution))
-    if asked.size:
-        part = data if asked.size == batch else data.rows(asked)
-        lacking[asked] = lacking_terms(
-            layout, part, theta[asked], inverse[asked], solution.cost[asked]
-        )
+    asked = _may_return(solution)
+    if batch > 1:
+        asked &= suspect | asks(plan, level.cost, level.expected, residual)
+    if asked.any():
+        rows = np.flatnonzero(asked)
+        part = data if rows.size == batch else data.rows(rows)
+        lacking[rows] = lacking_terms(plan, part, theta[rows], inverse[rows], solution.cost[rows])
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
-        rows = np.flatnonzero(suspect)
-        of_noise = (level.scale * data.variance_y.min(axis=(1, 2)))[rows]
-        suspect[rows] = of_noise > ROUNDED * mean_power(data.rows(rows).y_driven[:, 0])
+        power = _mean_power(data)
+        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * power
         lacking[~suspect] = np.nan
-    systematic = np.zeros((batch, layout.structure.order // 2, 2, 2))
-    wrong = suspect
-    if start is None and layout.other_bins.size > 0:  # others are fitted once more
-        wrong = suspect & ~_may_return(solution)
-    if wrong.any():
-        systematic[wrong] = systematic_of(layout, data.rows(wrong), solution.theta[wrong])
+    wrong = suspect if last else suspect & ~_may_return(solution)  # others are fitted once more
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
     unknown = np.full_like(covariance, np.nan)
-    known = layout.level_known
-    return JointFit(
+    known = plan.level_known
+    return Judged(
         theta=theta,
-        covariance=covariance if known else unknown,
-        total=unknown if known else covariance,
+        lines=np.where(usable, plan.excited_at.size, 0),
         condition=condition,
         converged=solution.converged,
-        usable=usable,
+        residual=residual,
         cost=level.cost,
         expected=level.expected,
         suspect=suspect,
+        covariance=covariance if known else unknown,
+        total=unknown if known else covariance,
+        kind=fitted.kind,
+        level_known=np.full(batch, known),
         noise=level.noise,
-        kind=kind,
-        residual=residual,
-        systematic=systematic,
-        remark=np.full(batch, "", object),
+        systematic=_systematic(plan, data, solution.theta, wrong),
         lacking=lacking,
+        remark=np.full(batch, "", object),
     )
 
 
-def _level_from_residuals(layout: JointLayout, solution: Solution) -> _Level:
-    """One period: a model error hides in the level, unless the residuals are smooth."""
-    batch = solution.cost.size
-    dof = max(layout.excited_bins.size - sum(layout.problem.sizes) / 2, 0.5)
-    level = solution.cost / dof
-    ratio = layout.input_noise_ratio or 0.0
-    nothing = np.full(batch, np.nan)
-    return _Level(
-        level,
-        nothing,
-        nothing,
-        np.zeros(batch, bool),
-        np.stack([level, ratio * level], axis=-1),
-        np.full(batch, student_variance(dof)),
+def _systematic(plan: JointPlan, data: BinData, theta: FloatArray, wrong: BoolArray) -> FloatArray:
+    """(batch, places, 2, 2) of `model_error.systematic_of` where the model is wrong, else 0."""
+    systematic = np.zeros((wrong.size, plan.structure.order // 2, 2, 2))
+    if wrong.any():
+        rows = np.flatnonzero(wrong)
+        poles = plan.poles_in_band(theta[rows, 0])
+        systematic[rows] = systematic_of(plan, data.rows(rows), poles, theta[rows])
+    return systematic
+
+
+def _mean_power(data: BinData) -> FloatArray:
+    """(batch,) mean square of Y on excited lines."""
+    y = data.y_driven
+    return np.asarray(np.mean(y.real**2 + y.imag**2, axis=(1, 2)))
+
+
+def _several(plan: JointPlan, plain: BinData, usable: BoolArray) -> Judged:
+    """Points of M >= 2 realisations of the phases each: one system, transients of their own."""
+    first = _from_noise(plan, plain)
+    changed = _weighted_wrongly(first)
+    rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
+    parts = []
+    if rows.size:
+        second = before = first.rows(rows)
+        for _ in range(REWEIGHTINGS):
+            second = _from_scatter(second)
+        parts.append(_judged(second, before, usable[rows]))
+    if rest.size or not rows.size:
+        part = first.rows(rest)
+        parts.append(_judged(part, part, usable[rest]))
+    return Judged.joined(parts).rows(np.argsort(np.concatenate([rows, rest])))
+
+
+def _weighted_wrongly(fitted: _Round) -> BoolArray:
+    """(batch,) where realisations differ on excited lines by more than the variances weighted with say.
+
+    By more than chance, on the whole or from line to line.
+    """
+    plan, levels, pieces = fitted.plan, fitted.levels, fitted.pieces
+    changed = levels.distorted()
+    if pieces.starts.size > 1:
+        changed = changed | ~are_flat(pieces.means(levels.line_variance), pieces.dof)
+    if fitted.data.undriven == 0 and plan.input_noise_ratio is None:
+        changed[:] = True  # nothing is known of the weights but what realisations differ by
+    return changed & fitted.more_than_rounding(levels.excited)
+
+
+def _variance(data: BinData, g: ComplexArray) -> FloatArray:
+    """(batch, K_e) variance of ``y - g u`` for a response g (batch, K_e): alike in all records."""
+    return np.broadcast_to(data.residual_variance(g)[:, 0], g.shape)
+
+
+def _from_scatter(fitted: _Round) -> _Round:
+    """Excited lines weighted with what realisations differ by, and fitted again."""
+    plan, levels, theta, g = fitted.plan, fitted.levels, fitted.solution.theta, fitted.response
+    gain = g.real**2 + g.imag**2
+    total, kind = smooth_variance(levels.line_variance * fitted.variance, gain, fitted.pieces)
+    if fitted.data.undriven:
+        # of distorted lines with too large weights the transients were wrong, and so the noise
+        data, _, found = with_noise(plan, fitted.plain, theta)
+        noise = found.mean_variances
+        known = _variance(data, g)
+        more = np.maximum(total - known, 0)
+        data = replace(data, variance_y=data.variance_y + more[:, None])
+        share = known / np.maximum(total, known)
+    else:
+        input_noise = levels.excited[:, None] * (plan.input_noise_ratio or 0.0)
+        rest = np.maximum(total - input_noise * gain, 1e-3 * total)
+        data = replace(
+            fitted.plain,
+            variance_y=rest[:, None],
+            variance_u=input_noise[:, None] if plan.input_noise_ratio else None,
+        )
+        noise = np.stack([rest.mean(axis=-1), input_noise[:, 0]], axis=-1)
+        share = np.ones_like(total)
+    solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
+    return _Round(plan, fitted.plain, data, solution, noise, kind, share)
+
+
+def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
+    """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
+    plan, solution, levels = fitted.plan, fitted.solution, fitted.levels
+    batch, _, _ = solution.theta.shape
+    a, b, _ = plan.problem.sizes
+    common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
+    suspect = are_smooth(common, plan.structure.parameters)
+    if suspect.any():
+        suspect &= fitted.more_than_rounding(levels.excited)
+    suspect |= levels.contradicts
+    covariance, total = fitted.covariances(suspect)
+    theta = solution.theta
+    judged = Judged(
+        theta=np.concatenate(
+            [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, -1)], axis=1
+        ),
+        lines=np.where(usable, plan.excited_at.size, 0),
+        condition=levels.inverse.condition,
+        converged=solution.converged,
+        residual=common,
+        cost=levels.cost,
+        expected=levels.expected,
+        suspect=suspect,
+        covariance=covariance,
+        total=total,
+        kind=fitted.kind,
+        level_known=np.ones(batch, bool),
+        noise=fitted.noise * levels.noise_level(suspect)[:, None],
+        systematic=_systematic(plan, fitted.data, theta, suspect),
+        lacking=np.full((batch, 3), np.nan),
+        remark=np.full(batch, "", object),
     )
+    return _each_by_itself(judged, first)
 
 
-def _level_from_others(
-    layout: JointLayout,
-    solution: Solution,
-    inverse: FloatArray,
-    noise: JointNoise,
-) -> _Level:
-    """The bins between harmonics tell the level, the excited ones whether the model holds."""
-    n = inverse.shape[-1]
-    # leverage of the others
-    used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0, 0])
-    dof_o = layout.other_bins.size - used / 2
-    dof_e = layout.excited_bins.size - (n - used) / 2
-    level = solution.part_cost[:, 0] / dof_o
-    cost = solution.part_cost[:, 1] / level
-    expected = dof_e * dof_o / (dof_o - 1)
-    limit = dof_e * f_quantile(1 - MODEL_ERROR_PROBABILITY, 2 * dof_e, 2 * dof_o)
-    pieces = noise.kind == "per line"
-    if pieces.any():
-        # weights from few bins: moments of F(2, 2 nu), as in `VarianceModel.cost_quantile`
-        mean = BINS_PER_BAND / (BINS_PER_BAND - 1)
-        std = mean * np.sqrt(BINS_PER_BAND / (BINS_PER_BAND - 2))
-        quantile = special.ndtri(1 - MODEL_ERROR_PROBABILITY)
-        expected = np.where(pieces, expected * mean, expected)
-        limit = np.where(pieces, dof_e * mean + np.sqrt(dof_e) * std * quantile, limit)
-    suspect = cost > limit
-    dof = dof_e + dof_o
-    correction = student_variance(dof)
-    if pieces.any():  # as `VarianceModel.information_correction` line by line
-        correction = np.where(pieces, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
-    pooled = solution.part_cost.sum(axis=-1) / dof
-    return _Level(
-        np.where(suspect, level, pooled),
-        cost,
-        expected,
-        suspect,
-        noise.mean_variances * level[:, None],
-        correction,
+def _each_by_itself(fit: Judged, first: _Round) -> Judged:
+    """With the scatter of the poles of each realisation in the total covariance.
+
+    Where lines are distorted the resonator is not linear. Then its poles are the mean of those of all
+    realisations, of the first round, weighted with the noise. Weighted with the distortion of each line
+    a resonance that differs would count least, and the bins between harmonics most, where the ringing up
+    of a resonator that is not linear tells of another system.
+    """
+    theta, levels = first.solution.theta, first.levels
+    # gradients as independent lines make them, each with the variance that it shows itself
+    inner = first.normal_of_excited(levels.line_variance)
+    if first.data.undriven:
+        inner = inner + levels.between[:, None, None, None] * first.solution.normal[:, :, 0]
+    spread = Spread.of(first.plan, first.data, theta, inner, levels.excited_dof)
+    distorted = levels.distorted() & spread.known
+    weight = np.where(distorted, 1.0, spread.weight)
+    covariance, total = fit.covariance, fit.total
+    if distorted.any():
+        of_first = first.covariances(np.zeros(weight.size, bool))
+        covariance, total = (
+            np.where(distorted[:, None, None], one, other)
+            for one, other in zip(of_first, (covariance, total), strict=True)
+        )
+    changed, systematic = fit.theta.copy(), fit.systematic.copy()
+    shared = total.shape[1]
+    changed[distorted, :shared] = (theta[:, 0, :shared] + spread.step)[distorted]
+    more = spread.variance_of_mean(distorted) - spread.of_poles(total)
+    for k in (0, 1):
+        systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
+    odd, remark = spread.remarks()
+    differing = replace(
+        fit,
+        theta=changed,
+        covariance=covariance,
+        total=total,
+        suspect=fit.suspect | odd,
+        systematic=systematic,
+        remark=remark,
     )
-
-
-def student_variance(dof):
-    """Variance of Student's distribution for a level of `dof` complex degrees of freedom."""
-    dof = np.asarray(dof, float)  # Python's own floats raise where the division is by 0
-    return np.divide(dof, dof - 1, out=np.full(dof.shape, np.nan), where=dof > 1)
-
-
-def mean_power(values: ComplexArray) -> FloatArray:
-    """(batch,) mean square."""
-    return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1))
+    rows = np.flatnonzero(weight > 0)
+    return fit.replaced(rows, differing.rows(rows))

@@ -1,15 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise that the bins between harmonics of a periodic excitation show, on both channels."""
+"""The noise that bins between harmonics of a periodic excitation show on both channels, as weights.
+
+The records of a point pool their noise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.poles.noise_level import FALSE_ALARM, KINDS, is_flat, model_variance
+from tactile_resonance.poles import likelihood
+from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.noise_level import FALSE_ALARM, are_flat, model_variance
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -23,7 +32,6 @@ FEWEST_PIECES = 4
 # bins leaves so much less of the error.
 MUCH_MORE = 1.5
 TINY = float(np.finfo(float).tiny)
-NAMES = np.array(KINDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +94,8 @@ class JointNoise:
     through_input : (batch, K_o) complex or None
         What the disturbances seen on U explain of Y between harmonics; None where nothing.
     mean_variances : (batch, 2) float
-    kind : (batch,) str
-        flat, sloped or per line.
+    kind : (batch,) int
+        Index into `noise_level.KINDS`.
     """
 
     variance_y: FloatArray
@@ -96,12 +104,77 @@ class JointNoise:
     covariance_yu: ComplexArray | None
     through_input: ComplexArray | None
     mean_variances: FloatArray
-    kind: npt.NDArray[np.str_]
+    kind: IntArray
 
     @staticmethod
     def on(pieces: IntArray, variance: FloatArray) -> FloatArray:
         """(batch, 1) or (batch, K) variance of bins from that of their pieces."""
         return variance if variance.shape[1] == 1 else np.ascontiguousarray(variance[:, pieces])
+
+
+def with_noise(
+    plan: JointPlan, data: BinData, theta: FloatArray | None = None
+) -> tuple[BinData, FloatArray, JointNoise]:
+    """Data weighted with the noise that their bins between harmonics show.
+
+    Parameters
+    ----------
+    plan : JointPlan
+    data : BinData
+        With variances of 1.
+    theta : (points, M, n) float, optional
+        Coefficients whose errors show it; when absent those of start values.
+
+    Returns
+    -------
+    BinData
+        With the variances, and without what came through the input.
+    theta : (points, M, n) float
+    JointNoise
+    """
+    bands, problem = plan.noise_bands(data.records), plan.problem
+    if theta is None:
+        limit = correlation_limit(data.records * data.undriven)
+        theta, powers = likelihood.begin(
+            problem.tables, problem.from_driven, data.arrays, limit, bands.size, bands.starts.size
+        )
+    else:
+        powers = likelihood.undriven_powers(
+            problem.tables, data.arrays, theta, bands.size, bands.starts.size
+        )
+
+    def signals() -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        alpha, beta, _ = problem.split(theta[:, 0])
+        of_a = alpha @ problem.denominator[: problem.undriven].T
+        g = np.asarray((beta @ plan.numerator_on_bins[plan.others_at].T) / of_a)
+        error = likelihood.undriven_errors(problem.tables, data.arrays, theta)
+        u = data.u[..., : data.undriven]
+        return _bin_by_bin(error), _bin_by_bin(u), g.repeat(data.records, axis=1)
+
+    noise = noise_between_harmonics(powers, signals, bands, problem.sizes[2] * data.records)
+    return _weighted(data, noise, bands), theta, noise
+
+
+def _weighted(data: BinData, noise: JointNoise, bands: NoiseBands) -> BinData:
+    if noise.through_input is not None:
+        y = data.y
+        y[..., : data.undriven] -= noise.through_input.reshape(
+            len(y), data.undriven, data.records
+        ).swapaxes(1, 2)
+        data = BinData.of(y, data.u, data.undriven, data.variance_y)
+    covariance = noise.covariance_yu
+    return replace(
+        data,
+        rest=noise.on(bands.of_others, noise.variance_rest)[:, None],
+        variance_y=noise.on(bands.of_excited, noise.variance_y)[:, None],
+        variance_u=noise.on(bands.of_excited, noise.variance_u)[:, None],
+        covariance_yu=None if covariance is None else covariance[:, None],
+    )
+
+
+def _bin_by_bin(values: ComplexArray) -> ComplexArray:
+    """(points, K M) of (points, M, K): the records of a bin side by side."""
+    return np.ascontiguousarray(values.swapaxes(1, 2).reshape(len(values), -1))
 
 
 def noise_between_harmonics(
@@ -133,21 +206,32 @@ def noise_between_harmonics(
     size = int(bands.counts.sum())
     dof = max(size - terms / 2, 1.0)
     through = covariance = None
-    of_error, of_u = powers[:, 0], powers[:, 1]
-    power_error, power_u, re, im = (powers[:, k].sum(axis=-1, keepdims=True) for k in range(4))
+    sums = powers.sum(axis=-1)[:, :, None]
+    power_error, power_u, re, im = (sums[:, k] for k in range(4))
     # how far both channels have anything in common
     squared = (re**2 + im**2) / np.maximum(power_error * power_u, TINY)
     correlated = squared > correlation_limit(size)
     power_error, power_u = power_error / size, power_u / size
     if not correlated.any():
-        total_power, kind_y = _pieces(of_error, power_error, bands, size / dof)
-        input_power, kind_u = _pieces(of_u, power_u, bands, 1.0)
-        kind = NAMES[np.maximum(kind_y, kind_u)]
-        variance_y = np.where(total_power > TINY, total_power, 1.0)  # no noise: any weights do
-        means = [power_error * (size / dof), input_power.mean(-1, keepdims=True)]
-        return JointNoise(
-            variance_y, input_power, variance_y, None, None, np.concatenate(means, -1), kind
+        (total_power, kind_y), (input_power, kind_u) = (
+            (mean, np.zeros(len(mean), np.int64)) for mean in (power_error * (size / dof), power_u)
         )
+        means = [total_power, input_power]
+        if not _is_flat(powers[:, :2], bands):
+            total_power, kind_y = _pieces(powers[:, 0], power_error, bands, size / dof)
+            input_power, kind_u = _pieces(powers[:, 1], power_u, bands, 1.0)
+            means[1] = input_power.mean(-1, keepdims=True)
+        variance_y = np.where(total_power > TINY, total_power, 1.0)  # no noise: any weights do
+        return JointNoise(
+            variance_y,
+            input_power,
+            variance_y,
+            None,
+            None,
+            np.concatenate(means, -1),
+            np.maximum(kind_y, kind_u),
+        )
+    of_error, of_u = powers[:, 0], powers[:, 1]
     error, u, response = signals()
     by_g, cross = response * u, (re + 1j * im) / size
     gain = cross / np.maximum(power_u, TINY)
@@ -175,7 +259,7 @@ def noise_between_harmonics(
         covariance,
         through,
         np.concatenate([power_rest * (size / dof), variance_u.mean(-1, keepdims=True)], -1),
-        NAMES[kind],
+        kind,
     )
 
 
@@ -194,6 +278,12 @@ def rough_noise(error: ComplexArray, u: ComplexArray) -> tuple[FloatArray, Float
     return np.where(of_error > TINY, of_error, 1.0), np.where(squared > limit, 0.0, of_u)
 
 
+def _is_flat(powers_of: FloatArray, bands: NoiseBands) -> bool:
+    """Whether a test finds the powers (..., pieces) of all points flat over the band."""
+    few = bands.starts.size < FEWEST_PIECES
+    return few or bool(are_flat(powers_of / bands.counts, bands.dof).all())
+
+
 def _pieces(
     powers_of: FloatArray, mean_power: FloatArray, bands: NoiseBands, factor: float
 ) -> tuple[FloatArray, IntArray]:
@@ -202,7 +292,7 @@ def _pieces(
     Flat unless a test says otherwise.
     """
     mean, samples = mean_power * factor, powers_of / bands.counts
-    if bands.starts.size < FEWEST_PIECES or is_flat(samples, bands.dof):
+    if _is_flat(powers_of, bands):
         return mean, np.zeros(mean.shape[0], np.int64)
     model = model_variance(samples * factor, bands.dof)
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind

@@ -13,9 +13,12 @@ import numpy.typing as npt
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.poles.disturbed_input import poles_with_all_bins
 from tactile_resonance.poles.drift import poles_with_drift
-from tactile_resonance.poles.joint import ComplexArray, JointPlan
-from tactile_resonance.poles.joint_layout import whole_harmonics
-from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.joint import (
+    ComplexArray,
+    JointPlan,
+    PoleEstimator,
+    whole_harmonics,
+)
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
@@ -68,8 +71,7 @@ def identify_poles_from_records(
             left_out=left_out,
         )
 
-    transform = plan_of(()).transform
-    return _of_plan(plan_of, transform(u, "u"), transform(y, "y"))
+    return _of_plan(plan_of, *plan_of(()).transform(u, y))
 
 
 def identify_poles_from_bins(

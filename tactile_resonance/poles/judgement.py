@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.poles.covariance import pole_quantities
-from tactile_resonance.poles.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.model_error import model_error_factor
+from tactile_resonance.poles.noise_level import KINDS
 from tactile_resonance.poles.result import (
     STATUS_CODE,
+    ComplexArray,
     FloatArray,
     PolesBatch,
     PolesStatus,
@@ -24,78 +26,101 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
+# Of `Judged.kind`.
+NAMES = np.array([*KINDS, "unknown", ""])
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What the statistics of a batch of fits rest on.
+class Judged:
+    """Fits of points and what the statistics say of them.
 
     Attributes
     ----------
-    fit : LinesFit
+    theta : (batch, n) float
+        Coefficients [A without its last, B, C]; of several records the C of each.
     lines : (batch,) int
-    enough : (batch,) bool
-        Lines for the model.
-    cost, expected_cost : (batch,) float
-        NaN where the variance is unknown.
+        That were used; 0 where a bin of a record is not finite.
+    condition : (batch,) float
+    converged : (batch,) bool
+    residual : (batch, F) complex
+        Weighted, on the (excited) lines; 0 on those left out.
+    cost, expected : (batch,) float
+        Of these lines; NaN where the level is from the residuals themselves.
     suspect : (batch,) bool
-        Whether the cost is beyond what noise explains.
-    covariance, total_covariance : (batch, n, n) float
-        Of the coefficients; NaN where it cannot be told.
-    variance_model : (batch,) str
-    level_known : bool or (batch,) bool
+        Whether cost, smoothness of the residuals or what the model lacks contradict the model.
+    covariance : (batch, p, p) float
+        Of the coefficients from noise, of several records of those they share; NaN where noise cannot be
+        told from all else.
+    total : same shape
+        From noise and distortion; NaN where nothing but noise is known.
+    kind : (batch,) int
+        Index into `NAMES`, what the variance was taken for.
+    level_known : (batch,) bool
         Whether the variance is known otherwise than from the residuals.
-    noise_variance : (batch, 2) float or None
+    noise : (batch, 2) float
+        Variance of a bin of Y and of U; NaN where the data brought their own.
+    systematic : (batch, places, 2, 2) float
+        What a model error moves (f0_hz, damping_ratio) by, as an outer product, and what else adds to the
+        total covariance; 0 where nothing does.
+    lacking : (batch, 3) float
         See `PolesBatch`.
-    lacking : (batch, 3) float or None
-        See `PolesBatch`.
+    remark : (batch,) object
+        What else is to be told to people; empty: nothing.
     """
 
-    fit: LinesFit
+    theta: FloatArray
     lines: npt.NDArray[np.int64]
-    enough: BoolArray
+    condition: FloatArray
+    converged: BoolArray
+    residual: ComplexArray
     cost: FloatArray
-    expected_cost: FloatArray
+    expected: FloatArray
     suspect: BoolArray
     covariance: FloatArray
-    total_covariance: FloatArray
-    variance_model: npt.NDArray[np.str_]
-    level_known: bool | BoolArray
-    noise_variance: FloatArray | None = None
-    lacking: FloatArray | None = None
+    total: FloatArray
+    kind: npt.NDArray[np.int64]
+    level_known: BoolArray
+    noise: FloatArray
+    systematic: FloatArray
+    lacking: FloatArray
+    remark: npt.NDArray[np.object_]
+
+    def rows(self, which: npt.NDArray[np.int64]) -> Judged:
+        """Some of the points."""
+        return Judged(*(getattr(self, f.name)[which] for f in fields(Judged)))
 
     @classmethod
-    def empty(cls, plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Evidence:
-        """Of a band with too few lines."""
-        batch, n = lines.size, plan.structure.parameters
-        nan = np.full(batch, np.nan)
-        a, b, _ = plan.problem.sizes
-        model = plan.model_of(np.full((batch, a + b), np.nan))
-        no = np.zeros(batch, bool)
-        residual = np.zeros((batch, 0), complex)
-        matrix = np.full((batch, n, n), np.nan)
-        fit = LinesFit(model, nan, matrix, nan, no, residual)
-        return cls(fit, lines, no, nan, nan, no, matrix, matrix, np.full(batch, ""), True)
+    def joined(cls, parts: list[Judged]) -> Judged:
+        """The points of several."""
+        if len(parts) == 1:
+            return parts[0]
+        names = [f.name for f in fields(cls)]
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
-    def with_model_error(self, weighted: FloatArray) -> Evidence:
-        """With the model error in the total covariance of the suspects.
+    def replaced(self, rows: npt.NDArray[np.int64], others: Judged) -> Judged:
+        """With some points of another batch."""
+        if rows.size == self.lines.size:
+            return others
+        arrays = {}
+        for name in (f.name for f in fields(self)):
+            arrays[name] = getattr(self, name).copy()
+            arrays[name][rows] = getattr(others, name)
+        return Judged(**arrays)
 
-        Parameters
-        ----------
-        weighted : (batch, n, n) float
-            Covariance of the coefficients from the variance weighted with.
-        """
-        rows = self.suspect
-        factor = model_error_factor(
-            self.fit.residual[rows], self.cost[rows], self.expected_cost[rows]
-        )
-        total = self.total_covariance.copy()
-        total[rows] = weighted[rows] * factor[:, None, None]
-        return replace(self, total_covariance=total)
+    def total_with_model_error(self) -> FloatArray:
+        """(batch, p, p) total covariance, of the suspects with the model error."""
+        if not self.suspect.any():
+            return self.total
+        rows, total = self.suspect, self.total.copy()
+        weighted = np.where(np.isfinite(total[rows]), total[rows], self.covariance[rows])
+        factor = model_error_factor(self.residual[rows], self.cost[rows], self.expected[rows])
+        total[rows] = weighted * factor[:, None, None]
+        return total
 
 
 def assemble(
-    evidence: Evidence,
+    judged: Judged,
+    model: RationalModel,
     structure: ModelStructure,
     band_hz: tuple[float, float],
     shape: tuple[int, ...],
@@ -105,71 +130,71 @@ def assemble(
 
     Parameters
     ----------
+    judged : Judged
+    model : RationalModel
+        Of its coefficients.
+    structure : ModelStructure
+    band_hz : (low, high)
     shape : tuple of int
         Leading axes, of as many points as the batch has.
+    method : str
     """
-    fit = evidence.fit
-    conditioned = fit.condition_number < LARGEST_CONDITION_NUMBER
+    enough = judged.lines >= structure.fewest_lines
+    conditioned = judged.condition < LARGEST_CONDITION_NUMBER
     # a model that the lines do not determine has no poles worth a number
-    undetermined = ~(evidence.enough & conditioned)
-    hopeless = undetermined | ~fit.converged
-    covariance, total = evidence.covariance, evidence.total_covariance
+    undetermined = ~(enough & conditioned)
+    hopeless = undetermined | ~judged.converged
+    covariance, total = judged.covariance, judged.total_with_model_error()
     if hopeless.any():
         covariance, total = covariance.copy(), total.copy()
         covariance[hopeless] = total[hopeless] = np.nan
-    quantities = pole_quantities(fit.model, band_hz, covariance)
+    quantities = pole_quantities(model, band_hz, covariance)
     if undetermined.any():
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
-    significant = significant_modes(fit.model, quantities, covariance, evidence.lines)
+    significant = significant_modes(model, quantities, covariance, judged.lines)
     total_f0_damping = np.full_like(quantities["covariance"], np.nan)
     rows = np.flatnonzero(np.isfinite(total[:, 0, 0]))
     if rows.size:
         total_f0_damping[rows] = pole_quantities(
-            fit.model if rows.size == total.shape[0] else fit.model.at((rows,)),
+            model if rows.size == total.shape[0] else model.at((rows,)),
             band_hz,
             total[rows],
         )["covariance"]
+        total_f0_damping[rows] += judged.systematic[rows]
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
         for where, status in (
-            (~np.asarray(evidence.level_known), PolesStatus.NO_COVARIANCE),
+            (~judged.level_known, PolesStatus.NO_COVARIANCE),
             (~np.isfinite(covariance[:, 0, 0]), PolesStatus.NO_COVARIANCE),
-            (evidence.suspect, PolesStatus.MODEL_ERROR),
+            (judged.suspect, PolesStatus.MODEL_ERROR),
             ((significant & (poles.real >= 0)).any(axis=-1), PolesStatus.UNSTABLE_POLE),
             (~significant.any(axis=-1), PolesStatus.NO_RESONANCE),
             (~conditioned, PolesStatus.ILL_CONDITIONED),
-            (~fit.converged, PolesStatus.NOT_CONVERGED),
-            (~evidence.enough, PolesStatus.TOO_FEW_LINES),
+            (~judged.converged, PolesStatus.NOT_CONVERGED),
+            (~enough, PolesStatus.TOO_FEW_LINES),
         ):
             code[where] = STATUS_CODE[status]
-    noise = evidence.noise_variance
-    if noise is None:
-        noise = np.full((code.size, 2), np.nan)
-    lacking = evidence.lacking
-    if lacking is None:
-        lacking = np.full((code.size, 3), np.nan)
 
     def batch(array: npt.NDArray) -> npt.NDArray:
         return array.reshape((*shape, *array.shape[1:]))
 
-    model = fit.model
     delay = model.delay_s
     return PolesBatch(
         **{name: batch(values) for name, values in quantities.items()},
         total_covariance=batch(total_f0_damping),
         coefficient_covariance=batch(covariance),
-        cost=batch(evidence.cost),
-        expected_cost=batch(evidence.expected_cost),
-        condition_number=batch(fit.condition_number),
-        residual=batch(fit.residual),
-        lines=batch(evidence.lines),
+        cost=batch(judged.cost),
+        expected_cost=batch(judged.expected),
+        condition_number=batch(judged.condition),
+        residual=batch(judged.residual),
+        lines=batch(judged.lines),
         significant=batch(significant),
         status_code=batch(code),
-        noise_variance=batch(noise),
-        lacking=batch(lacking),
+        noise_variance=batch(judged.noise),
+        lacking=batch(judged.lacking),
         fit=replace(
             model,
             denominator=batch(model.denominator),
@@ -179,6 +204,7 @@ def assemble(
         ),
         structure=structure,
         band_hz=band_hz,
-        variance_model=batch(evidence.variance_model),
+        variance_model=batch(NAMES[judged.kind]),
         method=method,
+        remark=batch(judged.remark),
     )

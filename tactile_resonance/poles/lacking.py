@@ -18,11 +18,11 @@ import numpy.typing as npt
 
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.likelihood import falls
+from tactile_resonance.poles.likelihood import best_fall
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
-    from tactile_resonance.poles.joint_layout import JointLayout
+    from tactile_resonance.poles.joint import JointPlan
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -92,27 +92,27 @@ class Directions:
 
 @np.errstate(invalid="ignore")
 def asks(
-    layout: JointLayout, cost: FloatArray, expected: FloatArray, residual: ComplexArray
+    plan: JointPlan, cost: FloatArray, expected: FloatArray, residual: ComplexArray
 ) -> BoolArray:
     """(batch,) for which points of a batch `lacking_terms` is worth its time.
 
     Parameters
     ----------
-    layout : JointLayout
+    plan : JointPlan
     cost, expected : (batch,) float
         Of the excited bins.
     residual : (batch, K) complex
         Weighted, turned by the phase of the input.
     """
-    others = layout.other_bins.size
+    others = plan.others_at.size
     if others == 0:
-        return are_smooth(residual, layout.structure.parameters, SMOOTHNESS_ASKS)
+        return are_smooth(residual, plan.structure.parameters, SMOOTHNESS_ASKS)
     return np.asarray(cost > expected + COST_ASKS * np.sqrt(expected * (1 + expected / others)))
 
 
 @np.errstate(all="ignore")
 def lacking_terms(
-    layout: JointLayout,
+    plan: JointPlan,
     data: BinData,
     theta: FloatArray,
     inverse: FloatArray,
@@ -122,7 +122,7 @@ def lacking_terms(
 
     Parameters
     ----------
-    layout : JointLayout
+    plan : JointPlan
     data : BinData
         Of one record each.
     theta : (batch, n) float
@@ -144,23 +144,23 @@ def lacking_terms(
     direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
     exceeded by chance with ``(1 - R)^(dof - 1)``.
     """
-    problem, directions = layout.problem, layout.directions
-    fall = falls(
+    problem, directions = plan.problem, plan.directions
+    dof = data.undriven + data.driven - theta.shape[1] / 2
+    best, fall, chance = best_fall(
         data.arrays,
         problem.tables.undriven.last.shape[0],
-        layout.driven_bases,
+        plan.driven_bases,
         theta,
         inverse,
+        cost,
+        dof,
         directions.numerator,
         directions.modes,
     )
-    dof = data.undriven + data.driven - theta.shape[1] / 2
-    chance = (dof - 1) * np.log1p(-fall / cost[:, None])  # (batch, 1 + N)
-    chance[:, 1:] += np.log(max(directions.poles_rad_s.size, 1))
-    best = np.argmin(np.nan_to_num(chance), axis=1)
-    rows = np.arange(best.size)
-    fall, chance = fall[rows, best], chance[rows, best]
-    chi_square = 2 * fall * (dof - 1) / (cost - fall)
-    f0_hz = np.append(np.nan, np.abs(directions.poles_rad_s) / (2 * np.pi))[best]
-    found = np.stack([chi_square, np.where(best > 0, 4.0, 2.0), f0_hz], axis=1)
-    return np.where((chance < np.log(FALSE_ALARM))[:, None], found, np.nan)
+    found = np.full((best.size, 3), np.nan)
+    for k in np.flatnonzero(chance < np.log(FALSE_ALARM)):
+        found[k, 0] = 2 * fall[k] * (dof - 1) / (cost[k] - fall[k])
+        found[k, 1] = 2.0 if best[k] == 0 else 4.0
+        if best[k] > 0:
+            found[k, 2] = np.abs(directions.poles_rad_s[best[k] - 1]) / (2 * np.pi)
+    return found

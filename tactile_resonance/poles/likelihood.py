@@ -880,7 +880,7 @@ def invert(matrices):
 
 @njit(**OPTIONS)
 def _fall(pair, own, slope, power, inverse, score, crossed):
-    """What the cost falls by along a pair of directions; see `falls`."""
+    """What the cost falls by along a pair of directions; see `best_fall`."""
     n, bins = own.shape[0], power.size
     p_00 = p_01 = p_11 = 0.0
     for k in range(bins):
@@ -913,8 +913,8 @@ def _fall(pair, own, slope, power, inverse, score, crossed):
 
 @_entry
 @njit(**OPTIONS)
-def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
-    """What the cost of fitted points of one record falls by with directions of the response added.
+def best_fall(data, undriven_blocks, bases, theta, inverse, cost, dof, numerator, modes):
+    """What the cost of fitted points of one record falls by most with a pair of directions of the response.
 
     Parameters
     ----------
@@ -925,6 +925,9 @@ def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
     theta : (points, n) float
     inverse : (points, n, n) float
         Of the normal matrices.
+    cost : (points,) float
+    dof : float
+        Complex degrees of freedom of it.
     numerator : (K, 2) complex
         A pair of directions over A.
     modes : (N, 2, 2, K) float
@@ -932,8 +935,12 @@ def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
 
     Returns
     -------
-    (points, 1 + N) float
+    best : (points,) int
+        0: the numerator, 1 + k: mode k.
+    fall : (points,) float
         0 where the fit has taken a direction up already.
+    chance : (points,) float
+        Logarithm of the probability that noise makes as much, for N modes tried.
     """
     basis_a, basis_b, basis_c = bases
     y, u, _, variance_y, variance_u, covariance = data
@@ -942,7 +949,8 @@ def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
     own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
     pair, score, crossed = np.empty((2, 2, bins)), np.empty(2), np.empty((2, n))
     flat = np.zeros((ROWS, BLOCK))
-    out = np.empty((points, 1 + modes.shape[0]))
+    best, found, least = np.zeros(points, np.int64), np.zeros(points), np.zeros(points)
+    trials = np.log(max(modes.shape[0], 1))
     for point in range(points):
         at = theta[point]
         for k in range(bins):
@@ -986,7 +994,10 @@ def falls(data, undriven_blocks, bases, theta, inverse, numerator, modes):
             for r in range(2):
                 value = of_a * numerator[k, r]
                 pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
-        out[point, 0] = _fall(pair, own, slope, power, inverse[point], score, crossed)
-        for m in range(modes.shape[0]):
-            out[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], score, crossed)
-    return out
+        for m in range(1 + modes.shape[0]):
+            tried = pair if m == 0 else modes[m - 1]
+            fall = _fall(tried, own, slope, power, inverse[point], score, crossed)
+            chance = (dof - 1) * np.log1p(-fall / cost[point]) + (0.0 if m == 0 else trials)
+            if chance < least[point]:
+                best[point], found[point], least[point] = m, fall, chance
+    return best, found, least

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData, Problem
+from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
@@ -25,7 +26,7 @@ from tactile_resonance.poles.fit import (
     start_values,
 )
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS
+from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
 from tactile_resonance.poles.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,7 +48,10 @@ class LinesFit:
 
     Attributes
     ----------
+    theta : (batch, n) float
+        Coefficients [A without its last, B].
     model : RationalModel
+        Of these, and of a delay.
     cost : (batch,) float
     covariance : (batch, n, n) float
         Of the coefficients, where the variance of each line is the one it was weighted with.
@@ -57,6 +61,7 @@ class LinesFit:
         Weighted residuals; 0 on lines that were left out.
     """
 
+    theta: FloatArray
     model: RationalModel
     cost: FloatArray
     covariance: FloatArray
@@ -73,12 +78,14 @@ class LinesPlan:
     ----------
     frequency_hz : (F,) float
     structure : ModelStructure
+    band_hz : (low, high)
     start_size : (F,) float or None
         ``|A|`` that start values begin from, in a rebased plan.
     """
 
     frequency_hz: FloatArray
     structure: ModelStructure
+    band_hz: tuple[float, float]
     problem: Problem
     variable: Variable
     denominator_basis: PolynomialBasis
@@ -86,9 +93,16 @@ class LinesPlan:
     start_size: FloatArray | None = None
 
     @classmethod
-    def on_lines(cls, frequency_hz: FloatArray, structure: ModelStructure) -> LinesPlan:
+    def on_lines(
+        cls, frequency_hz: FloatArray, structure: ModelStructure, band_hz: tuple[float, float]
+    ) -> LinesPlan:
         """Plan with bases orthonormal on the lines; the latest ones are kept."""
-        return _plan(np.ascontiguousarray(frequency_hz, float).tobytes(), structure)
+        return _plan(np.ascontiguousarray(frequency_hz, float).tobytes(), structure, band_hz)
+
+    @property
+    def richer(self) -> LinesPlan:
+        """With one mode more."""
+        return LinesPlan.on_lines(self.frequency_hz, richer(self.structure), self.band_hz)
 
     def fit(self, data: BinData) -> LinesFit:
         """Fit of all points of a batch."""
@@ -111,17 +125,22 @@ class LinesPlan:
                 residual[k] = dense.turned[0]
                 half, condition[k] = dense.covariance()
                 parameters[k] = 0.5 * half
-        return LinesFit(self.model_of(theta), cost, parameters, condition, converged, residual)
+        return LinesFit(
+            theta, self.model_of(theta), cost, parameters, condition, converged, residual
+        )
 
-    def compared(self, data: BinData) -> ComplexArray:
-        """(batch, order) poles [rad/s] of a fit that others are compared with.
+    @np.errstate(over="ignore", invalid="ignore")
+    def compared(self, data: BinData, _: FloatArray | None = None) -> tuple[ComplexArray, None]:
+        """Poles (batch, places) in the band of a fit that others are compared with; see `JointPlan`.
 
         Of the batched solver alone where it is that of `fit`, and of few iterations.
         """
         if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
-            return self.fit(data).model.poles_rad_s()
-        theta = minimise(self.problem, data, None, COMPARISON_ITERATIONS).theta
-        return self.model_of(theta[:, 0]).poles_rad_s()
+            model = self.fit(data).model
+        else:
+            theta = minimise(self.problem, data, None, COMPARISON_ITERATIONS).theta
+            model = self.model_of(theta[:, 0])
+        return modes_in_band(model.poles_rad_s(), self.band_hz), None
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
@@ -156,7 +175,13 @@ class LinesPlan:
                 break
             problem = Problem.of_lines(denominator.values, numerator.values)
             plan = LinesPlan(
-                self.frequency_hz, self.structure, problem, self.variable, denominator, numerator
+                self.frequency_hz,
+                self.structure,
+                self.band_hz,
+                problem,
+                self.variable,
+                denominator,
+                numerator,
             )
             theta = linear_step(problem, row, np.sqrt(size))
             last, size = size, np.abs(denominator.values @ np.append(theta[:order], 1.0)) ** 2
@@ -170,10 +195,6 @@ class LinesPlan:
     def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
         """(batch, n, n) ``Re J^H J`` for the weights of `data`."""
         return likelihood.moments(self.problem.tables, data.arrays, theta[:, None])[2][:, 0, 1]
-
-    def theta(self, model: RationalModel) -> FloatArray:
-        """(batch, n) free coefficients of a model of this plan."""
-        return np.concatenate([model.denominator[:, :-1], model.numerator], axis=1)
 
     def model_of(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
         """The model with coefficients (batch, n), those of A first."""
@@ -201,7 +222,9 @@ class LinesPlan:
         theta = np.stack([s.theta for s in solutions])
         covariances, conditions = zip(*(s.covariance() for s in solutions), strict=True)
         delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
+        a, b, _ = self.problem.sizes
         return LinesFit(
+            theta[:, : a + b],
             self.model_of(theta, delay_s),
             np.array([s.cost for s in solutions]),
             0.5 * np.stack(covariances),
@@ -225,14 +248,16 @@ class LinesPlan:
 
 
 @lru_cache(maxsize=16)
-def _plan(frequency_hz: bytes, structure: ModelStructure) -> LinesPlan:
+def _plan(
+    frequency_hz: bytes, structure: ModelStructure, band_hz: tuple[float, float]
+) -> LinesPlan:
     lines_hz = np.frombuffer(frequency_hz)
     variable = Variable.for_lines(lines_hz, structure)
     x = variable.of_frequency(lines_hz)
     denominator = PolynomialBasis.on_lines(x, structure.order)
     numerator = PolynomialBasis.on_lines(x, structure.numerator_order)
     problem = Problem.of_lines(denominator.values, numerator.values)
-    return LinesPlan(lines_hz, structure, problem, variable, denominator, numerator)
+    return LinesPlan(lines_hz, structure, band_hz, problem, variable, denominator, numerator)
 
 
 def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[FloatArray | None]:

@@ -102,8 +102,8 @@ class RationalModel:
     def response(self, frequency_hz: FloatArray) -> ComplexArray:
         """(..., F) the model at any frequencies (F,)."""
         x = self.variable.of_frequency(frequency_hz)
-        a = self.denominator @ self.denominator_basis.values_at(x).T
-        b = self.numerator @ self.numerator_basis.values_at(x).T
+        a = self.denominator @ self.denominator_basis.at(x, 0)[0].T
+        b = self.numerator @ self.numerator_basis.at(x, 0)[0].T
         phase = 2 * np.pi * np.asarray(frequency_hz) * np.asarray(self.delay_s)[..., None]
         return b / a * np.exp(-1j * phase)
 
@@ -125,7 +125,7 @@ class RationalModel:
         values, slopes = self.denominator_basis.at(x)
         # A(x; a) = 0 along the root: dx = - dA / A'
         factor = self.variable.to_s(x)[1] / _dot(slopes, self.denominator)
-        residues = _dot(self.numerator_basis.values_at(x), self.numerator) * factor
+        residues = _dot(self.numerator_basis.at(x, 0)[0], self.numerator) * factor
         return residues, values[..., :-1] * -factor[..., None]
 
     def zero_sensitivity(self, zeros_rad_s: ComplexArray) -> ComplexArray:
@@ -138,9 +138,9 @@ class RationalModel:
     def residue_sensitivity(self, poles_rad_s: ComplexArray) -> ComplexArray:
         """(..., k, n + m + 1) derivative of the residues by the free coefficients of A, then B."""
         x = self.variable.of_s(poles_rad_s)
-        values, slopes = self.denominator_basis.at(x)
+        values, slopes, bends = self.denominator_basis.at(x, 2)
         a1 = _dot(slopes, self.denominator)
-        a2 = _dot(self.denominator_basis.second_derivative(x), self.denominator)
+        a2 = _dot(bends, self.denominator)
         b_values, b_slopes = self.numerator_basis.at(x)
         b, b1 = _dot(b_values, self.numerator), _dot(b_slopes, self.numerator)
         map_1 = self.variable.to_s(x)[1]

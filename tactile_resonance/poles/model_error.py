@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.result import (
     ComplexArray,
     FloatArray,
@@ -14,11 +16,62 @@ from tactile_resonance.poles.result import (
 )
 from tactile_resonance.poles.structure import ModelStructure
 
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
+    from tactile_resonance.poles.lines_fit import LinesPlan
+
 # A cost that noise alone exceeds once in a thousand fits counts as model error.
 MODEL_ERROR_PROBABILITY = 1e-3
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
 COMPARISON_ITERATIONS = 8
+
+
+def systematic_of(
+    plan: JointPlan | LinesPlan,
+    data: BinData,
+    poles_rad_s: ComplexArray,
+    theta: FloatArray | None = None,
+) -> FloatArray:
+    """Outer products of what halves of the data, and one mode more, move each pole by.
+
+    Halves are those of the driven bins and, of several records, the first and the last ones.
+
+    Parameters
+    ----------
+    plan : JointPlan or LinesPlan
+    data : BinData
+    poles_rad_s : (points, places) complex
+        Of the fit.
+    theta : (points, M, n) float, optional
+        Of the fit, where those to halves begin; needed of several records.
+
+    Returns
+    -------
+    (points, places, 2, 2) float
+        In (f0_hz, damping_ratio).
+    """
+    poles = []
+    for parity in (0, 1):
+        left_out = np.arange(data.driven) % 2 == parity
+        half = replace(data, variance_y=np.where(left_out, np.inf, data.variance_y))
+        poles.append(plan.compared(half, theta)[0])
+    systematic = difference_of_halves(*poles)
+    half_of = data.records // 2
+    if half_of > 0 and theta is not None:
+        first, last = slice(0, half_of), slice(data.records - half_of, None)
+        poles = [plan.compared(data.part(which), theta[:, which])[0] for which in (first, last)]
+        systematic = systematic + difference_of_halves(*poles)
+    if plan.richer is not None and _fewest_lines(data) > plan.richer.structure.fewest_lines:
+        more = difference_of_models(poles_rad_s, *plan.richer.compared(data))
+        systematic = systematic + more
+    return systematic
+
+
+def _fewest_lines(data: BinData) -> int:
+    """Driven bins of a point that are not left out."""
+    used = np.isfinite(data.variance_y[:, 0])
+    return int(np.broadcast_to(used, (len(used), data.driven)).sum(axis=-1).min())
 
 
 def model_error_factor(

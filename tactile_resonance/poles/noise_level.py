@@ -69,57 +69,33 @@ class VarianceModel:
         distributed: with 2 nu real degrees of freedom their variance is ``nu / (nu - 1)``.
         """
         per_line = self.dof / (self.dof - 2) if self.dof > 2 else np.nan
-        pooled = self.pooled_dof
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factor = np.where(pooled > 1, pooled / (pooled - 1), np.nan)
-        return np.where(self.kind == 2, per_line, factor)
+        return np.where(self.kind == 2, per_line, student_variance(self.pooled_dof))
 
     def expected_cost(self, parameters: int) -> FloatArray:
         """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
-        nu = self.pooled_dof
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(nu > 1, (self.lines - parameters / 2) * nu / (nu - 1), np.nan)
+        return (self.lines - parameters / 2) * student_variance(self.pooled_dof)
 
-    def cost_quantile(self, parameters: int, probability: float) -> FloatArray:
-        """(batch,) quantile of the cost with noise alone; NaN where it is too wide to tell.
-
-        Wilson and Hilferty's cube root makes the F-distribution normal to better than 1 % here.
-        """
+    def contradicts(
+        self, cost: FloatArray, parameters: int, probability: float
+    ) -> npt.NDArray[np.bool_]:
+        """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be told."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
-        per_line = np.nan
+        chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
         if self.dof > 2:
             # moments of F(2, 2 nu)
             nu = self.dof
             mean = nu / (nu - 1)
             std = mean * np.sqrt(nu / (nu - 2))
-            per_line = free * mean + np.sqrt(free) * std * special.ndtri(probability)
-        pooled = free * f_quantile(probability, 2 * free, 2 * self.pooled_dof)
-        return np.where(self.kind == 2, per_line, pooled)
+            per_line = special.ndtr((free * mean - cost) / (np.sqrt(free) * std))
+        else:
+            per_line = np.ones(free.shape)
+        return np.asarray(np.where(self.kind == 2, per_line, chance) < probability)
 
 
-def f_quantile(probability: float, dof_1: FloatArray, dof_2: FloatArray) -> FloatArray:
-    """Quantile of the F-distribution by Wilson and Hilferty's cube roots: arrays at no cost.
-
-    Paulson, *An approximate normalization of the analysis of variance distribution*, Ann. Math.
-    Stat. 13 (1942) 233-235. Within 1 % for degrees of freedom above 10. Infinite where the
-    approximation ends.
-    """
-    normal = _normal_quantile(probability)
-    with np.errstate(divide="ignore"):
-        a, b = 2 / (9 * np.asarray(dof_1)), 2 / (9 * np.asarray(dof_2))
-    if a.size == b.size == 1:  # numbers are faster than arrays of one
-        a, b = a.reshape(())[()], b.reshape(())[()]
-    bottom = (1 - b) ** 2 - normal**2 * b
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = (1 - a) * (1 - b) + normal * np.sqrt(
-            np.maximum((1 - a) ** 2 * b + (1 - b) ** 2 * a - normal**2 * a * b, 0)
-        )
-        return np.where(bottom > 0, (root / bottom) ** 3, np.inf)
-
-
-@lru_cache(maxsize=16)
-def _normal_quantile(probability: float) -> float:
-    return float(special.ndtri(probability))
+@np.errstate(divide="ignore", invalid="ignore")
+def student_variance(dof: FloatArray) -> FloatArray:
+    """Variance of Student's distribution for a level of `dof` complex degrees of freedom; NaN up to 1."""
+    return np.where(dof > 1, dof / (dof - 1), np.nan)
 
 
 def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = None) -> VarianceModel:
@@ -177,13 +153,8 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     return VarianceModel(model, lines, dof, kind)
 
 
-def is_flat(variance: FloatArray, dof: int) -> bool:
-    """Whether the test of `model_variance` finds every point of (batch, F) variances flat."""
-    return bool(are_flat(variance, dof).all())
-
-
 def are_flat(variance: FloatArray, dof: int) -> npt.NDArray[np.bool_]:
-    """(batch,) whether the test of `model_variance` finds (batch, F) variances flat."""
+    """(...) whether the test of `model_variance` finds variances (..., F) flat."""
     lines = variance.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.log(variance.sum(axis=-1) / lines) - np.log(variance).sum(axis=-1) / lines
@@ -193,7 +164,7 @@ def are_flat(variance: FloatArray, dof: int) -> npt.NDArray[np.bool_]:
 
 @lru_cache(maxsize=256)
 def flat_limit(lines: int, dof: int) -> float:
-    """Largest ``log mean - mean log`` that `is_flat` lets pass."""
+    """Largest ``log mean - mean log`` that `are_flat` lets pass."""
     return float(_bartlett_limit(np.array(lines), dof, 1))
 
 

@@ -32,20 +32,29 @@ CERTAIN_LEVERAGE = 0.99
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def falls_without_each(jacobian: ComplexArray, error: ComplexArray) -> FloatArray:
+def falls_without_each(shared: ComplexArray, own: ComplexArray, error: ComplexArray) -> FloatArray:
     """(M, K) what the cost falls by without a bin, in units of its variance.
 
     0 where the fit goes through a bin whatever is there.
 
     Parameters
     ----------
-    jacobian : (M, K, n) complex
-        Derivative of the model by the n real parameters of the fit, weighted; 0 on bins not used.
+    shared : (M, K, n) complex
+        Derivative of the model by the n real parameters that all records share, weighted; 0 on bins not
+        used.
+    own : (K, c) complex
+        By those of one record, the same for each.
     error : (M, K) complex
         Weighted; E|error|^2 = 1 of noise.
     """
-    parts = np.stack([jacobian.real, jacobian.imag], axis=2)  # (M, K, 2, n)
-    q = np.linalg.qr(parts.reshape(-1, parts.shape[-1]))[0].reshape(parts.shape)
+    records, bins, n = shared.shape
+    of_own = np.linalg.qr(_real_rows(own))[0]  # (2 K, c)
+    rest = _real_rows(shared)  # (M, 2 K, n)
+    for _ in range(2):  # twice is enough: the second pass removes what rounding left
+        rest = rest - of_own @ (of_own.T @ rest)
+    of_shared = np.linalg.qr(rest.reshape(-1, n))[0].reshape(rest.shape)
+    whole = np.concatenate([of_shared, np.broadcast_to(of_own, (records, *of_own.shape))], axis=-1)
+    q = whole.reshape(records, bins, 2, -1)
     # (I - H) of each bin, 2 x 2: what of an error there the fit has left
     p, r = (1 - np.sum(q[..., k, :] ** 2, axis=-1) for k in (0, 1))
     b = -np.sum(q[..., 0, :] * q[..., 1, :], axis=-1)
@@ -53,6 +62,12 @@ def falls_without_each(jacobian: ComplexArray, error: ComplexArray) -> FloatArra
     falls = (r * re**2 - 2 * b * re * im + p * im**2) / (p * r - b**2)
     least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
     return np.asarray(np.where(least > 1 - CERTAIN_LEVERAGE, falls, 0.0))
+
+
+def _real_rows(values: ComplexArray) -> FloatArray:
+    """(..., 2 K, n) real and imaginary parts of values (..., K, n), one after the other."""
+    parts = np.stack([values.real, values.imag], axis=-2)
+    return parts.reshape(*values.shape[:-2], -1, values.shape[-1])
 
 
 def chances_of(

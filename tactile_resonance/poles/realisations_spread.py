@@ -9,16 +9,20 @@ are widened by the quantile of Student's distribution that belongs to them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.joint_layout import JointLayout
+from tactile_resonance.poles.covariance import real_rows
 from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -60,7 +64,7 @@ class Spread:
     @classmethod
     def of(
         cls,
-        layout: JointLayout,
+        plan: JointPlan,
         data: BinData,
         theta: FloatArray,
         inner: FloatArray,
@@ -70,7 +74,7 @@ class Spread:
 
         Parameters
         ----------
-        layout : JointLayout
+        plan : JointPlan
         data : BinData
             With the variances that it was weighted with.
         theta : (batch, M, n) float
@@ -80,16 +84,16 @@ class Spread:
         dof : (batch,) float
             Complex degrees of freedom of that.
         """
-        a, b, _ = layout.problem.sizes
+        a, b, _ = plan.problem.sizes
         batch, records, n = theta.shape
-        _, gradient, normal = moments(layout.problem.tables, data.arrays, theta)
+        _, gradient, normal = moments(plan.problem.tables, data.arrays, theta)
         inverse = invert(normal.sum(axis=2).reshape(-1, n, n))[0]
         step = -(inverse @ gradient.reshape(-1, n, 1))[:, : a + b, 0]
         inverse = inverse[:, :a]  # (batch M, a, n)
         covariance = 0.5 * inverse @ inner.reshape(-1, n, n) @ inverse.swapaxes(-1, -2)
         step = step.reshape(batch, records, a + b)
         covariance = covariance.reshape(batch, records, a, a)
-        turn = _turn(layout, theta[:, 0])  # (batch, places, 2, a)
+        turn = _turn(plan, theta[:, 0])  # (batch, places, 2, a)
         departure = np.einsum("bpia,bma->bmpi", turn, step[..., :a])
         expected = np.einsum("bpia,bmac,bpic->bmpi", turn, covariance, turn)
         return cls(step.mean(axis=1), departure, expected, 2 * dof, turn)
@@ -156,6 +160,8 @@ class Spread:
     def remarks(self) -> tuple[BoolArray, npt.NDArray[np.object_]]:
         """(batch,) where one realisation contradicts the others, and what is to be told to people."""
         surely = self.chance < MODEL_ERROR_PROBABILITY
+        if not surely.any():
+            return surely, np.full(surely.size, "", object)
         odd, away = self._odd_one()
         size = np.sqrt(np.nan_to_num(self.ratio).max(axis=(1, 2), initial=0.0))
         remarks = np.full(size.size, "", object)
@@ -197,9 +203,8 @@ class Spread:
         return odd, size
 
 
-def _turn(layout: JointLayout, theta: FloatArray) -> FloatArray:
+def _turn(plan: JointPlan, theta: FloatArray) -> FloatArray:
     """(batch, places, 2, a) derivative of (f0_hz, damping_ratio) by the denominator's coefficients."""
-    poles = layout.poles_in_band(theta)
-    _, sensitivity = layout.model_of(theta).residues_and_sensitivity(poles)  # (batch, places, a)
-    stacked = np.stack([sensitivity.real, sensitivity.imag], axis=-2)
-    return np.asarray(natural_frequency_and_damping_jacobian(poles) @ stacked)
+    poles = plan.poles_in_band(theta)
+    _, sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)  # (batch, places, a)
+    return np.asarray(natural_frequency_and_damping_jacobian(poles) @ real_rows(sensitivity))

@@ -240,7 +240,7 @@ class PolesBatch:
     band_hz : (float, float)
     variance_model : (...) str array
     method : str
-    remark : (...) object array of str, optional
+    remark : (...) object array of str
         What else is to be told to people of a point; empty: nothing.
     """
 
@@ -266,7 +266,7 @@ class PolesBatch:
     band_hz: tuple[float, float]
     variance_model: npt.NDArray[np.str_]
     method: str
-    remark: npt.NDArray[np.object_] | None = None
+    remark: npt.NDArray[np.object_]
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -62,8 +62,8 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         values = array[index][there]
         return values if values.size and np.isfinite(values).all() else None
 
-    remark = "" if batch.remark is None else str(batch.remark[index])
-    message = "; ".join(filter(None, [_sentence(batch, index, status), remark, *notes]))
+    said = [_sentence(batch, index, status), str(batch.remark[index]), *notes]
+    message = "; ".join(filter(None, said))
     return Poles(
         poles_rad_s=poles,
         f0_hz=batch.f0_hz[index][there],

@@ -201,6 +201,8 @@ def in_blocks(values: Sequence[npt.NDArray], points: int = 1) -> FloatArray:
     if not values:
         return np.empty((points, 1, 0, 1, 1))
     shape, bins = values[0].shape[:-1], values[0].shape[-1]
+    if bins == len(values) == 1:
+        return np.ascontiguousarray(values[0], float)[..., None, None]
     if bins == 1:
         return np.ascontiguousarray(np.stack(values, axis=-2), float)[..., None, :, :]
     blocks = -(-bins // BLOCK)
@@ -243,7 +245,8 @@ def compiled() -> int:
     modes = np.ones((1, 2, 2, bins - undriven))
     two = np.ones((bins - undriven, 2), complex)
     bases = (two, one[undriven:], one[undriven:])
-    likelihood.falls(data, 1, bases, theta[:, 0, :3], inverse[:, :3, :3], two, modes)
+    at, inverse = theta[:, 0, :3], inverse[:, :3, :3]
+    likelihood.best_fall(data, 1, bases, at, inverse, np.ones(1), 9.0, two, modes)
     missing = sum(sum(kernel.stats.cache_misses.values()) for kernel in likelihood.KERNELS)
     if missing:
         logging.getLogger(__name__).warning(

@@ -18,7 +18,6 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.joint_transient import transient_basis
 from tactile_resonance.poles.outliers import (
     FALSE_ALARM,
     MOST_TONES,
@@ -168,7 +167,7 @@ def _taken_too(
     for _ in range(MOST_RETURNS):
         plan = fitted.plan
         rest = fitted.u if channel == "actuator" else _Model(fitted).errors()
-        unknown = _excited(plan) if channel == "actuator" else plan.excited_bins
+        unknown = plan.bins[plan.driven] if channel == "actuator" else plan.excited_bins
         at, phasor = _tone_near(plan, rest + tone.leak(plan), k, unknown)
         near = plan.bins[np.abs(plan.bins - at) <= NEAR_BINS]
         moved = abs(at - tone.at)
@@ -181,17 +180,10 @@ def _taken_too(
 
 def _lines_in_a_row(plan: JointPlan) -> bool:
     """Whether neighbouring excited lines are left out, and not what lies between them: no tone does that."""
-    gone = np.flatnonzero(np.isin(_excited(plan), plan.left_out))
+    gone = np.flatnonzero(np.isin(plan.bins[plan.driven], plan.left_out))
     if plan.periods == 1:  # two are one tone between them
         return bool(np.any(gone[2:] - gone[:-2] == 2))
     return bool(np.any(np.diff(gone) == 1))
-
-
-def _excited(plan: JointPlan) -> IntArray:
-    """Bins of the band that are excited, left out or not."""
-    if plan.harmonics is None:
-        return plan.bins
-    return plan.bins[np.isin(plan.bins, np.asarray(plan.harmonics) * plan.periods)]
 
 
 class _Model:
@@ -206,24 +198,16 @@ class _Model:
     def __init__(self, fitted: _Fitted) -> None:
         plan, fit = fitted.plan, fitted.batch.fit
         self._u, self._y, self.bins = fitted.u, fitted.y, plan.bins
-        frequency_hz = plan.frequency_hz(plan.bins)
-        x = plan.variable.of_frequency(frequency_hz)
-        self._p = fit.denominator_basis.values_at(x)  # (K, a + 1)
-        self._q = fit.numerator_basis.values_at(x)  # (K, b)
-        self._t = transient_basis(
-            frequency_hz,
-            plan.transient_terms or 0,
-            plan.sample_rate_hz,
-            plan.band_hz,
-            plan.structure,
-        )  # (K, c)
+        self._p = plan.denominator_basis.values  # (K, a + 1)
+        self._q = plan.numerator_on_bins  # (K, b)
+        self._t = plan.transient_on_bins  # (K, c)
         self._a = self._p @ fit.denominator  # (K,)
         self.g = (self._q @ fit.numerator) / self._a
         decay = fit.transient.reshape(-1, self._t.shape[1])  # (M, c)
         self._transient = decay @ self._t.T / self._a  # (M, K)
-        self.driven = np.isin(plan.bins, _excited(plan))
-        self.excited = np.isin(plan.bins, plan.excited_bins)
-        self.others = np.isin(plan.bins, plan.other_bins)
+        self.driven = plan.driven
+        self.excited, self.others = np.zeros((2, plan.bins.size), bool)
+        self.excited[plan.excited_at] = self.others[plan.others_at] = True
         # between harmonics the input is noise of the voltmeter, unless the output follows it
         error, through = self._y - self._transient, self.g * self._u
         less = np.linalg.norm((error - through)[:, self.others])
@@ -242,23 +226,17 @@ class _Model:
 
         0 where a bin is not used.
         """
-        records = self._y.shape[0]
         used = self.excited | self.others
-        of_ab = np.concatenate(
+        by_shared = np.concatenate(
             [
                 -self._output[..., None] * self._p[:, :-1],
                 np.where(self.driven, self._u, 0)[..., None] * self._q,
             ],
             axis=-1,
         )  # (M, K, a + b)
-        c = self._t.shape[1]
-        shared = of_ab.shape[-1]
-        jacobian = np.zeros((records, self.bins.size, shared + records * c), complex)
-        jacobian[..., :shared] = of_ab
-        for m in range(records):
-            jacobian[m, :, shared + m * c : shared + (m + 1) * c] = self._t
         weight = used / np.sqrt(self.variance)
-        falls = falls_without_each(jacobian * (weight / self._a)[:, None], self.errors() * weight)
+        scale = (weight / self._a)[:, None]
+        falls = falls_without_each(by_shared * scale, self._t * scale, self.errors() * weight)
         return np.asarray(falls.mean(axis=0))
 
 

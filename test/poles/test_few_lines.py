@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.poles_plant import HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
-from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure

@@ -6,7 +6,7 @@ import pytest
 
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
-from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -42,7 +42,7 @@ def test_exact_data_give_the_exact_pole():
         variance_noise=np.full(LINES_HZ.size, 1e-12),
         noise_dof=10,
     )
-    poles = identify_poles(frf, structure=BARE)
+    poles = identify_frf(frf, structure=BARE)
     w0 = 2 * np.pi * F0_HZ
     expected = w0 * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2))
     np.testing.assert_allclose(poles.poles_rad_s, [expected], rtol=1e-11)
@@ -62,7 +62,7 @@ def test_stated_covariance_is_that_of_the_estimates(pooled, dof, kind):
     rng = np.random.default_rng(1)
     runs, squared, costs, expected, kinds = 1000, [], [], [], []
     for _ in range(runs):
-        poles = identify_poles(noisy(rng, 1e-3, dof, LINES_HZ, pooled), structure=BARE)
+        poles = identify_frf(noisy(rng, 1e-3, dof, LINES_HZ, pooled), structure=BARE)
         kinds.append(poles.variance_model)
         error = np.array([poles.f0_hz[0] - F0_HZ, poles.damping_ratio[0] - DAMPING])
         squared.append(error @ np.linalg.solve(poles.covariance[0], error))
@@ -78,7 +78,7 @@ def test_stated_covariance_is_that_of_the_estimates(pooled, dof, kind):
 def test_model_error_is_seen_and_enlarges_the_total_covariance():
     g = second_order(LINES_HZ) + 0.02 * second_order(LINES_HZ, 280.0, 0.01)
     frf = FRF(LINES_HZ, g, variance_noise=np.full(g.size, 1e-10), noise_dof=20)
-    poles = identify_poles(frf, structure=BARE)
+    poles = identify_frf(frf, structure=BARE)
     assert poles.status is PolesStatus.MODEL_ERROR
     assert np.trace(poles.total_covariance[0]) > 10 * np.trace(poles.covariance[0])
     assert "cost" in poles.message
@@ -86,10 +86,10 @@ def test_model_error_is_seen_and_enlarges_the_total_covariance():
 
 def test_too_few_lines_and_no_variance_are_said():
     frf = FRF(LINES_HZ[:3], second_order(LINES_HZ[:3]))
-    poles = identify_poles(frf)
+    poles = identify_frf(frf)
     assert poles.status is PolesStatus.TOO_FEW_LINES
     assert poles.poles_rad_s.size == 0
-    poles = identify_poles(FRF(LINES_HZ, second_order(LINES_HZ)), structure=BARE)
+    poles = identify_frf(FRF(LINES_HZ, second_order(LINES_HZ)), structure=BARE)
     assert poles.status is PolesStatus.NO_COVARIANCE
     assert poles.covariance is None
     assert poles.f0_hz[0] == pytest.approx(F0_HZ, rel=1e-9)
@@ -99,7 +99,7 @@ def test_lines_without_a_finite_response_are_left_out():
     g = second_order(LINES_HZ)
     g[5] = np.nan
     frf = FRF(LINES_HZ, g, variance_noise=np.full(g.size, 1e-10), noise_dof=20)
-    poles = identify_poles(frf, structure=BARE)
+    poles = identify_frf(frf, structure=BARE)
     assert poles.lines == LINES_HZ.size - 1
     assert poles.f0_hz[0] == pytest.approx(F0_HZ, rel=1e-9)
     assert "1 lines" in poles.message
@@ -123,5 +123,5 @@ def test_a_transient_too_narrow_for_local_polynomials_is_said(periods, said, met
     """Half the width is 7.5 Hz: 6 bins of two periods, 24 of eight."""
     rng = np.random.default_rng(1)
     frf = replace(noisy(rng, 1e-4, 6, LINES_HZ), periods=periods, method=method)
-    message = identify_poles(frf, structure=BARE).message
+    message = identify_frf(frf, structure=BARE).message
     assert ("half the width of the mode is 6.0 bins" in message) == (said and "local" in method)

@@ -22,7 +22,7 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.estimator import poles_of_frf
 from tactile_resonance.poles.identify import (
     identify_batch,
-    identify_poles,
+    identify_frf,
     identify_spectra,
 )
 from tactile_resonance.poles.joint import JointPlan
@@ -59,7 +59,7 @@ def with_entry(row, column, value):
 )
 def test_a_bad_frf_is_named(changes, band_hz, said):
     with pytest.raises(ValueError, match=said):
-        identify_poles(frf(**changes), band_hz, BARE)
+        identify_frf(frf(**changes), band_hz, BARE)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_leading_axes_that_do_not_fit_are_named():
 
 def test_harmonics_kept_with_bins_are_whole_too():
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
-    u, y = (plan.transform(x)[None] for x in record())
+    u, y = (x[None] for x in plan.transform(*record()))
     bins = BandBins(int(plan.bins[0]), u, y, HARMONICS + 0.5, RATE_HZ, SAMPLES, PERIODS)
     with pytest.raises(ValueError, match="harmonics: "):
         identify_poles_from_bins(bins, (200, 300), BARE)
@@ -158,7 +158,7 @@ def test_harmonics_kept_with_bins_are_whole_too():
 
 def test_no_candidates_are_named():
     with pytest.raises(ValueError, match="candidates: none given"):
-        choose_among(lambda structure: identify_poles(frf(), None, structure), candidates=[])
+        choose_among(lambda structure: identify_frf(frf(), None, structure), candidates=[])
 
 
 @pytest.mark.parametrize(
@@ -171,9 +171,9 @@ def test_no_candidates_are_named():
     ids=["strided", "other byte order", "lists"],
 )
 def test_form_of_the_same_numbers_does_not_matter(form):
-    one = identify_poles(frf(), structure=BARE)
+    one = identify_frf(frf(), structure=BARE)
     changed = {name: form(getattr(frf(), name)) for name in ("frequency_hz", "g")}
-    same = identify_poles(frf(**changed, variance_noise=1e-6), structure=BARE)
+    same = identify_frf(frf(**changed, variance_noise=1e-6), structure=BARE)
     assert same.f0_hz == one.f0_hz
     assert same.covariance == pytest.approx(one.covariance)
     arguments = spectra()
@@ -188,11 +188,11 @@ def test_single_precision_and_read_only_data():
     g = NOISY.copy()
     g[3] = np.nan
     g.flags.writeable = False
-    one = identify_poles(frf(g=g), structure=BARE)
-    low = identify_poles(frf(g=g.astype(np.complex64)), structure=BARE)
+    one = identify_frf(frf(g=g), structure=BARE)
+    low = identify_frf(frf(g=g.astype(np.complex64)), structure=BARE)
     assert low.f0_hz == pytest.approx(one.f0_hz, rel=1e-7)
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
-    u, y = (plan.transform(x) for x in record())
+    u, y = plan.transform(*record())
     result = plan.from_bins(u.astype(np.complex64), y.astype(np.complex64))
     assert result.f0_hz == pytest.approx(plan.from_bins(u, y).f0_hz, rel=1e-6)
 
@@ -214,9 +214,9 @@ def test_no_points_give_no_results(shape, order):
 @pytest.mark.parametrize(
     "fit",
     [
-        lambda band: identify_poles(frf(), band, BARE),
+        lambda band: identify_frf(frf(), band, BARE),
         lambda band: poles_of_frf(frf(), band, BARE),
-        lambda band: identify_poles(FRF(np.empty(0), np.empty(0, complex)), None, BARE),
+        lambda band: identify_frf(FRF(np.empty(0), np.empty(0, complex)), None, BARE),
     ],
 )
 def test_a_band_without_lines_has_too_few(fit):

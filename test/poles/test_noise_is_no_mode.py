@@ -40,7 +40,7 @@ def from_noise(plan_of, structure):
     """Records whose output is noise and nothing else."""
     plan = plan_of(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), structure)
     rng = np.random.default_rng(2)
-    u = plan.transform(record(noise=0.0)[0])
+    u, _ = plan.transform(*record(noise=0.0))
     variance = 1e-6 / (SAMPLES * PERIODS)
     noise = circular(rng, (2, RUNS, u.size), variance)
     return plan.from_bins(u + noise[0], noise[1])

@@ -19,9 +19,8 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
-from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_records
-from tactile_resonance.poles.realisations import PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
@@ -92,7 +91,7 @@ def test_distortion_is_told_from_noise_and_from_model_error(realisations, period
     if periods == 1:  # noise or distortion: lines are taken to be independent
         assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants, level))
     else:
-        alone = JointPlan(*plan_of(periods)._arguments).from_bins(u, y)
+        alone = plan_of(periods, kind=JointPlan).from_bins(u, y)
         mean = np.stack([alone.f0_hz[..., 0] - 250, alone.damping_ratio[..., 0] - 0.01], -1)
         assert np.all(np.mean(errors**2, axis=0) < 1.1 * np.mean(mean.mean(axis=1) ** 2, axis=0))
         assert np.median(result.noise_variance[:, 0]) == pytest.approx(level / 100, rel=0.05)

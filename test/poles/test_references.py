@@ -13,7 +13,7 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import (
     identify_batch,
-    identify_poles,
+    identify_frf,
     identify_spectra,
 )
 from tactile_resonance.poles.joint_records import identify_poles_from_records
@@ -107,7 +107,7 @@ def test_silverbox_with_its_transients(silverbox_records, band):
 
 
 def test_silverbox(silverbox):
-    poles = identify_poles(silverbox, (40, 110), BARE)
+    poles = identify_frf(silverbox, (40, 110), BARE)
     assert poles.f0_hz[0] == pytest.approx(69.536, abs=1e-3)
     assert poles.damping_ratio[0] == pytest.approx(0.04877, abs=2e-5)
     assert poles.cost == pytest.approx(525.6, abs=0.2)
@@ -116,7 +116,7 @@ def test_silverbox(silverbox):
 
 
 def test_silverbox_over_a_wider_band_agrees_within_its_total_covariance(silverbox):
-    poles = identify_poles(silverbox, (1, 200), BARE)
+    poles = identify_frf(silverbox, (1, 200), BARE)
     std = np.sqrt(np.diagonal(poles.total_covariance[0]))
     assert abs(poles.f0_hz[0] - 69.536) < 2 * std[0]
     assert abs(poles.damping_ratio[0] - 0.04877) < 2 * std[1]
@@ -124,7 +124,7 @@ def test_silverbox_over_a_wider_band_agrees_within_its_total_covariance(silverbo
 
 def test_silverbox_second_order_leaves_nothing_out_that_ten_realisations_show(silverbox):
     """Over 1-200 Hz too: fourteen more terms lower the cost by what chance takes, no more."""
-    bare, rich = (identify_poles(silverbox, (1, 200), ModelStructure(2, n)) for n in (2, 16))
+    bare, rich = (identify_frf(silverbox, (1, 200), ModelStructure(2, n)) for n in (2, 16))
     assert bare.status is PolesStatus.OK
     assert abs(bare.whiteness) < SMOOTH_RESIDUAL
     # half a chi-square of 14 degrees of freedom, weights of 9 degrees: mean 7.9
@@ -139,7 +139,7 @@ def test_silverbox_one_model_serves_both_parts_of_the_band(silverbox):
     def cost(lines):
         variance = silverbox.variance_total[lines]
         frf = FRF(f[lines], silverbox.g[lines], variance_total=variance, total_dof=9)
-        return identify_poles(frf, structure=BARE).cost
+        return identify_frf(frf, structure=BARE).cost
 
     gain = cost(band) - cost(band & middle) - cost(band & ~middle)
     assert 0 < gain < stats.chi2.ppf(0.95, BARE.parameters) / 2 * 9 / 8
@@ -153,7 +153,7 @@ def test_silverbox_with_a_neighbouring_mode_is_told(silverbox, band):
     end = int(np.argmin(np.abs(silverbox.frequency_hz - band[1])))
     std = np.sqrt(silverbox.variance_total[end - 20 : end].mean())
     changed = replace(silverbox, g=silverbox.g + 4 * std * mode / np.abs(mode[end]))
-    poles = identify_poles(changed, band, BARE)
+    poles = identify_frf(changed, band, BARE)
     assert poles.status is PolesStatus.MODEL_ERROR
     total = np.sqrt(np.diagonal(poles.total_covariance[0]))
     assert abs(poles.f0_hz[0] - 69.536) < 2 * total[0]
@@ -171,7 +171,7 @@ def test_batch_equals_single_points(silverbox):
         ),
         structure=BARE,
     )
-    poles = identify_poles(silverbox, (40, 110), BARE)
+    poles = identify_frf(silverbox, (40, 110), BARE)
     assert batch.shape == (2, 1)
     assert batch.f0_hz[:, 0, 0] == pytest.approx(poles.f0_hz[0], rel=1e-8)
     assert batch.covariance[1, 0, 0] == pytest.approx(poles.covariance[0], rel=1e-6)

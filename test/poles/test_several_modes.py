@@ -44,7 +44,7 @@ def record(f0_hz, damping_ratio):
 def test_ellipses_hold_every_mode(f0_hz, band_hz):
     order = 2 * len(f0_hz)
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, band_hz, ModelStructure(order, order))
-    u, y = (plan.transform(x) for x in record(f0_hz, 0.02))
+    u, y = plan.transform(*record(f0_hz, 0.02))
     rng = np.random.default_rng(1)
     runs = 200 if order < 20 else 50
     variance = 1e-8 / (SAMPLES * PERIODS)

@@ -8,7 +8,7 @@ import scipy.signal
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import (
     identify_batch,
-    identify_poles,
+    identify_frf,
     identify_spectra,
 )
 from tactile_resonance.poles.order_choice import choose_among
@@ -40,7 +40,7 @@ def assert_exact(poles, f0_hz, damping_ratio, rel=1e-9):
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("structure", [BARE, ModelStructure()])
 def test_scale_of_the_data(scale, structure):
-    poles = identify_poles(
+    poles = identify_frf(
         frf(LINES_HZ, scale * modal(LINES_HZ, [250], [0.02], [0.04])), None, structure
     )
     assert_exact(poles, 250, 0.02)
@@ -52,7 +52,7 @@ def test_scale_of_the_data(scale, structure):
 def test_frequency_and_damping(f0_hz, damping_ratio):
     reach = 10 * damping_ratio
     f = np.linspace(f0_hz * max(1 - reach, 0.1), f0_hz * (1 + reach), 101)
-    poles = identify_poles(
+    poles = identify_frf(
         frf(f, modal(f, [f0_hz], [damping_ratio], [2 * damping_ratio])), None, BARE
     )
     assert_exact(poles, f0_hz, damping_ratio)
@@ -60,8 +60,8 @@ def test_frequency_and_damping(f0_hz, damping_ratio):
 
 def test_three_lines():
     f = LINES_HZ[[15, 20, 25]]
-    assert_exact(identify_poles(frf(f, modal(f, [250], [0.02], [0.04])), None, BARE), 250, 0.02)
-    two = identify_poles(frf(f[:2], modal(f[:2], [250], [0.02], [0.04])), None, BARE)
+    assert_exact(identify_frf(frf(f, modal(f, [250], [0.02], [0.04])), None, BARE), 250, 0.02)
+    two = identify_frf(frf(f[:2], modal(f[:2], [250], [0.02], [0.04])), None, BARE)
     assert two.status is PolesStatus.TOO_FEW_LINES
     assert two.f0_hz.size == 0
     assert "2 lines" in two.message
@@ -69,12 +69,12 @@ def test_three_lines():
 
 @pytest.mark.parametrize("f0_hz", [200.0, 300.0, 305.0])
 def test_mode_at_the_edge(f0_hz):
-    poles = identify_poles(frf(LINES_HZ, modal(LINES_HZ, [f0_hz], [0.02], [0.04])), None, BARE)
+    poles = identify_frf(frf(LINES_HZ, modal(LINES_HZ, [f0_hz], [0.02], [0.04])), None, BARE)
     assert_exact(poles, f0_hz, 0.02)
 
 
 def test_mode_far_outside_is_none_of_the_band():
-    poles = identify_poles(frf(LINES_HZ, modal(LINES_HZ, [400], [0.02], [0.04])), None, BARE)
+    poles = identify_frf(frf(LINES_HZ, modal(LINES_HZ, [400], [0.02], [0.04])), None, BARE)
     assert poles.status is PolesStatus.NO_RESONANCE
     assert poles.f0_hz.size == 0
 
@@ -84,7 +84,7 @@ def test_two_modes_a_thousandth_apart(damping_ratio):
     f = np.linspace(249, 251.25, 181)
     pair = [250.0, 250.25]
     g = modal(f, pair, [damping_ratio] * 2, [1, 1.3])
-    assert_exact(identify_poles(frf(f, g), None, ModelStructure(4, 4)), pair, [damping_ratio] * 2)
+    assert_exact(identify_frf(frf(f, g), None, ModelStructure(4, 4)), pair, [damping_ratio] * 2)
 
 
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
@@ -92,7 +92,7 @@ def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)
     f = spacing(5, 2e4, 400 if spacing is np.geomspace else 6000)
     g = modal(f, f0_hz, np.full(10, 0.02), np.ones(10))
-    poles = identify_poles(frf(f, g), None, ModelStructure(20, 20))
+    poles = identify_frf(frf(f, g), None, ModelStructure(20, 20))
     assert_exact(poles, f0_hz, np.full(10, 0.02))
     assert poles.condition_number < 1e3
     assert poles.fit.response(f) == pytest.approx(g, rel=1e-9)
@@ -104,7 +104,7 @@ def test_twenty_poles_with_noise():
     rng = np.random.default_rng(0)
     noise = 1e-3 * (rng.standard_normal(400) + 1j * rng.standard_normal(400)) / np.sqrt(2)
     g = modal(f, f0_hz, np.full(10, 0.02), np.ones(10)) + noise
-    poles = identify_poles(
+    poles = identify_frf(
         frf(f, g, variance_noise=1e-6 * rng.gamma(7, 1 / 7, 400), noise_dof=7),
         None,
         ModelStructure(20, 20),
@@ -116,7 +116,7 @@ def test_twenty_poles_with_noise():
 @pytest.mark.parametrize("variance", [1e-30, 1e-300])
 def test_exact_data_with_tiny_variances(variance):
     g = modal(LINES_HZ, [250], [0.02], [0.04])
-    poles = identify_poles(
+    poles = identify_frf(
         frf(LINES_HZ, g, variance_noise=np.full(41, variance), noise_dof=7), None, BARE
     )
     assert_exact(poles, 250, 0.02)
@@ -124,7 +124,7 @@ def test_exact_data_with_tiny_variances(variance):
 
 def test_real_pole_beside_a_pair():
     g = 1 / (1 + 1j * LINES_HZ / 50) + modal(LINES_HZ, [250], [0.02], [1], 0)
-    poles = identify_poles(frf(LINES_HZ, g), None, ModelStructure(3, 2))
+    poles = identify_frf(frf(LINES_HZ, g), None, ModelStructure(3, 2))
     assert_exact(poles, 250, 0.02)
     real = poles.fit.poles_rad_s()
     assert real[np.abs(real.imag) < 1e-3].real == pytest.approx([-2 * np.pi * 50], rel=1e-6)
@@ -133,7 +133,7 @@ def test_real_pole_beside_a_pair():
 @pytest.mark.parametrize("delay_s", [0.0, 1e-3, 2e-2])
 def test_pure_delay(delay_s):
     g = modal(LINES_HZ, [250], [0.02], [0.04]) * np.exp(-2j * np.pi * LINES_HZ * delay_s)
-    poles = identify_poles(frf(LINES_HZ, g), None, ModelStructure(2, 2, delay=True))
+    poles = identify_frf(frf(LINES_HZ, g), None, ModelStructure(2, 2, delay=True))
     assert_exact(poles, 250, 0.02)
     assert poles.fit.delay_s == pytest.approx(delay_s, abs=1e-12)
     assert poles.fit.response(LINES_HZ) == pytest.approx(g, rel=1e-9)
@@ -146,7 +146,7 @@ def test_z_domain_of_a_zero_order_hold(sample_rate_hz):
     b, a, _ = scipy.signal.cont2discrete(([0.1, 0.1 * w0, 0.14 * w0**2], den), 1 / sample_rate_hz)
     _, g = scipy.signal.freqz(np.ravel(b), a, worN=LINES_HZ, fs=sample_rate_hz)
     structure = ModelStructure(2, 2, domain="z", sample_rate_hz=sample_rate_hz)
-    poles = identify_poles(frf(LINES_HZ, g), None, structure)
+    poles = identify_frf(frf(LINES_HZ, g), None, structure)
     assert_exact(poles, 250, 0.02)
     assert poles.fit.response(LINES_HZ) == pytest.approx(g, rel=1e-9)
 
@@ -154,7 +154,7 @@ def test_z_domain_of_a_zero_order_hold(sample_rate_hz):
 def test_nan_lines_are_left_out_and_said_so():
     g = modal(LINES_HZ, [250], [0.02], [0.04])
     g[[3, 20]] = np.nan, np.inf
-    poles = identify_poles(frf(LINES_HZ, g), None, BARE)
+    poles = identify_frf(frf(LINES_HZ, g), None, BARE)
     assert_exact(poles, 250, 0.02)
     assert poles.lines == 39
     assert "2 lines" in poles.message
@@ -166,7 +166,7 @@ def test_one_wild_outlier_never_looks_precise():
     for line in range(0, 41, 4):
         wild = g + 1e-4 * (rng.standard_normal(41) + 1j * rng.standard_normal(41))
         wild[line] += 5
-        poles = identify_poles(
+        poles = identify_frf(
             frf(LINES_HZ, wild, variance_noise=np.full(41, 2e-8), noise_dof=7), None, BARE
         )
         assert poles.status is not PolesStatus.OK
@@ -190,12 +190,12 @@ def test_zero_input_on_some_lines():
     assert result.status() is PolesStatus.OK
     assert abs(result.f0_hz[0] - 250) < 4 * np.sqrt(result.covariance[0, 0, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = identify_poles(frf(LINES_HZ, y / u), None, BARE)
+        ratio = identify_frf(frf(LINES_HZ, y / u), None, BARE)
     assert_exact(ratio, 250, 0.02)
 
 
 def test_no_response_at_all_has_no_poles():
-    poles = identify_poles(frf(LINES_HZ, np.zeros(41, complex)), None, BARE)
+    poles = identify_frf(frf(LINES_HZ, np.zeros(41, complex)), None, BARE)
     assert poles.status is PolesStatus.ILL_CONDITIONED
     assert poles.f0_hz.size == 0
 
@@ -215,7 +215,7 @@ def test_order_is_chosen_by_description_length(modes):
     noise = 1e-3 * (rng.standard_normal(41) + 1j * rng.standard_normal(41)) / np.sqrt(2)
     g = modal(LINES_HZ, [240, 262][:modes], [0.02] * modes, [0.04, 0.03][:modes]) + noise
     given = frf(LINES_HZ, g, variance_noise=1e-6 * rng.gamma(7, 1 / 7, 41), noise_dof=7)
-    choice = choose_among(lambda structure: identify_poles(given, None, structure))
+    choice = choose_among(lambda structure: identify_frf(given, None, structure))
     assert choice.structure.order == 2 * modes
     assert choice.best.status is PolesStatus.OK
 
@@ -230,6 +230,6 @@ def test_pole_against_high_precision_reference():
         for line in f:
             s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(float(line)))
             g.append(complex(1 / (s**2 / w0**2 + 2 * zeta * s / w0 + 1) + mpmath.mpf("0.1")))
-    poles = identify_poles(frf(f, np.array(g)), None, BARE)
+    poles = identify_frf(frf(f, np.array(g)), None, BARE)
     # rounding of G and of the lines to double precision moves the damping by eps / damping
     assert_exact(poles, 250, 1e-5, rel=1e-9)

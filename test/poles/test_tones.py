@@ -18,7 +18,7 @@ from benchmarks.poles_plant import (
 )
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.multisine import mains_lines
-from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.result import PolesStatus
 
@@ -152,7 +152,9 @@ def test_hum_at_minus_60_db_leaves_the_ellipse_honest(periods):
         return u, y + sum(hum)
 
     found = [p for p in runs([plant], 60, disturb) if p.status is PolesStatus.OK]
-    assert len(found) >= 57  # of 40 lines three are hum: some hide each other, and stay a model error
+    assert (
+        len(found) >= 57
+    )  # of 40 lines three are hum: some hide each other, and stay a model error
     inside = np.count_nonzero(distances(found) < -2 * np.log(0.05))
     assert inside >= 49  # 57 expected, fewer than 49 once in a thousand at the most
 
@@ -233,7 +235,7 @@ def test_a_tone_on_a_line_of_an_frf_is_named_and_moves_nothing(line, hum):
     """20 deviations of a line: before, model error without a name."""
     g = mode.NOISY.copy()
     g[line] += 0.02j
-    poles = identify_poles(mode.frf(g=g), BAND_HZ)
+    poles = identify_frf(mode.frf(g=g), BAND_HZ)
     assert poles.status is PolesStatus.OK
     assert poles.message == f"tone at {mode.LINES_HZ[line]:.1f} Hz left out{hum}"
     error = [poles.f0_hz[0] - F0_HZ, poles.damping_ratio[0] - 0.02]
@@ -250,4 +252,4 @@ def test_noise_of_an_frf_is_no_tone(spread):
             g=mode.G + mode.circular(rng, (41,), variance),
             variance_noise=variance * rng.gamma(7, 1 / 7, 41),
         )
-        assert "tone" not in identify_poles(frf, BAND_HZ).message
+        assert "tone" not in identify_frf(frf, BAND_HZ).message

@@ -20,9 +20,8 @@ from poles.mode_at_250_hz import (
 )
 from scipy import stats
 
-from tactile_resonance.poles.identify import identify_batch, identify_poles
-from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.realisations import PoleEstimator
+from tactile_resonance.poles.identify import identify_batch, identify_frf
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
@@ -43,7 +42,7 @@ def from_records(order, realisations=None):
         kind, shape = PoleEstimator, (RUNS, realisations)
     plan = kind(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), ModelStructure(order, order))
     rng = np.random.default_rng(2)
-    u, y = (plan.transform(x) for x in record(noise=0.0))
+    u, y = plan.transform(*record(noise=0.0))
     variance = 1e-6 / (SAMPLES * PERIODS)
     u, y = (x + circular(rng, (*shape, x.size), v) for x, v in ((u, variance / 100), (y, variance)))
     return plan.from_bins(u, y)
@@ -95,7 +94,7 @@ def test_a_model_error_shows_once_an_unstable_mode_is_left_out():
 def test_a_mode_that_is_unstable_stays_so_beside_one_left_out():
     """The wrong sign of phase: what is left out was not what made it unstable."""
     noise = circular(np.random.default_rng(3), (LINES_HZ.size,), 1e-6)
-    poles = identify_poles(frf(g=G.conj() + noise), None, ModelStructure(4, 4))
+    poles = identify_frf(frf(g=G.conj() + noise), None, ModelStructure(4, 4))
     assert "noise makes" in poles.message
     assert poles.f0_hz == pytest.approx([250], abs=0.05)
     assert poles.status is PolesStatus.UNSTABLE_POLE

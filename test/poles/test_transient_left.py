@@ -6,7 +6,7 @@ import pytest
 
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.identify import identify_poles
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -34,7 +34,7 @@ def record(seed, periods, damping_ratio, snr_db, *, settled):
 def poles_of(*arguments, settled):
     u, y = record(*arguments, settled=settled)
     frf = frf_of_record(Spectrum.of(u[None], y[None]), sample_rate_hz=RATE_HZ, harmonics=LINES)
-    return identify_poles(frf, (200.0, 300.0), ModelStructure(2, 2))
+    return identify_frf(frf, (200.0, 300.0), ModelStructure(2, 2))
 
 
 @pytest.mark.parametrize(

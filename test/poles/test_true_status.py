@@ -22,7 +22,7 @@ from scipy import stats
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import (
     identify_batch,
-    identify_poles,
+    identify_frf,
     identify_spectra,
 )
 from tactile_resonance.poles.order_choice import choose_among
@@ -46,7 +46,7 @@ def test_beyond_double_precision_is_right_or_told(scale, variance):
     if variance is not None:
         with np.errstate(over="ignore", under="ignore"):
             fields["variance_noise"] = np.full(41, variance * scale * scale)
-    poles = identify_poles(frf(g=scale * NOISY, **fields), None, BARE)
+    poles = identify_frf(frf(g=scale * NOISY, **fields), None, BARE)
     right = poles.f0_hz.size == 1 and abs(poles.f0_hz[0] - 250) < 0.02
     assert right or (poles.status is not PolesStatus.OK and poles.covariance is None)
     u, y = record()
@@ -59,13 +59,13 @@ def test_beyond_double_precision_is_right_or_told(scale, variance):
     "variance", [np.full(41, np.inf), np.full(41, np.nan), np.full(41, 5e-324), np.zeros(41)]
 )
 def test_variances_that_say_nothing(variance):
-    poles = identify_poles(frf(variance_noise=variance), None, BARE)
+    poles = identify_frf(frf(variance_noise=variance), None, BARE)
     assert poles.status is not PolesStatus.OK
     assert poles.covariance is None
 
 
 def test_more_parameters_than_smooth_residuals_have_room_for():
-    poles = identify_poles(frf(), None, ModelStructure(2, 60))
+    poles = identify_frf(frf(), None, ModelStructure(2, 60))
     assert poles.whiteness < 10 or poles.status is not PolesStatus.OK
 
 
@@ -94,7 +94,7 @@ def test_a_point_without_variance_leaves_its_batch_alone():
 def test_a_line_without_variance_is_left_out_alone():
     for bad in (0.0, -1e-6, np.nan):
         variance = np.where(np.arange(41) == 5, bad, 1e-6)
-        poles = identify_poles(frf(variance_noise=variance), None, BARE)
+        poles = identify_frf(frf(variance_noise=variance), None, BARE)
         assert poles.status is PolesStatus.OK
         assert poles.lines == 40
         assert "1 lines without" in poles.message
@@ -117,14 +117,14 @@ def second_mode(size):
 
 def test_a_smooth_error_is_told_without_a_variance():
     noise = circular(np.random.default_rng(3), (41,), 1e-10)
-    clean = identify_poles(FRF(LINES_HZ, G + noise), None, BARE)
+    clean = identify_frf(FRF(LINES_HZ, G + noise), None, BARE)
     assert clean.status is PolesStatus.NO_COVARIANCE
-    poles = identify_poles(FRF(LINES_HZ, G + second_mode(0.1) + noise), None, BARE)
+    poles = identify_frf(FRF(LINES_HZ, G + second_mode(0.1) + noise), None, BARE)
     assert poles.status is PolesStatus.MODEL_ERROR
     std = np.sqrt(np.diagonal(poles.total_covariance[0]))
     assert abs(poles.f0_hz[0] - 250) < 3 * std[0]
     assert abs(poles.damping_ratio[0] - 0.02) < 3 * std[1]
-    assert identify_poles(FRF(LINES_HZ, G), None, BARE).status is PolesStatus.NO_COVARIANCE
+    assert identify_frf(FRF(LINES_HZ, G), None, BARE).status is PolesStatus.NO_COVARIANCE
 
 
 def coverage(result):
@@ -179,7 +179,7 @@ def test_spectra_without_any_covariance_are_fitted_and_said_so():
 
 def test_orders_of_exact_data_are_compared():
     """Modes too many leave nothing to determine them by: each candidate still has an answer."""
-    choice = choose_among(lambda structure: identify_poles(frf(g=G), None, structure))
+    choice = choose_among(lambda structure: identify_frf(frf(g=G), None, structure))
     best = choice.poles[choice.chosen]
     assert best.f0_hz[0] == pytest.approx(250, rel=1e-9)
     assert len(choice.poles) == len(choice.mdl) == 9
@@ -213,7 +213,7 @@ def test_a_mode_that_noise_made_is_left_out_and_said_so():
     told = 0
     for _ in range(20):
         noisy = frf(g=G + circular(rng, (41,), 1e-6))
-        poles = identify_poles(noisy, None, ModelStructure(4, 4))
+        poles = identify_frf(noisy, None, ModelStructure(4, 4))
         assert poles.f0_hz.size < 2 or "noise makes" not in poles.message
         if poles.f0_hz.size == 1 and "noise makes" in poles.message:
             told += 1
@@ -224,17 +224,17 @@ def test_a_mode_that_noise_made_is_left_out_and_said_so():
 def test_noise_alone_has_no_resonance():
     rng = np.random.default_rng(8)
     for _ in range(50):
-        poles = identify_poles(frf(g=0.1 + circular(rng, (41,), 1e-6)), None, BARE)
+        poles = identify_frf(frf(g=0.1 + circular(rng, (41,), 1e-6)), None, BARE)
         assert poles.f0_hz.size == 0
         assert poles.status is not PolesStatus.OK
 
 
 def test_a_response_of_the_wrong_sign_of_phase_is_unstable():
-    assert identify_poles(frf(g=NOISY.conj()), None, BARE).status is PolesStatus.UNSTABLE_POLE
+    assert identify_frf(frf(g=NOISY.conj()), None, BARE).status is PolesStatus.UNSTABLE_POLE
 
 
 def test_a_constant_response_determines_no_pole():
-    poles = identify_poles(frf(g=np.full(41, 0.3 + 0j)), None, BARE)
+    poles = identify_frf(frf(g=np.full(41, 0.3 + 0j)), None, BARE)
     assert poles.status is PolesStatus.ILL_CONDITIONED
     assert poles.f0_hz.size == 0
 

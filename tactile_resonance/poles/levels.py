@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Levels of noise and distortion of several realisations, and what contradicts the model."""
+"""Levels of noise and distortion that a fit to records shows, and whether its cost contradicts the model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance.poles.fit import RecordsInverse, Solution
-from tactile_resonance.poles.joint_fit import student_variance
-from tactile_resonance.poles.joint_layout import JointLayout
+from tactile_resonance.poles.joint_noise import BINS_PER_BAND
 from tactile_resonance.poles.likelihood import invert
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
-from tactile_resonance.poles.noise_level import f_quantile
+from tactile_resonance.poles.noise_level import student_variance
 from tactile_resonance.poles.scatter import Pieces, Scatter
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -22,6 +26,80 @@ ComplexArray = npt.NDArray[np.complex128]
 
 # Noise alone looks like distortion this often; it is then weighted as such, at next to no loss.
 DISTORTION_PROBABILITY = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Noise level of points of one record, in units of the variances weighted with.
+
+    Attributes
+    ----------
+    scale : (batch,) float
+        Level that covariances are of.
+    cost, expected, suspect, noise
+        See `judgement.Judged`.
+    correction : (batch,) float
+        Factor of the covariance for a level that is not known exactly.
+    """
+
+    scale: FloatArray
+    cost: FloatArray
+    expected: FloatArray
+    suspect: BoolArray
+    noise: FloatArray
+    correction: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        plan: JointPlan,
+        solution: Solution,
+        inverse: FloatArray,
+        noise: FloatArray,
+        by_piece: BoolArray,
+    ) -> Level:
+        """Level of a fit.
+
+        Without bins between harmonics it is from the residuals, and a model error hides in it unless they
+        are smooth. With such bins these tell the level, and the excited ones whether the model holds.
+
+        Parameters
+        ----------
+        plan : JointPlan
+        solution : Solution
+        inverse : (batch, n, n) float
+            Of the normal matrices.
+        noise : (batch, 2) float
+            Mean variances of Y and U weighted with.
+        by_piece : (batch,) bool
+            Where the variances are from each of the pieces of the band alone.
+        """
+        n, lines, others = inverse.shape[-1], plan.excited_at.size, plan.others_at.size
+        if others == 0:
+            dof = np.full(len(inverse), max(lines - n / 2, 0.5))
+            scale, nothing = solution.cost / dof, np.full(len(inverse), np.nan)
+            no = np.zeros(len(inverse), bool)
+            return cls(scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof))
+        # leverage of the others
+        used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0, 0])
+        dof_o = others - used / 2
+        dof_e = lines - (n - used) / 2
+        dof = dof_e + dof_o
+        level = solution.part_cost[:, 0] / dof_o
+        cost = solution.part_cost[:, 1] / level
+        expected = dof_e * dof_o / (dof_o - 1)
+        suspect = special.fdtrc(2 * dof_e, 2 * dof_o, cost / dof_e) < MODEL_ERROR_PROBABILITY
+        correction = student_variance(dof)
+        if by_piece.any():
+            # weights from few bins: moments of F(2, 2 nu), as in `noise_level.VarianceModel`
+            mean = BINS_PER_BAND / (BINS_PER_BAND - 1)
+            std = mean * np.sqrt(BINS_PER_BAND / (BINS_PER_BAND - 2))
+            limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
+            expected = np.where(by_piece, expected * mean, expected)
+            suspect = np.where(by_piece, cost > limit, suspect)
+            correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
+        scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
+        return cls(scale, cost, expected, suspect, noise * level[:, None], correction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +119,10 @@ class Levels:
     excited : (batch,) float
         From what realisations differ by on excited lines: noise and distortion.
     excited_dof, common_dof : (batch,) float
-    cost, expected, limit : (batch,) float
-        Of what realisations have in common, over `excited`: as found, expected, and exceeded by
-        chance once in a thousand times.
+    cost, expected : (batch,) float
+        Of what realisations have in common, over `excited`: as found, and expected.
+    contradicts : (batch,) bool
+        Whether chance exceeds this cost less than once in a thousand times.
     line_variance : (batch, K_e) float
         Sample variances of lines, M - 1 degrees of freedom each.
     piece_dof : (batch,) float
@@ -67,14 +146,14 @@ class Levels:
     common_dof: FloatArray
     cost: FloatArray
     expected: FloatArray
-    limit: FloatArray
+    contradicts: BoolArray
     line_variance: FloatArray
     piece_dof: FloatArray
 
     @classmethod
     def of(
         cls,
-        layout: JointLayout,
+        plan: JointPlan,
         solution: Solution,
         u: ComplexArray,
         variance: FloatArray,
@@ -85,7 +164,7 @@ class Levels:
 
         Parameters
         ----------
-        layout : JointLayout
+        plan : JointPlan
         solution : Solution
         u : (batch, M, K_e) complex
             Input on excited lines.
@@ -95,34 +174,33 @@ class Levels:
         by_piece : (batch,) bool
             Where that variance is from each of the pieces alone.
         """
-        a, b, _ = layout.problem.sizes
+        a, b, _ = plan.problem.sizes
         shared = a + b
         batch, records, lines = solution.residual.shape
         scatter = Scatter.of(solution.residual, u)
         inverse = RecordsInverse.of(solution.normal.sum(axis=2), shared)
         used = inverse.leverage(solution.normal[:, :, 1])
         # what the transients take from a line: of each a part 1/M of what all have in common
-        taken = _taken_by_transients(layout, solution, variance)
+        taken = _taken_by_transients(plan, solution, variance)
         line_dof = (records - 1) * np.maximum(1 - taken / (2 * records), 0.05)
         excited_dof = np.maximum(line_dof.sum(axis=-1), 0.5)
         common_dof = np.maximum(records * lines - used / 2 - excited_dof, 0.5)
         excited = scatter.differing_cost / excited_dof
         between = between_dof = np.full(batch, np.nan)
-        if layout.other_bins.size > 0:
+        if plan.others_at.size > 0:
             used_between = inverse.leverage(solution.normal[:, :, 0])
-            between_dof = records * layout.other_bins.size - used_between / 2
+            between_dof = records * plan.others_at.size - used_between / 2
             between = solution.part_cost[:, 0] / between_dof
         cost = scatter.common_cost / excited
         nu = np.where(by_piece, float(pieces.dof), excited_dof)
         expected = common_dof * np.where(nu > 1, nu / (nu - 1), np.nan)
-        limit = common_dof * f_quantile(
-            1 - MODEL_ERROR_PROBABILITY, 2 * common_dof, 2 * excited_dof
-        )
+        ratio = cost / common_dof
+        chance = special.fdtrc(2 * common_dof, 2 * excited_dof, ratio)
         if by_piece.any():
             # sums over pieces of F(2 lines, 2 nu): as a chi-square of the same mean and variance
             spread = (pieces.lines + nu - 1) / (lines * (nu - 2))
-            scaled = f_quantile(1 - MODEL_ERROR_PROBABILITY, 2 / spread, np.full(batch, 1e12))
-            limit = np.where(by_piece, expected * scaled, limit)
+            of_pieces = special.chdtrc(2 / spread, 2 / spread * cost / expected)
+            chance = np.where(by_piece, of_pieces, chance)
         return cls(
             scatter,
             inverse,
@@ -134,15 +212,15 @@ class Levels:
             common_dof,
             cost,
             expected,
-            limit,
+            chance < MODEL_ERROR_PROBABILITY,
             scatter.line_cost / line_dof,
             np.where(by_piece, float(pieces.dof), 0.0),
         )
 
     def distorted(self, chance: float = DISTORTION_PROBABILITY) -> BoolArray:
         """(batch,) whether realisations differ by more than the noise between harmonics explains."""
-        limit = f_quantile(1 - chance, 2 * self.excited_dof, 2 * self.between_dof)
-        return np.asarray(self.excited > limit * self.between)
+        ratio = self.excited / self.between
+        return np.asarray(special.fdtrc(2 * self.excited_dof, 2 * self.between_dof, ratio) < chance)
 
     def _residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) level of the excited lines and its degrees of freedom.
@@ -207,18 +285,16 @@ class Levels:
             )
 
 
-def _taken_by_transients(
-    layout: JointLayout, solution: Solution, variance: FloatArray
-) -> FloatArray:
+def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArray) -> FloatArray:
     """(batch, K_e) real coefficients of all transients that go to each excited line.
 
     Leverages with A and B as they are. A transient is large where the response is, and takes most
     there.
     """
-    a, b, own = layout.problem.sizes
-    problem = layout.problem
+    a, b, own = plan.problem.sizes
+    problem = plan.problem
     driven = slice(problem.undriven, None)
-    alpha, _, _ = layout.problem.split(solution.theta[:, 0])
+    alpha, _, _ = plan.problem.split(solution.theta[:, 0])
     size = alpha @ problem.denominator[driven].T
     basis = problem.transient[driven]
     blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
