@@ -14,7 +14,7 @@ from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
-from tactile_resonance.scan.surface import Surface, TouchRequest
+from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 
 FloatArray = npt.NDArray[np.float64]
 STEEPEST_RAD = np.pi / 3
@@ -126,6 +126,19 @@ def make_plan(
     return plan_points(scene, points, skipped, measurement, timing)
 
 
+def compile_scene(scene: ScanScene) -> Plan:
+    """Plan of a scene before anything moves; a surface to be found by touch is taken to be level.
+
+    Raises
+    ------
+    ValueError
+        As `make_plan`.
+    """
+    if isinstance(scene.surface, TouchRequest):
+        return make_plan(scene, Plane((0.0, 0.0, scene.surface.expected_height_m)))
+    return make_plan(scene)
+
+
 def clear_plan(scene: ScanScene, plan: Plan, surface: Surface, use: TipUse | None) -> Plan:
     """The plan without points at which the sensor would not stay clear of the surface; None: not looked at.
 
@@ -184,11 +197,15 @@ def plan_points(
 
 
 def duration_s(
-    points: tuple[ScanPoint, ...], blocks: int, measurement: MeasurementDesign, timing: Timing
+    points: tuple[ScanPoint, ...],
+    blocks: int,
+    measurement: MeasurementDesign,
+    timing: Timing | None = None,
 ) -> float:
     """Time that the remaining points take with so many blocks each [s]."""
     if not points:
         return 0.0
+    timing = Timing() if timing is None else timing
     position = np.array([point.position_m for point in points])
     travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     contact_s = timing.approach_s + timing.settle_s + timing.retract_s
