@@ -80,7 +80,7 @@ def _expected(path: Path, scene: ScanScene, plan: Plan) -> list[str]:
         )
         lines.append(f"on {tissue.name} (simulated) after {count} blocks: {found}")
     if blocks:
-        mean = round(sum(blocks) / len(blocks) / plan.measurement.realisations)
+        mean = round(sum(blocks) / len(blocks))
         lines.append(f"time {duration_s(plan.points, mean, plan.measurement):.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
 
@@ -90,25 +90,25 @@ def _rehearsed(scene: ScanScene, plan: Plan, tissue: Tissue) -> tuple[Poles, int
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
     from tactile_resonance.scan.decision import Precise, decide_bands
-    from tactile_resonance.scan.measurement import excitations
+    from tactile_resonance.scan.measurement import excitation_of
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
 
     design, frf, blocks = plan.measurement, MeasurementFrf(0), 0
     wanted = scene.precision if isinstance(scene.precision, Precise) else None
+    excitation = excitation_of(design, seed=1)
     at_rest = SimulatedBench.from_configuration().start(tissue, force_n=scene.force_n, seed=1)
-    for excitation in excitations(design, seed=1):
-        for record in at_rest.play(excitation, excitation.periods):
-            blocks += 1
-            poles = poles_of_bands(frf.add(record, excitation), design.bands)
-            if decide_bands(poles, blocks, wanted, scene.blocks, design.block_s).stop:
-                return poles, blocks
+    for record in at_rest.play(excitation, excitation.periods):
+        blocks += 1
+        poles = poles_of_bands(frf.add(record, excitation), design.bands)
+        if decide_bands(poles, blocks, wanted, scene.blocks, design.block_s).stop:
+            break
     return poles, blocks
 
 
 def _draw(scene: ScanScene, plan: Plan) -> Figure:
     """Points in their order, seen from above, and the lines that are excited."""
     from tactile_resonance.report.drawing import new_figure
-    from tactile_resonance.scan.measurement import excitations
+    from tactile_resonance.scan.measurement import excitation_of
 
     figure = new_figure(13, 5)
     figure.suptitle(f"plan of {scene.name}")
@@ -120,7 +120,7 @@ def _draw(scene: ScanScene, plan: Plan) -> Figure:
     above.plot(x_mm[0], y_mm[0], "s", ms=9, mfc="none", color="C3", label="first")
     above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{len(plan.points)} points")
     above.legend()
-    first = excitations(plan.measurement, seed=1)[0]
+    first = excitation_of(plan.measurement, seed=1)
     lines.vlines(first.frequency_hz, 0, 1e3 * first.amplitude_v, lw=0.8)
     for k, band in enumerate(plan.measurement.bands):
         lines.axvspan(band.low_hz, band.high_hz, color=f"C{k + 1}", alpha=0.2)

@@ -46,9 +46,10 @@ def run(options: argparse.Namespace) -> int:
     truths = truths_of(content)
     pole_maps, pictures = pole_maps_of(content), []
     name = options.run_folder.resolve().name
-    for file, pole_map in zip(map_names(len(pole_maps)), pole_maps, strict=True):
-        pictures.append(figure_bytes(draw_pole_map(pole_map, f"Pole map, {name}"), ".png"))
-        write_whole(options.run_folder / file, pictures[-1])
+    for band, pole_map in enumerate(pole_maps):
+        title = f"Pole map, {name}" + (f", band {band + 1}" if len(pole_maps) > 1 else "")
+        pictures.append(figure_bytes(draw_pole_map(pole_map, title), ".png"))
+        write_whole(options.run_folder / map_names(band + 1)[-1], pictures[-1])
     write_whole(options.run_folder / "report.html", as_page(content, pictures, truths).encode())
     if content.latest:
         print(point_table(content.latest, truths))

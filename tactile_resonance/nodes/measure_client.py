@@ -94,7 +94,7 @@ class MeasureClient:
             sample_rate_hz=design.sample_rate_hz,
             samples_per_period=design.samples,
             periods=design.periods,
-            realisations=design.realisations,
+            realisations=1,
             seed=seed,
         )
         write_bands(goal, msg.Band, design.bands)

@@ -13,7 +13,6 @@ from tactile_resonance.scan.scene import Output, ScanScene
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
 MARGIN_LINES = 8
-DISTORTION_REALISATIONS = 2
 F_MIN_HZ, F_MAX_HZ = 10.0, 10_000.0
 """The sensor's whole range, to which the level of a scene refers."""
 MOST_OF_RATE = 0.4
@@ -56,8 +55,6 @@ class MeasurementDesign:
         Of each channel in a block, one period.
     periods : int
         Most blocks.
-    realisations : int
-        Each of as many periods.
     lines : int
         Excited where the grid leaves none out.
     skipped : tuple of Skipped
@@ -72,7 +69,6 @@ class MeasurementDesign:
     sample_rate_hz: float
     samples: int
     periods: int
-    realisations: int
     lines: int
     skipped: tuple[Skipped, ...]
     silent: bool = False
@@ -123,10 +119,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
         skipped.append(Skipped(text, f"only poles from {named} are wanted"))
     if not distortion:
-        # a second realisation of random phases distinguishes distortion from noise
-        saved = (DISTORTION_REALISATIONS - 1) * scene.blocks.most * block_s
-        why = "distortion is not wanted"
-        skipped.append(Skipped("a second realisation at every point", why, saved))
+        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
     if Output.SILENT not in outputs:
         skipped.append(
             Skipped("a silent record", "silent is not wanted", scene.blocks.least * block_s)
@@ -141,29 +134,23 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         sample_rate_hz=use.sample_rate_hz,
         samples=use.samples_per_period,
         periods=scene.blocks.most,
-        realisations=DISTORTION_REALISATIONS if distortion else 1,
         lines=lines,
         skipped=tuple(skipped),
     )
 
 
-def excitations(design: MeasurementDesign, seed: int) -> list[Excitation]:
+def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:
     """What excitation_node plays for a design, where its parameters leave no line out."""
-    return [
-        design_multisine(
-            sample_rate_hz=design.sample_rate_hz,
-            samples_per_period=design.samples,
-            band_hz=design.stretches_hz,
-            level_v=design.level_v,
-            grid=design.grid,
-            seed=seed,
-            realisation=realisation,
-            realisations=design.realisations,
-            periods=design.periods,
-            bands=design.bands,
-        )
-        for realisation in range(design.realisations)
-    ]
+    return design_multisine(
+        sample_rate_hz=design.sample_rate_hz,
+        samples_per_period=design.samples,
+        band_hz=design.stretches_hz,
+        level_v=design.level_v,
+        grid=design.grid,
+        seed=seed,
+        periods=design.periods,
+        bands=design.bands,
+    )
 
 
 def _stretches(

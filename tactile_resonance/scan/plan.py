@@ -114,7 +114,7 @@ def make_plan(
         for index in range(len(where))
     )
     each_s = timing.approach_s + timing.settle_s + timing.retract_s
-    each_s += scene.blocks.most * measurement.realisations * measurement.block_s
+    each_s += scene.blocks.most * measurement.block_s
     skipped = [
         Skipped(f"{int(left.sum())} points", why, float(left.sum() * each_s))
         for left, why in (
@@ -209,7 +209,7 @@ def duration_s(
     position = np.array([point.position_m for point in points])
     travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     contact_s = timing.approach_s + timing.settle_s + timing.retract_s
-    measuring_s = blocks * measurement.realisations * measurement.block_s
+    measuring_s = blocks * measurement.block_s
     return travel_m / timing.travel_m_s + len(points) * (contact_s + measuring_s)
 
 

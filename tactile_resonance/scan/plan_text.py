@@ -37,9 +37,6 @@ def plan_rows(scene: ScanScene, plan: Plan) -> Rows:
     design, count = plan.measurement, len(plan.points)
     before, in_all = touches(scene, count)
     stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
-    realisations = (
-        "" if design.realisations == 1 else f", {design.realisations} realisations of each"
-    )
     rows = [
         (
             "touches",
@@ -48,13 +45,13 @@ def plan_rows(scene: ScanScene, plan: Plan) -> Rows:
         (
             "excited",
             f"{design.grid.value} grid of {design.lines} lines, {stretches} Hz, at "
-            f"{1e3 * design.level_v:.3g} mV rms",
+            f"{design.level_v:.3g} V rms",
         ),
         (
             "sampled",
             f"{design.sample_rate_hz:g} Hz, blocks of {design.samples} samples, {design.block_s:g} s",
         ),
-        ("measured", f"{scene.blocks.least} to {scene.blocks.most} blocks a point{realisations}"),
+        ("measured", f"{scene.blocks.least} to {scene.blocks.most} blocks a point"),
         ("until", _wanted(scene)),
     ]
     for band in design.bands:

@@ -209,7 +209,6 @@ def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> d
             "samples_per_period": design.samples,
             "level_v": design.level_v,
             "most_periods": design.periods,
-            "realisations": design.realisations,
         },
         "skipped": [asdict(skipped) for skipped in plan.skipped],
         **(more or {}),

@@ -260,7 +260,7 @@ class ScanRunner:
         point = air_point(len(self._plan.points) + (name == AFTER))
         design = replace(self._plan.measurement, periods=self._scene.blocks.least)
         if silent:
-            design = replace(design, realisations=1, silent=True)
+            design = replace(design, silent=True)
             point = replace(point, label=SILENT)
         told = 0
 

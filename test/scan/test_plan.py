@@ -157,12 +157,13 @@ def test_what_nobody_reads_is_not_excited():
     # the same amplitude per line
     assert poles.level_v**2 / poles.lines == pytest.approx(whole.level_v**2 / whole.lines)
     assert whole.level_v == 1.0
-    assert (poles.grid, poles.realisations) == (Grid.FULL, 1)
-    assert (distortion.grid, distortion.realisations) == (Grid.ODD_RANDOM, 2)
+    assert poles.grid is Grid.FULL
+    assert (distortion.grid, distortion.lines) == (Grid.ODD_RANDOM, 3997)
     assert any(f"{3997 - poles.lines} of 3997 lines" in s.what for s in poles.skipped)
     assert not any("lines" in s.what for s in whole.skipped)
     saved = {s.why: s.saved_s for s in poles.skipped}
-    assert saved["distortion is not wanted"] == pytest.approx(8 * 0.4)
+    assert saved["silent is not wanted"] == pytest.approx(3 * 0.4)
+    assert "distortion is not wanted" in saved
     asked = scene([[0, 0]])
     asked = replace(asked, sensor=replace(asked.sensor, band_high_hz=2e4))
     with pytest.raises(ValueError, match="200 to 20000 Hz; accepted is within 10 to 10000"):

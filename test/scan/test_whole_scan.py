@@ -128,7 +128,7 @@ def test_report_needs_nothing_else(run_folder, capsys):
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert page.rows == 52  # each point in both tables
+    assert page.rows == 57  # each point in both tables, and the plan with its outcome
     assert [link[:22] for link in page.links] == ["data:image/png;base64,"]
     assert "simulated, not measured" in text
     assert "gelatine with an inclusion" in text
