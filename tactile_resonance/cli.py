@@ -65,6 +65,7 @@ def _parser() -> OneLineParser:
         check_robot,
         demo,
         figures,
+        plan,
         reidentify,
         report,
         scan,
@@ -79,7 +80,7 @@ def _parser() -> OneLineParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
         *(demo, analyze, reidentify, report, figures, benchmark),
-        *(scan, calibrate_table, simulate_ur, simulate_cell, check_robot),
+        *(plan, scan, calibrate_table, simulate_ur, simulate_cell, check_robot),
     ):
         command.add_parser(commands)
     return parser

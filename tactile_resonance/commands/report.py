@@ -34,22 +34,23 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import (
         as_page,
-        pole_map_of,
+        pole_maps_of,
         silent_lines,
         skipped_lines,
         summary,
     )
     from tactile_resonance.scan.bench_truth import truths_of
+    from tactile_resonance.scan.plan_text import map_names
 
     content = read_run(options.run_folder)
     truths = truths_of(content)
-    pole_map = pole_map_of(content)
-    picture = None
-    if pole_map.points:
-        title = f"Pole map, {options.run_folder.resolve().name}"
-        picture = figure_bytes(draw_pole_map(pole_map, title), ".png")
-        write_whole(options.run_folder / "pole_map.png", picture)
-    write_whole(options.run_folder / "report.html", as_page(content, picture, truths).encode())
+    pole_maps, pictures = pole_maps_of(content), []
+    name = options.run_folder.resolve().name
+    for band, pole_map in enumerate(pole_maps):
+        title = f"Pole map, {name}" + (f", band {band + 1}" if len(pole_maps) > 1 else "")
+        pictures.append(figure_bytes(draw_pole_map(pole_map, title), ".png"))
+        write_whole(options.run_folder / map_names(band + 1)[-1], pictures[-1])
+    write_whole(options.run_folder / "report.html", as_page(content, pictures, truths).encode())
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
@@ -58,6 +59,9 @@ def run(options: argparse.Namespace) -> int:
         print(line)
     for problem in content.problems:
         print(f"damaged: {problem}")
-    write_map_recording(content)  # last: the page and the table do not wait for it
-    print(f"page, picture and map.mcap in {options.run_folder}")
+    drawn = ["report.html", *map_names(len(pole_maps))]
+    if pole_maps:
+        write_map_recording(content)  # last: the page and the table do not wait for it
+        drawn.append("map.mcap")
+    print(f"{', '.join(drawn)} in {options.run_folder}")
     return 0

@@ -17,11 +17,13 @@ from rclpy.serialization import deserialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
+from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.nodes.excitation_design import GRIDS
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
+from tactile_resonance.recording.messages import distortion_from_message, write_bands
 from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
@@ -58,6 +60,11 @@ class MeasureClient:
         """Why the force of a block of the newest measurement is unknown."""
         return self._recorder.force_reason or "no record states why"
 
+    @property
+    def distortion(self) -> tuple[BandDistortion, ...]:
+        """Of the newest measurement so far, in each band."""
+        return self._recorder.distortion
+
     def measure(
         self,
         design: MeasurementDesign,
@@ -82,12 +89,15 @@ class MeasureClient:
             grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
             level_v=0.0 if design.silent else design.level_v,
             silent=design.silent,
-            f_min_hz=design.f_min_hz,
-            f_max_hz=design.f_max_hz,
+            excited_low_hz=[low_hz for low_hz, _ in design.stretches_hz],
+            excited_high_hz=[high_hz for _, high_hz in design.stretches_hz],
+            sample_rate_hz=design.sample_rate_hz,
+            samples_per_period=design.samples,
             periods=design.periods,
-            realisations=design.realisations,
+            realisations=1,
             seed=seed,
         )
+        write_bands(goal, msg.Band, design.bands)
         self._recorder.record_into(recording, goal.measurement_id)
         try:
             return self._follow(goal, enough, check, poll, held)
@@ -194,11 +204,14 @@ class ScanRecorder:
         In the order of their arrival, for the scan's own thread.
     force_reason : str
         Why the force of a block is unknown, of the newest one of which it is; empty: of none.
+    distortion : tuple of BandDistortion
+        Of all blocks so far.
     """
 
     def __init__(self, node: ManagedNode) -> None:
         self.poles: queue.SimpleQueue[msg.Poles] = queue.SimpleQueue()
         self.force_reason = ""
+        self.distortion: tuple[BandDistortion, ...] = ()
         self._lock = threading.Lock()
         self._recording: PointRecording | None = None
         self._measurement_id = 0
@@ -214,7 +227,7 @@ class ScanRecorder:
             self._recording, self._measurement_id = recording, measurement_id
             for kept in (self._counts, self._played, self._described):
                 kept.clear()
-            self.force_reason = ""
+            self.force_reason, self.distortion = "", ()
             while not self.poles.empty():
                 self.poles.get()
 
@@ -258,6 +271,8 @@ class ScanRecorder:
                 self._counts[topic] += 1
                 if topic == "poles":
                     self.poles.put(message)
+                elif topic == "frf":
+                    self.distortion = distortion_from_message(message)
                 elif topic == "excitation":
                     self._described.add(message.excitation_id)
                 elif topic == "record":

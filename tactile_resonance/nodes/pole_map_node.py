@@ -94,6 +94,15 @@ PARAMETERS = (
         0.0,
         1e6,
     ),
+    Parameter(
+        "band",
+        1,
+        "Of measurements in several bands the one that is mapped, in the order of the scene; tissue is "
+        "called from the first only.",
+        1,
+        100,
+        read_only=True,
+    ),
     Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
 )
 
@@ -191,13 +200,21 @@ class PoleMapNode(ManagedNode):
         """
         try:
             poles, origin = poles_from_message(message)
-            (level,) = values(self, "unknown_level")
+            (level, band) = values(self, "unknown_level", "band")
+            if band > len(poles.bands):
+                raise ValueError(f"band: {band}; there are poles of {len(poles.bands)} only")
             frame_id = origin.contact.frame_id
             if result is None:
                 x_m, y_m, z_m = origin.contact.position_m or (math.nan,) * 3
                 result = PointResult(0, x_m=x_m, y_m=y_m, z_m=z_m, frame_id=frame_id)
             result = with_poles(
-                result, poles, origin, self._classes, level, self._nominal, result.contact_age_s
+                result,
+                poles.bands[band - 1],
+                origin,
+                self._classes if band == 1 else (),
+                level,
+                self._nominal,
+                result.contact_age_s,
             )
             point = MapPoint.of_tip(result, origin)
             if not self._frame_id:

@@ -210,7 +210,7 @@ class NodeHands:
         poles, origin = poles_from_message(message)
         touched_ns = None if self._tip is None else self._tip.touched_ns
         age_s = math.nan if touched_ns is None else (origin.time_ns - touched_ns) * 1e-9
-        return Measured(poles, origin, age_s)
+        return Measured(poles, origin, age_s, self._measure.distortion)
 
     def _poll_of(self, topics: list[str]) -> Poll:
         """Raises `NodeAway` where a node behind these topics is not at work any more."""

@@ -167,7 +167,8 @@ def _channel(message: Any, name: str) -> Channel:
 
 def poles_from_message(message: Any) -> tuple[Poles, Origin]:
     """Poles of a message, and what they belong to; the fitted model itself does not travel."""
-    further = tuple(_poles_of_band(band) for band in message.further)
+    # one within a result of an earlier version has no such field
+    further = tuple(_poles_of_band(band) for band in getattr(message, "further", ()))
     return replace(_poles_of_band(message), further=further), origin_from_message(message)
 
 

@@ -16,12 +16,13 @@ import yaml
 from tactile_resonance.report.drawing import SIMULATED
 from tactile_resonance.report.point_table import table_notes, tissue_of
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
+from tactile_resonance.scan.plan_text import plan_against_outcome
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RECORDING, RunContent
-from tactile_resonance.scan.scene import DriftLimits, ScanScene, read_scan_scene
+from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
 
@@ -64,31 +65,44 @@ _AIR_COLUMNS: Columns = (
     ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
     ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
 )
-_TEXT = {"tissue", "repeats", "outcome"}
+_TEXT = {"tissue", "repeats", "outcome", "what", "planned", "came"}
 
 
-def pole_map_of(run: RunContent) -> PoleMap:
-    """Map of every point's latest attempt that counts; those skipped are not on it."""
-    return reduce(PoleMap.with_result, run.results, PoleMap())
+def pole_maps_of(run: RunContent) -> list[PoleMap]:
+    """Of each band a map of every point's latest attempt that counts, without those skipped.
+
+    None without a point, or where the scene wants no map.
+    """
+    scene = scene_of(run)
+    if not run.results or (scene is not None and Output.MAP not in scene.outputs):
+        return []
+    bands = 1 if scene is None else len(scene.sensor.bands)
+    maps = [
+        reduce(PoleMap.with_result, (result.of_band(k) for result in run.results), PoleMap())
+        for k in range(bands)
+    ]
+    return [pole_map for pole_map in maps if pole_map.points]
 
 
-def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
-    """HTML with the picture (PNG) in it; nothing is fetched from elsewhere.
+def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
+    """HTML with the pictures (PNG) in it; nothing is fetched from elsewhere.
 
     Parameters
     ----------
     run : RunContent
-    picture : bytes or None
+    pictures : sequence of bytes
+        Maps of the bands, in their order.
     truths : mapping of int to PointTruth
         What the simulated bench knew, by point; empty for hardware.
     """
-    name, scene = _scene_name(run), _scene_of(run)
+    name, scene = _scene_name(run), scene_of(run)
     simulated = any(result.simulated for result in run.latest)
     health, sentence = sensor_health(run, scene.drift_limits if scene else DriftLimits())
     measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     notes = run.facts.get("notes") or {"notes": "none"}
     facts = {key: value for key, value in run.facts.items() if key not in _SHOWN}
     sections = {
+        "Plan and outcome": _compared_with_plan(scene, run),
         "Sensor in free air": _paragraphs([sentence], mark=health is not SensorHealth.STEADY),
         "Silent record": _bullets(silent_lines(run)),
         "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),
@@ -97,6 +111,8 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
         f"Against free air{' and the truth of the simulation' if truths else ''}": _results(
             (*_AIR_COLUMNS, *_truth_columns(truths)), measured
         ),
+        "Further bands": _bands_table(measured),
+        "Nonlinear distortion": _distortion_table(measured),
         "Left out": _bullets(skipped_lines(run)),
         "Damaged files": _bullets(run.problems),
         "Scene": f"<pre>{html.escape(run.scene)}</pre>",
@@ -104,7 +120,7 @@ def as_page(run: RunContent, picture: bytes | None, truths: Truths) -> str:
     }
     parts = [f"<h1>{html.escape(name)}</h1>"]
     parts += [_paragraphs([SIMULATED], mark=True) if simulated else "", _paragraphs(summary(run))]
-    if picture is not None:
+    for picture in pictures:
         data = base64.b64encode(picture).decode()
         parts.append(f'<img alt="pole map" src="data:image/png;base64,{data}">')
     parts += [f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text]
@@ -156,7 +172,9 @@ def read_silent(run: RunContent) -> SilentRecord | None:
             for stored in measurements_of_file(run.path / RECORDING / file.name):
                 records = stored.records
                 if not records or stored.gaps:
-                    raise ValueError(f"{file.name}: {len(records)} records, expected some without a gap")
+                    raise ValueError(
+                        f"{file.name}: {len(records)} records, expected some without a gap"
+                    )
                 u, y = (
                     np.stack([getattr(record, channel).volts() for record in records])
                     for channel in ("actuator", "sensor")
@@ -182,7 +200,7 @@ def _compared(run: RunContent, called: Sequence[PointResult]) -> str:
         reasons = "; ".join(sorted({r.tissue_reason for r in called if r.tissue_reason}))
         return f"No pole is referred to a nominal contact: {reasons or 'of an earlier version'}."
     std = np.median([r.nominal_f0_std_hz for r in referred])
-    scene = _scene_of(run)
+    scene = scene_of(run)
     nominal = scene and scene.nominal_contact
     which = f", {1e3 * nominal.force_n:g} mN and {nominal.age_s:g} s" if nominal else ""
     return (
@@ -247,11 +265,61 @@ def _truth_columns(truths: Truths) -> Columns:
     )
 
 
+def _bands_table(results: Sequence[PointResult]) -> str:
+    """Poles of the bands beyond the first; nothing where there are none."""
+    names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
+    for result in results:
+        for band in result.further:
+            texts = (
+                f"{result.index + 1}",
+                f"{band.band_low_hz:g} to {band.band_high_hz:g}",
+                _with_std(band.f0_hz, band.f0_std_hz, 3),
+                _with_std(band.damping_ratio, band.damping_ratio_std, 5),
+                band.poles_status,
+            )
+            rows.append(_row("td", names, texts))
+    return _table(names, rows) if rows else ""
+
+
+def _distortion_table(results: Sequence[PointResult]) -> str:
+    """Levels at the lines left out, against those excited; in brackets the noise; nothing where unknown."""
+    sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
+    names, rows = ("point", "band [Hz]", *sides), []
+
+    def level(value_db: float, noise_db: float, above: bool) -> str:
+        text = f"{_number(value_db, 1)} ({_number(noise_db, 1)})"
+        return text if above else f"{text}, only noise"
+
+    for result in results:
+        for band in result.distortion:
+            texts = (
+                f"{result.index + 1}",
+                f"{band.low_hz:g} to {band.high_hz:g}",
+                level(band.even_db, band.even_noise_db, band.even_above_noise),
+                level(band.odd_db, band.odd_noise_db, band.odd_above_noise),
+                _number(band.input_even_db, 1),
+                _number(band.input_odd_db, 1),
+            )
+            rows.append(_row("td", names, texts))
+    return _table(names, rows) if rows else ""
+
+
+def _compared_with_plan(scene: ScanScene | None, run: RunContent) -> str:
+    """Nothing where the scene cannot be read."""
+    if scene is None:
+        return ""
+    names = ("what", "planned", "came")
+    return _table(names, [_row("td", names, row) for row in plan_against_outcome(scene, run)])
+
+
 def _touches(surface: Mapping[str, Any] | None) -> str:
     """What the surface rests on; nothing where it was not found by touch."""
     if surface is None:
         return ""
-    names, rows = ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]"), []
+    names, rows = (
+        ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]"),
+        [],
+    )
     for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
         x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
         z += f" ± {1e3 * touch['std_m']:.2g}"
@@ -265,10 +333,10 @@ def _touches(surface: Mapping[str, Any] | None) -> str:
     return _paragraphs([f"A {surface['form']}. {told}"]) + _table(names, rows)
 
 
-def _scene_of(run: RunContent) -> ScanScene | None:
+def scene_of(run: RunContent) -> ScanScene | None:
     """None where it cannot be read: a run is reported whatever became of its scene."""
     try:
-        return read_scan_scene(run.path / "scene.yaml")
+        return read_run_scene(run.path / "scene.yaml")
     except ValueError:
         return None
 

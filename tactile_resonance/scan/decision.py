@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import check_above_zero, require
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 
 FloatArray = npt.NDArray[np.float64]
@@ -144,6 +145,29 @@ def decide(
         verdict, reason = Verdict.MOST_BLOCKS, f"{blocks} blocks; {reason}"
     saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
     return Decision(verdict, reason, blocks, saved, saved * block_s, called)
+
+
+def decide_bands(
+    poles: Poles,
+    blocks: int,
+    wanted: Precise | None,
+    limits: BlockLimits,
+    block_s: float,
+) -> Decision:
+    """Whether the main modes of all bands are as precise as wanted; the first that is not decides.
+
+    Parameters
+    ----------
+    poles : Poles
+        Of all blocks so far.
+    blocks, wanted, limits, block_s
+        As `decide`.
+    """
+    of_bands = [
+        decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
+        for mode in (band.main for band in poles.bands)
+    ]
+    return next((decision for decision in of_bands if not decision.stop), of_bands[0])
 
 
 def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:

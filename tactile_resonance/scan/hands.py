@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
@@ -89,11 +90,14 @@ class Measured:
         Of the poles; its contact is that of the measurement.
     contact_age_s : float
         From the first touch until the middle of the measurement [s]; NaN where unknown.
+    distortion : tuple of BandDistortion
+        In each band, where it is measured.
     """
 
     poles: Poles
     origin: Origin
     contact_age_s: float = float("nan")
+    distortion: tuple[BandDistortion, ...] = ()
 
     def with_zero_moved(self, moved_n: float) -> Measured:
         """The same, its force uncertain by half of what its zero moved in the contact."""

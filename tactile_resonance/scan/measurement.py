@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tactile_resonance.multisine import Grid
+from tactile_resonance.multisine import Excitation, Grid, design_multisine
+from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.scene import Output, ScanScene
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
 MARGIN_LINES = 8
-DISTORTION_REALISATIONS = 2
+F_MIN_HZ, F_MAX_HZ = 10.0, 10_000.0
+"""The sensor's whole range, to which the level of a scene refers."""
+MOST_OF_RATE = 0.4
+"""Of the sample rate: up to here anti-alias filters pass lines."""
 
 
 @dataclass(frozen=True)
@@ -32,129 +37,136 @@ class Skipped:
 
 
 @dataclass(frozen=True)
-class SensorRange:
-    """What the acquisition offers: lines from f_min to f_max, a whole number of them per hertz spacing.
-
-    Attributes
-    ----------
-    f_min_hz, f_max_hz : float
-        Lowest and highest line.
-    sample_rate_hz : float
-    samples_per_period : int
-    """
-
-    f_min_hz: float = 10.0
-    f_max_hz: float = 10_000.0
-    sample_rate_hz: float = 50_000.0
-    samples_per_period: int = 20_000
-
-    @property
-    def spacing_hz(self) -> float:
-        """Between lines [Hz]."""
-        return self.sample_rate_hz / self.samples_per_period
-
-    @property
-    def period_s(self) -> float:
-        """One block [s]."""
-        return self.samples_per_period / self.sample_rate_hz
-
-    def lines(self, low_hz: float, high_hz: float) -> int:
-        """How many lines lie from `low_hz` to `high_hz`."""
-        return (
-            math.floor(high_hz / self.spacing_hz + 1e-9)
-            - math.ceil(low_hz / self.spacing_hz - 1e-9)
-            + 1
-        )
-
-
-@dataclass(frozen=True)
 class MeasurementDesign:
-    """One measurement, as the action `measure` takes it.
+    """One measurement, as the action `measure` takes it and every node behind it follows it.
 
     Attributes
     ----------
+    bands : tuple of PoleBand
+        In which poles are identified, the main one first.
+    stretches_hz : tuple of (float, float)
+        Lines from the one to the other are excited, ascending and apart from each other.
     grid : Grid
-    f_min_hz, f_max_hz : float
-        Excited lines.
     level_v : float
         Root mean square of what is played [V]: the amplitude per line is that of the whole range at the
         scene's level.
+    sample_rate_hz : float
+    samples : int
+        Of each channel in a block, one period.
     periods : int
         Most blocks.
-    realisations : int
-        Each of as many periods.
     lines : int
-        Excited.
-    samples : int
-        Of each channel in a block.
-    block_s : float
-        Duration of a block [s].
+        Excited where the grid leaves none out.
     skipped : tuple of Skipped
     silent : bool
         Nothing is played.
     """
 
+    bands: tuple[PoleBand, ...]
+    stretches_hz: tuple[tuple[float, float], ...]
     grid: Grid
-    f_min_hz: float
-    f_max_hz: float
     level_v: float
-    periods: int
-    realisations: int
-    lines: int
+    sample_rate_hz: float
     samples: int
-    block_s: float
+    periods: int
+    lines: int
     skipped: tuple[Skipped, ...]
     silent: bool = False
 
+    @property
+    def block_s(self) -> float:
+        """Duration of a block [s]."""
+        return self.samples / self.sample_rate_hz
 
-def design_measurement(scene: ScanScene, offered: SensorRange | None = None) -> MeasurementDesign:
+
+def design_measurement(scene: ScanScene) -> MeasurementDesign:
     """What to play at each point of a scene.
 
     Raises
     ------
     ValueError
-        If the scene's band does not lie within what the acquisition offers.
+        If a band does not lie within what can be excited, or holds too few lines for its model.
     """
-    offered = SensorRange() if offered is None else offered
-    band = scene.sensor.band_low_hz, scene.sensor.band_high_hz
-    if not offered.f_min_hz <= band[0] < band[1] <= offered.f_max_hz:
-        raise ValueError(
-            f"sensor.band: got {band[0]:g} to {band[1]:g} Hz; accepted is within "
-            f"{offered.f_min_hz:g} to {offered.f_max_hz:g} Hz"
-        )
+    use, outputs = scene.sensor, set(scene.outputs)
+    spacing_hz = use.sample_rate_hz / use.samples_per_period
+    block_s = use.samples_per_period / use.sample_rate_hz
+    top_hz = min(F_MAX_HZ, MOST_OF_RATE * use.sample_rate_hz)
+    for band in use.bands:
+        if band.low_hz < F_MIN_HZ or band.high_hz > top_hz:
+            raise ValueError(
+                f"sensor.band: got {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
+                f"{F_MIN_HZ:g} to {top_hz:g} Hz"
+            )
+    whole_hz = ((F_MIN_HZ, top_hz),)
+    # even distortion of a band falls outside of it: what is to show there must be excited there
+    distortion = Output.DISTORTION in outputs
+    narrow = not distortion and Output.FRF not in outputs
+    stretches_hz = _stretches(use.bands, MARGIN_LINES * spacing_hz, top_hz) if narrow else whole_hz
+    lines = sum(_lines(ends_hz, spacing_hz) for ends_hz in stretches_hz)
+    for band in use.bands:
+        fewest = ModelStructure.with_residual(band.order or 2, band.residual_terms).fewest_lines
+        found = _lines(band.ends_hz, spacing_hz)
+        found = found * 3 // 8 if distortion else found  # odd ones, three of four
+        if found <= fewest:
+            raise ValueError(
+                f"sensor.band: got {found} excited lines from {band.low_hz:g} to {band.high_hz:g} Hz, "
+                f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
+            )
     skipped = []
-    f_min_hz, f_max_hz = offered.f_min_hz, offered.f_max_hz
-    if not {Output.FRF, Output.DISTORTION} & set(scene.outputs):
-        margin_hz = MARGIN_LINES * offered.spacing_hz
-        f_min_hz, f_max_hz = max(f_min_hz, band[0] - margin_hz), min(f_max_hz, band[1] + margin_hz)
-    lines = offered.lines(f_min_hz, f_max_hz)
-    whole = offered.lines(offered.f_min_hz, offered.f_max_hz)
-    if lines < whole:
-        text = f"{whole - lines} of {whole} lines, neither excited nor computed"
-        skipped.append(Skipped(text, f"only poles from {band[0]:g} to {band[1]:g} Hz are wanted"))
-    distortion = Output.DISTORTION in scene.outputs
-    realisations = DISTORTION_REALISATIONS if distortion else 1
+    of_whole = _lines(whole_hz[0], spacing_hz)
+    if narrow:
+        text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
+        named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
+        skipped.append(Skipped(text, f"only poles from {named} are wanted"))
     if not distortion:
-        # a second realisation of random phases distinguishes distortion from noise
-        saved = (DISTORTION_REALISATIONS - 1) * scene.blocks.most * offered.period_s
-        why = "distortion is not wanted"
-        skipped.append(Skipped("a second realisation at every point", why, saved))
-    if Output.RELAXATION not in scene.outputs:
-        skipped.append(Skipped("relaxation after contact", "relaxation is not wanted"))
-    if Output.SILENT not in scene.outputs:
-        saved = scene.blocks.least * offered.period_s
-        skipped.append(Skipped("a silent record", "silent is not wanted", saved))
-    if Output.MAP not in scene.outputs:
-        skipped.append(Skipped("the map", "no map is wanted"))
+        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
+    if Output.SILENT not in outputs:
+        skipped.append(
+            Skipped("a silent record", "silent is not wanted", scene.blocks.least * block_s)
+        )
+    if Output.MAP not in outputs:
+        skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
     return MeasurementDesign(
+        bands=use.bands,
+        stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
-        f_min_hz=f_min_hz,
-        f_max_hz=f_max_hz,
-        level_v=scene.sensor.level_v * math.sqrt(lines / whole),
+        level_v=use.level_v * math.sqrt(lines / _lines((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
+        sample_rate_hz=use.sample_rate_hz,
+        samples=use.samples_per_period,
         periods=scene.blocks.most,
-        realisations=realisations,
         lines=lines,
-        samples=offered.samples_per_period,
-        block_s=offered.period_s,
         skipped=tuple(skipped),
     )
+
+
+def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:
+    """What excitation_node plays for a design, where its parameters leave no line out."""
+    return design_multisine(
+        sample_rate_hz=design.sample_rate_hz,
+        samples_per_period=design.samples,
+        band_hz=design.stretches_hz,
+        level_v=design.level_v,
+        grid=design.grid,
+        seed=seed,
+        periods=design.periods,
+        bands=design.bands,
+    )
+
+
+def _stretches(
+    bands: Sequence[PoleBand], margin_hz: float, top_hz: float
+) -> tuple[tuple[float, float], ...]:
+    """Bands with a margin on either side; those that touch become one."""
+    found: list[tuple[float, float]] = []
+    for low_hz, high_hz in sorted(band.ends_hz for band in bands):
+        low_hz, high_hz = max(F_MIN_HZ, low_hz - margin_hz), min(top_hz, high_hz + margin_hz)
+        if found and low_hz <= found[-1][1]:
+            low_hz = found.pop()[0]
+        found.append((low_hz, high_hz))
+    return tuple(found)
+
+
+def _lines(ends_hz: tuple[float, float], spacing_hz: float) -> int:
+    """How many lines lie from the one end to the other."""
+    low, high = (hz / spacing_hz for hz in ends_hz)
+    return math.floor(high + 1e-9) - math.ceil(low - 1e-9) + 1

@@ -14,7 +14,7 @@ from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
-from tactile_resonance.scan.surface import Surface, TouchRequest
+from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 
 FloatArray = npt.NDArray[np.float64]
 STEEPEST_RAD = np.pi / 3
@@ -114,7 +114,7 @@ def make_plan(
         for index in range(len(where))
     )
     each_s = timing.approach_s + timing.settle_s + timing.retract_s
-    each_s += scene.blocks.most * measurement.realisations * measurement.block_s
+    each_s += scene.blocks.most * measurement.block_s
     skipped = [
         Skipped(f"{int(left.sum())} points", why, float(left.sum() * each_s))
         for left, why in (
@@ -124,6 +124,19 @@ def make_plan(
         if left.any()
     ]
     return plan_points(scene, points, skipped, measurement, timing)
+
+
+def compile_scene(scene: ScanScene) -> Plan:
+    """Plan of a scene before anything moves; a surface to be found by touch is taken to be level.
+
+    Raises
+    ------
+    ValueError
+        As `make_plan`.
+    """
+    if isinstance(scene.surface, TouchRequest):
+        return make_plan(scene, Plane((0.0, 0.0, scene.surface.expected_height_m)))
+    return make_plan(scene)
 
 
 def clear_plan(scene: ScanScene, plan: Plan, surface: Surface, use: TipUse | None) -> Plan:
@@ -184,15 +197,19 @@ def plan_points(
 
 
 def duration_s(
-    points: tuple[ScanPoint, ...], blocks: int, measurement: MeasurementDesign, timing: Timing
+    points: tuple[ScanPoint, ...],
+    blocks: int,
+    measurement: MeasurementDesign,
+    timing: Timing | None = None,
 ) -> float:
     """Time that the remaining points take with so many blocks each [s]."""
     if not points:
         return 0.0
+    timing = Timing() if timing is None else timing
     position = np.array([point.position_m for point in points])
     travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     contact_s = timing.approach_s + timing.settle_s + timing.retract_s
-    measuring_s = blocks * measurement.realisations * measurement.block_s
+    measuring_s = blocks * measurement.block_s
     return travel_m / timing.travel_m_s + len(points) * (contact_s + measuring_s)
 
 

@@ -12,7 +12,7 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.point_result import NAN, PointOutcome, PointResult
+from tactile_resonance.scan.point_result import NAN, PointOutcome, PointResult, band_results
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
@@ -84,6 +84,7 @@ def measured_result(
         blocks_saved=decision.blocks_saved,
         verdict=decision.verdict.value,
         saved_s=decision.saved_s,
+        distortion=measured.distortion,
     )
 
 
@@ -136,6 +137,7 @@ def with_poles(
         cost=float(poles.cost),
         expected_cost=float(poles.expected_cost),
         poles_status=poles.status.value,
+        further=band_results(poles),
         measurement_id=origin.measurement_id,
         simulated=origin.simulated,
     )

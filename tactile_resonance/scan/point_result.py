@@ -7,18 +7,25 @@ import csv
 import io
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum, IntEnum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.frf.result import BandDistortion
+from tactile_resonance.poles.result import Poles
+from tactile_resonance.recording.messages import (
+    distortion_from_message,
+    poles_from_message,
+    time_from_message,
+)
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 
 TOPIC = "point_result"
 TYPE = "tactile_resonance/msg/PointResult"
+DISTORTION_TYPE = "tactile_resonance/msg/Distortion"
 POLES_TYPE = "tactile_resonance/msg/Poles"
 RESULTS_DEPTH = 4096  # of the nodes that publish them
 NAN = float("nan")
@@ -41,10 +48,25 @@ class PointKind(str, Enum):
 
 
 @dataclass(frozen=True)
+class BandResult:
+    """The pole of one further band; fields as in `PointResult`, where that of the first band stands."""
+
+    band_low_hz: float
+    band_high_hz: float
+    f0_hz: float = NAN
+    f0_std_hz: float = NAN
+    damping_ratio: float = NAN
+    damping_ratio_std: float = NAN
+    f0_damping_covariance_hz: float = NAN
+    poles_status: str = ""
+
+
+@dataclass(frozen=True)
 class PointResult:
     """One attempt at one scan point; ``msg/PointResult.msg`` gives unit and meaning of each field.
 
-    ``time_ns`` and ``frame_id`` stand for the message's header; its ``poles`` are not part of it.
+    ``time_ns`` and ``frame_id`` stand for the message's header. Of its ``poles`` only those of further bands
+    are part of it, as ``further``.
     """
 
     index: int
@@ -106,6 +128,18 @@ class PointResult:
     kind: PointKind = PointKind.TISSUE
     time_ns: int = 0
     frame_id: str = ""
+    distortion: tuple[BandDistortion, ...] = ()
+    further: tuple[BandResult, ...] = ()
+
+    def of_band(self, k: int) -> PointResult:
+        """The same with the pole of band k, from 0, in place of the first's; no tissue is called from it."""
+        if k == 0:
+            return self
+        nothing = BandResult(NAN, NAN)
+        band = self.further[k - 1] if k <= len(self.further) else nothing
+        values: dict[str, Any] = {name: getattr(band, name) for name in _BAND_COLUMNS}
+        values |= dict.fromkeys(_OF_FIRST_BAND, NAN)
+        return replace(self, **values, tissue_class="", tissue_probability=NAN, tissue_reason="")
 
     @property
     def failed(self) -> bool:
@@ -139,8 +173,18 @@ class PointResult:
         return np.array([[self.f0_std_hz**2, cross], [cross, self.damping_ratio_std**2]])
 
 
+_OF_BANDS = ("distortion", "further")
 # in the order of the message, the header's two last
-COLUMNS = tuple(field.name for field in fields(PointResult))
+COLUMNS = tuple(field.name for field in fields(PointResult) if field.name not in _OF_BANDS)
+_BAND_COLUMNS = tuple(field.name for field in fields(BandResult))[2:]
+_DISTORTION_COLUMNS = tuple(field.name for field in fields(BandDistortion))[2:]
+_OF_FIRST_BAND = tuple(
+    name
+    for name in COLUMNS
+    if name.startswith(("nominal_", "f0_shift", "f0_over", "damping_shift", "pole_"))
+    or "_per_s" in name
+    or name.endswith("cost")
+)
 _HEADER = ("time_ns", "frame_id")
 
 
@@ -154,6 +198,9 @@ def to_message(result: PointResult, poles: Any = None) -> Any:
     """
     content = {name: getattr(result, name) for name in COLUMNS if name not in _HEADER}
     content["kind"] = result.kind.value
+    content["distortion"] = [
+        make_message(DISTORTION_TYPE, **asdict(band)) for band in result.distortion
+    ]
     header = header_message(result.frame_id, result.time_ns)
     return make_message(TYPE, header=header, poles=[] if poles is None else [poles], **content)
 
@@ -168,17 +215,55 @@ def from_message(message: Any) -> PointResult:
     content = {name: getattr(message, name) for name in COLUMNS if name not in _HEADER}
     content["outcome"] = PointOutcome(message.outcome)
     content["kind"] = PointKind(message.kind or PointKind.TISSUE)
-    time_ns = time_from_message(message.header.stamp)
-    return PointResult(**content, time_ns=time_ns, frame_id=message.header.frame_id)
+    poles = poles_from_message(message.poles[0])[0] if len(message.poles) else Poles()
+    return PointResult(
+        **content,
+        time_ns=time_from_message(message.header.stamp),
+        frame_id=message.header.frame_id,
+        distortion=distortion_from_message(message),
+        further=band_results(poles),
+    )
+
+
+def band_results(poles: Poles) -> tuple[BandResult, ...]:
+    """Of the bands beyond the first, of each the pole with the highest peak."""
+    return tuple(
+        BandResult(
+            *band.band_hz,
+            f0_hz=band.main.f0_hz,
+            f0_std_hz=float(band.main.std[0]),
+            damping_ratio=band.main.damping_ratio,
+            damping_ratio_std=float(band.main.std[1]),
+            f0_damping_covariance_hz=float(band.main.covariance[0, 1]),
+            poles_status=band.status.value,
+        )
+        for band in poles.further
+    )
 
 
 def as_csv(results: Iterable[PointResult]) -> str:
-    """One row each, numbers with all their digits, unknown numbers ``nan``."""
-    text = io.StringIO()
+    """One row each, numbers with all their digits, unknown numbers ``nan``.
+
+    Where a result has them, columns for the poles of further bands, numbered from ``f0_hz_2``, and for the
+    distortion in each band, ``distortion_even_db``, ``distortion_even_db_2``, ..., follow the others.
+    """
+    text, rows = io.StringIO(), list(results)
+    further = max((len(result.further) for result in rows), default=0)
+    distortion = max((len(result.distortion) for result in rows), default=0)
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for result in results:
-        writer.writerow([_write(getattr(result, name)) for name in COLUMNS])
+    numbers = [f"_{k + 1}" if k else "" for k in range(1 + max(further, distortion))]
+    head = [f"{name}{n}" for n in numbers[1 : 1 + further] for name in _BAND_COLUMNS]
+    head += [f"distortion_{name}{n}" for n in numbers[:distortion] for name in _DISTORTION_COLUMNS]
+    writer.writerow([*COLUMNS, *head])
+    for result in rows:
+        row = [getattr(result, name) for name in COLUMNS]
+        for bands, names, count in (
+            (result.further, _BAND_COLUMNS, further),
+            (result.distortion, _DISTORTION_COLUMNS, distortion),
+        ):
+            for k in range(count):
+                row += [getattr(bands[k], name) if k < len(bands) else NAN for name in names]
+        writer.writerow([_write(value) for value in row])
     return text.getvalue()
 
 

@@ -292,7 +292,7 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
     a megabyte a point for poses and wrenches.
     """
     block = 2 * 8 * design.samples + 10 * 8 * design.lines + 10_000
-    return points * (design.periods * design.realisations * block + 1_000_000)
+    return points * (design.periods * block + 1_000_000)
 
 
 def _other_definitions(content: RunContent) -> list[str]:

@@ -31,7 +31,7 @@ from tactile_resonance.scan.preparation import prepare
 from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import ScanScene, read_scan_scene
+from tactile_resonance.scan.scene import ScanScene, read_run_scene
 from tactile_resonance.sensor import sensor_named
 
 _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
@@ -140,9 +140,7 @@ def start_run(
             **made.facts,
         },
     )
-    run = RunDirectory.create(
-        new.path, new.wanted.text, made.plan.points, facts, new.needed_bytes
-    )
+    run = RunDirectory.create(new.path, new.wanted.text, made.plan.points, facts, new.needed_bytes)
     return StartedRun(scene, made.plan, run, seed)
 
 
@@ -155,7 +153,7 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         began = noted.get("table_in_base")
         accepted = f"{began}, with which the run began, to resume it"
         require(began in (None, table), "table_in_base", table, accepted)
-        scene = read_scan_scene(run.path / "scene.yaml")
+        scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
         scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
         return StartedRun(scene, plan_points(scene, run.content.points), run, int(facts["seed"]))
@@ -205,11 +203,12 @@ def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> d
         "longest_s": plan.longest_s,
         "measurement": {
             "grid": design.grid.value,
-            "f_min_hz": design.f_min_hz,
-            "f_max_hz": design.f_max_hz,
+            "stretches_hz": design.stretches_hz,
+            "bands": [asdict(band) for band in design.bands],
+            "sample_rate_hz": design.sample_rate_hz,
+            "samples_per_period": design.samples,
             "level_v": design.level_v,
             "most_periods": design.periods,
-            "realisations": design.realisations,
         },
         "skipped": [asdict(skipped) for skipped in plan.skipped],
         **(more or {}),

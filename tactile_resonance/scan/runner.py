@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide
+from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide, decide_bands
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -210,7 +210,9 @@ class ScanRunner:
                 result = measured_result(result, scene, measured, decisions[-1], self._air)
             if moved_n:
                 text = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
-                result = replace(result, reason=f"{result.reason}; {text}" if result.reason else text)
+                result = replace(
+                    result, reason=f"{result.reason}; {text}" if result.reason else text
+                )
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(
                 result,
@@ -242,7 +244,7 @@ class ScanRunner:
             if np.isnan(at.compared).any() and at.note:
                 return replace(decision, reason=at.note)
             return decision
-        return decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
+        return decide_bands(measured.poles, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan.
@@ -258,7 +260,7 @@ class ScanRunner:
         point = air_point(len(self._plan.points) + (name == AFTER))
         design = replace(self._plan.measurement, periods=self._scene.blocks.least)
         if silent:
-            design = replace(design, realisations=1, silent=True)
+            design = replace(design, silent=True)
             point = replace(point, label=SILENT)
         told = 0
 

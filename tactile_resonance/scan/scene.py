@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from tactile_resonance.fields import (
     require,
     section,
 )
+from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.patterns import read_positions
@@ -64,8 +66,7 @@ class Output(str, Enum):
 
     POLES = "poles"
     FRF = "frf"  # over the sensor's whole range, not only the mode's band
-    DISTORTION = "distortion"
-    RELAXATION = "relaxation"
+    DISTORTION = "distortion"  # even and odd, at input and output, in each band
     MAP = "map"
     SILENT = "silent"  # tones and noise, from a record without drive before the first point
 
@@ -86,7 +87,14 @@ class SensorUse:
     name : str
         Of ``config/sensors``.
     band_low_hz, band_high_hz : float
-        Around the mode that is identified.
+        Around the main mode: precision, tissue and the comparison with free air are of this one.
+    order, residual_terms : int
+        Of the model there: see `PoleBand`.
+    further_bands : tuple of PoleBand
+        Around other modes that are identified and mapped too.
+    sample_rate_hz : float
+    samples_per_period : int
+        Lines are multiples of their ratio; a block is one period.
     level_v : float
         Drive [V rms], if the sensor's whole range were excited: the amplitude of each line follows from
         it, however few are.
@@ -97,15 +105,37 @@ class SensorUse:
     name: str = "bimorph"
     band_low_hz: float = 200.0
     band_high_hz: float = 300.0
+    order: int = 2
+    residual_terms: int = DEFAULT_RESIDUAL_TERMS
+    further_bands: tuple[PoleBand, ...] = ()
+    sample_rate_hz: float = 50_000.0
+    samples_per_period: int = 20_000
     level_v: float = 1.0
     heading_rad: float = 0.0
 
     def __post_init__(self) -> None:
         known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))
         require(self.name in known, "name", self.name, f"one of config/sensors: {', '.join(known)}")
-        check_above_zero(self, "band_low_hz", "level_v")
+        check_above_zero(self, "band_low_hz", "level_v", "sample_rate_hz")
+        check_within(self, samples_per_period=(4, 10**8))
         low, high = self.band_low_hz, self.band_high_hz
         require(high > low, "band_high_hz", high, f"above band_low_hz = {low:g}")
+        for band in self.bands:
+            require(band.order in range(21), "order", band.order, "0 (the data choose) to 20")
+            terms = band.residual_terms
+            require(terms in range(1, 21), "residual_terms", terms, "1 to 20")
+        ends = sorted(band.ends_hz for band in self.bands)
+        for (_, top_hz), following in pairwise(ends):
+            accepted = "bands that do not overlap"
+            require(
+                following[0] >= top_hz, "further_bands", [list(each) for each in ends], accepted
+            )
+
+    @property
+    def bands(self) -> tuple[PoleBand, ...]:
+        """All, the main one first."""
+        main = PoleBand(self.band_low_hz, self.band_high_hz, self.order, self.residual_terms)
+        return (main, *self.further_bands)
 
 
 @dataclass(frozen=True)
@@ -234,6 +264,23 @@ def read_scan_scene(path: Path) -> ScanScene:
     return parse_scan_scene(read_yaml(path), path)
 
 
+def read_run_scene(path: Path) -> ScanScene:
+    """Scene of a run, also of one that an earlier version recorded.
+
+    That version accepted outputs of which it made nothing, and took poles for granted.
+
+    Raises
+    ------
+    ValueError
+        As `read_scan_scene`.
+    """
+    content = read_yaml(path)
+    if isinstance(given := content.get("outputs"), list):
+        known = [output for output in given if output != "relaxation"]
+        content = {**content, "outputs": list(dict.fromkeys([Output.POLES.value, *known]))}
+    return parse_scan_scene(content, path)
+
+
 def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     """Scene of a file's content.
 
@@ -263,7 +310,8 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
         given["surface"] = read_surface(surface, path.parent, f"{where} surface")
     if "outputs" in content:
         wanted = read(tuple[Output, ...], content["outputs"], f"{where} outputs")
-        require(bool(wanted), f"{where} outputs", [], "a list of one output or more")
+        accepted = "a list with poles: a scan measures until they are known"
+        require(Output.POLES in wanted, f"{where} outputs", content["outputs"], accepted)
         given["outputs"] = tuple(output for output in Output if output in wanted)
     handled = {*given, "positions", *BENCH_KEYS}
     rest = {key: value for key, value in content.items() if key not in handled}

@@ -99,6 +99,8 @@ def bits(message, *without):
     elif dataclasses.is_dataclass(message):
         # without the constants of the definition and the name of its type
         names = [f.name for f in dataclasses.fields(message) if f.name[0].islower()]
+    elif isinstance(message, list | tuple):
+        return [bits(each, *without) for each in message]
     elif isinstance(message, array.array | np.ndarray):
         return message.tobytes()
     else:

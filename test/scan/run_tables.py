@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 import numpy as np
 
 from tactile_resonance.scan.messages import make_message, to_cdr
-from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.scan_point import ScanPoint
 
 POLES = "tactile_resonance/msg/Poles"
@@ -30,7 +30,13 @@ def table_of(run_folder):
     """Results as they stand in results.csv."""
     rows = csv.DictReader((run_folder / "results.csv").read_text().splitlines())
     return [
-        PointResult(**{f.name: VALUES[str(f.type)](row[f.name]) for f in fields(PointResult)})
+        PointResult(
+            **{
+                f.name: VALUES[str(f.type)](row[f.name])
+                for f in fields(PointResult)
+                if f.name in COLUMNS
+            }
+        )
         for row in rows
     ]
 

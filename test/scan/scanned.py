@@ -48,7 +48,7 @@ def go_on(path, run, most=None):
 def measure(scene, phantoms, design, bench, point, attempt):
     """Block by block until it is enough."""
     excitation = design_multisine(
-        band_hz=(design.f_min_hz, design.f_max_hz),
+        band_hz=design.stretches_hz,
         level_v=design.level_v,
         grid=design.grid,
         seed=1 + point.index,

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.fields import read_dataclass
 from tactile_resonance.multisine import Grid
-from tactile_resonance.scan.measurement import SensorRange, design_measurement
+from tactile_resonance.poles.structure import PoleBand
+from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.patterns import grid, inside_polygon, read_positions, spiral
 from tactile_resonance.scan.plan import Timing, duration_s, make_plan, tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -149,21 +150,41 @@ def test_time_adds_up():
 def test_what_nobody_reads_is_not_excited():
     poles = design_measurement(scene([[0, 0]]))
     whole = design_measurement(scene([[0, 0]], outputs=(Output.POLES, Output.FRF)))
-    distortion = design_measurement(scene([[0, 0]], outputs=(Output.DISTORTION,)))
-    assert poles.f_min_hz <= 200 - 10
-    assert poles.f_max_hz < 400
-    assert (whole.f_min_hz, whole.f_max_hz, whole.lines) == (10.0, 10_000.0, 3997)
+    distortion = design_measurement(scene([[0, 0]], outputs=(Output.POLES, Output.DISTORTION)))
+    assert poles.stretches_hz == ((180.0, 320.0),)
+    assert poles.lines == 57
+    assert (whole.stretches_hz, whole.lines) == (((10.0, 10_000.0),), 3997)
     # the same amplitude per line
     assert poles.level_v**2 / poles.lines == pytest.approx(whole.level_v**2 / whole.lines)
     assert whole.level_v == 1.0
-    assert (poles.grid, poles.realisations) == (Grid.FULL, 1)
-    assert (distortion.grid, distortion.realisations) == (Grid.ODD_RANDOM, 2)
+    assert poles.grid is Grid.FULL
+    assert (distortion.grid, distortion.lines) == (Grid.ODD_RANDOM, 3997)
     assert any(f"{3997 - poles.lines} of 3997 lines" in s.what for s in poles.skipped)
     assert not any("lines" in s.what for s in whole.skipped)
     saved = {s.why: s.saved_s for s in poles.skipped}
-    assert saved["distortion is not wanted"] == pytest.approx(8 * 0.4)
+    assert saved["silent is not wanted"] == pytest.approx(3 * 0.4)
+    assert "distortion is not wanted" in saved
     asked = scene([[0, 0]])
     asked = replace(asked, sensor=replace(asked.sensor, band_high_hz=2e4))
     with pytest.raises(ValueError, match="200 to 20000 Hz; accepted is within 10 to 10000"):
         design_measurement(asked)
-    assert SensorRange().lines(200, 300) == 41
+
+
+def test_several_bands_are_excited_and_nothing_between_them():
+    asked = scene([[0, 0]])
+    one = design_measurement(asked)
+    further = (PoleBand(600.0, 800.0, 4, 8), PoleBand(320.0, 400.0))
+    two = design_measurement(replace(asked, sensor=replace(asked.sensor, further_bands=further)))
+    assert two.bands == (PoleBand(200.0, 300.0), *further)
+    assert two.stretches_hz == ((180.0, 420.0), (580.0, 820.0))
+    # the same amplitude per line
+    assert two.level_v**2 / two.lines == pytest.approx(one.level_v**2 / one.lines)
+    slow = replace(asked.sensor, sample_rate_hz=10e3, samples_per_period=8000)
+    slow = design_measurement(replace(asked, sensor=slow))
+    assert (slow.sample_rate_hz, slow.samples, slow.block_s) == (10e3, 8000, 0.8)
+    assert slow.lines == 97  # of 1.25 Hz, eight on either side
+    coarse = replace(asked.sensor, samples_per_period=1000)
+    with pytest.raises(ValueError, match="got 3 excited lines from 200 to 300 Hz, 50 Hz apart"):
+        design_measurement(replace(asked, sensor=coarse))
+    with pytest.raises(ValueError, match="further_bands: .*accepted is bands that do not overlap"):
+        replace(asked.sensor, further_bands=(PoleBand(250.0, 400.0),))

@@ -119,13 +119,15 @@ def test_a_row_a_message_and_a_file_say_the_same(tmp_path):
     # every field of the message but its poles is a column
     fields = [name for name, _ in message_types().fielddefs["tactile_resonance/msg/PointResult"][1]]
     columns = [c for c in COLUMNS if c not in ("time_ns", "frame_id")]
-    assert ["header", *columns, "poles"] == fields
+    assert ["header", *columns, "distortion", "poles"] == fields
 
 
 def offers_of(path):
     """Texts in the metadata of the channels of an MCAP file: key and value, each after its length."""
     content = path.read_bytes()
-    summary = content[int.from_bytes(content[-28:-20], "little") :]  # not compressed; see the footer
+    summary = content[
+        int.from_bytes(content[-28:-20], "little") :
+    ]  # not compressed; see the footer
     for found in re.finditer(b"offered_qos_profiles", summary):
         size = int.from_bytes(summary[found.end() : found.end() + 4], "little")
         yield summary[found.end() + 4 : found.end() + 4 + size].decode()

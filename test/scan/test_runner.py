@@ -17,7 +17,7 @@ import pytest
 
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.point_table import point_table
-from tactile_resonance.report.run_report import pole_map_of
+from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
@@ -97,8 +97,8 @@ def test_of_two_modes_the_main_one_ends_the_measurement_and_is_on_the_map(tmp_pa
         assert (result.f0_hz, result.damping_ratio) == (254.0, 0.03)
         assert result.f0_std_hz == pytest.approx(SPREAD_HZ / np.sqrt(blocks))
         assert (result.pole_real_rad_s, result.pole_imag_rad_s) == (-50.0, 1600.0)
-    np.testing.assert_array_equal(pole_map_of(run).f0_hz, 254.0)
-    std_hz = [point.result.f0_std_hz for point in pole_map_of(run).points]
+    np.testing.assert_array_equal(pole_maps_of(run)[0].f0_hz, 254.0)
+    std_hz = [point.result.f0_std_hz for point in pole_maps_of(run)[0].points]
     np.testing.assert_allclose(std_hz, SPREAD_HZ / np.sqrt(blocks))
     measured = [p.poles.main for p in told if p.poles is not None]
     assert {mode.f0_hz for mode in measured} == {254.0}

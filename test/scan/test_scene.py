@@ -140,8 +140,22 @@ def test_classes_from_a_file_and_from_points(tmp_path):
         ({"force_n": -1}, "force_n: got -1.0; accepted is a number above 0"),
         ({"force_n": "1 cN"}, "force_n: got '1 cN'; accepted is a finite number"),
         ({"hold": "pressure"}, "hold: got 'pressure'; accepted is one of force, indentation"),
-        ({"outputs": ["poles", "sound"]}, r"outputs\[1\]: got .sound.; accepted is one of poles, frf"),
+        (
+            {"outputs": ["poles", "sound"]},
+            r"outputs\[1\]: got .sound.; accepted is one of poles, frf",
+        ),
         ({"outputs": []}, "outputs: got"),
+        ({"outputs": ["map"]}, r"outputs: got .'map'.; accepted is a list with poles"),
+        (
+            {"outputs": ["poles", "relaxation"]},
+            r"outputs\[1\]: got .relaxation.; accepted is one of poles, frf, distortion, map, silent",
+        ),
+        ({"sensor": {"order": 30}}, "sensor.order: got 30; accepted is 0"),
+        ({"sensor": {"samples_per_period": 2}}, "sensor.samples_per_period: got 2"),
+        (
+            {"sensor": {"further_bands": [{"low_hz": 600, "high_hz": 500}]}},
+            r"sensor.further_bands\[0\].band: 600 to 500 Hz",
+        ),
         ({"blocks": {"least": 5, "most": 4}}, "blocks.most: got 4; accepted is at least least = 5"),
         ({"blocks": {"least": 2.5}}, "blocks.least: got 2.5; accepted is an integer"),
         ({"blocks": {"fewest": 2}}, "blocks.fewest"),

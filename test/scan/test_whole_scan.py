@@ -11,7 +11,7 @@ import pytest
 
 from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
-from tactile_resonance.report.run_report import pole_map_of
+from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -65,7 +65,7 @@ def test_it_stops_where_it_is_precise_and_says_what_that_saved(run_folder):
 
 
 def test_the_inclusion_is_found_where_it_lies(run_folder):
-    pole_map = pole_map_of(read_run(run_folder))
+    pole_map = pole_maps_of(read_run(run_folder))[0]
     called = {
         tuple(np.round(1e3 * p.position_m[:2]).astype(int)) for p in pole_map.points
         if p.result.tissue_class == "inclusion"
@@ -84,7 +84,7 @@ def test_the_inclusion_is_found_where_it_lies(run_folder):
 
 
 def test_between_the_points_the_truth_lies_within_the_uncertainty(run_folder):
-    kriged = pole_map_of(read_run(run_folder)).krige()
+    kriged = pole_maps_of(read_run(run_folder))[0].krige()
     rng = np.random.default_rng(21)
     at = rng.uniform(-0.01, 0.01, (40, 2))
     truth = np.array([true_poles(SCENE, (*p, 0.0))[0] for p in at])
@@ -128,7 +128,7 @@ def test_report_needs_nothing_else(run_folder, capsys):
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert page.rows == 52  # each point in both tables
+    assert page.rows == 57  # each point in both tables, and the plan with its outcome
     assert [link[:22] for link in page.links] == ["data:image/png;base64,"]
     assert "simulated, not measured" in text
     assert "gelatine with an inclusion" in text
@@ -154,7 +154,7 @@ def test_report_of_a_run_with_failures_and_gaps(tmp_path, capsys):
     assert main(["report", str(folder)]) == 0
     assert "4 of 25 points finished: 2 with poles, 1 failed, 1 skipped." in capsys.readouterr().out
     assert "contact &lt;lost&gt;" in (folder / "report.html").read_text()
-    assert len(pole_map_of(read_run(folder)).failures) == 1
+    assert len(pole_maps_of(read_run(folder))[0].failures) == 1
 
 
 def test_report_of_no_run_says_so(tmp_path, capsys):

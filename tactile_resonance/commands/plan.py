@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance plan`: what a scan of a scene will do, before anything moves."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tactile_resonance.poles.result import Poles
+    from tactile_resonance.scan.plan import Plan
+    from tactile_resonance.scan.scene import ScanScene
+    from tactile_resonance.simulation.tissue.hertz import Tissue
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "plan",
+        help="what a scan of a scene will do, and what it leaves out",
+        description="Print what a scan of a scene will excite, compute, publish and draw, what it leaves out "
+        "and why, the touches and the time. Where the scene has regions, the simulated bench measures the "
+        "first point of each as planned, and its precision and blocks are printed as expected.",
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file")
+    parser.add_argument(
+        "--figure", type=Path, metavar="FILE", help="draw points and lines (.png, .svg, .pdf)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the scene, compile it, print, draw."""
+    # only here: the command answers --help without the libraries of scans
+    from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.scan.plan import compile_scene
+    from tactile_resonance.scan.plan_text import plan_rows
+    from tactile_resonance.scan.scene import read_scan_scene
+
+    scene = read_scan_scene(options.scene)
+    plan = compile_scene(scene)
+    print(f"plan of {scene.name}")
+    for name, text in plan_rows(scene, plan):
+        print(f"{name:>12}  {text}")
+    for text in _expected(options.scene, scene, plan):
+        print(f"{'expected':>12}  {text}")
+    if options.figure is not None:
+        save_figure(_draw(scene, plan), options.figure)
+        print(f"figure in {options.figure}")
+    return 0
+
+
+def _expected(path: Path, scene: ScanScene, plan: Plan) -> list[str]:
+    """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
+    from tactile_resonance.scan.plan import duration_s
+    from tactile_resonance.simulation.tissue.library import read_tissues
+    from tactile_resonance.simulation.tissue.scene import read_scene
+
+    try:
+        phantoms = read_scene(read_tissues(), path)
+    except ValueError as error:
+        return [f"precision unknown: nothing to try it on ({error})"]
+    lines, blocks, tried = [], [], set()
+    for point in plan.points:
+        tissue = phantoms.tissue_at(point.position_m)
+        if tissue is None or tissue.name in tried:
+            continue
+        tried.add(tissue.name)
+        poles, count = _rehearsed(scene, plan, tissue)
+        blocks.append(count)
+        found = ", ".join(
+            f"f0 {of.main.f0_hz:.2f} +- {of.main.std[0]:.2g} Hz, damping ratio "
+            f"{of.main.damping_ratio:.5f} +- {of.main.std[1]:.1g}"
+            if of.main.found
+            else f"no pole from {of.band_hz[0]:g} to {of.band_hz[1]:g} Hz: {of.status.value}"
+            for of in poles.bands
+        )
+        lines.append(f"on {tissue.name} (simulated) after {count} blocks: {found}")
+    if blocks:
+        mean = round(sum(blocks) / len(blocks))
+        lines.append(f"time {duration_s(plan.points, mean, plan.measurement):.0f} s")
+    return lines or ["precision unknown: no point lies on a region of the scene"]
+
+
+def _rehearsed(scene: ScanScene, plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
+    """Poles of one point measured block by block, and how many blocks that took."""
+    from tactile_resonance.frf.measurement import MeasurementFrf
+    from tactile_resonance.poles.estimator import poles_of_bands
+    from tactile_resonance.scan.decision import Precise, decide_bands
+    from tactile_resonance.scan.measurement import excitation_of
+    from tactile_resonance.simulation.sensor.bench import SimulatedBench
+
+    design, frf, blocks = plan.measurement, MeasurementFrf(0), 0
+    wanted = scene.precision if isinstance(scene.precision, Precise) else None
+    excitation = excitation_of(design, seed=1)
+    at_rest = SimulatedBench.from_configuration().start(tissue, force_n=scene.force_n, seed=1)
+    for record in at_rest.play(excitation, excitation.periods):
+        blocks += 1
+        poles = poles_of_bands(frf.add(record, excitation), design.bands)
+        if decide_bands(poles, blocks, wanted, scene.blocks, design.block_s).stop:
+            break
+    return poles, blocks
+
+
+def _draw(scene: ScanScene, plan: Plan) -> Figure:
+    """Points in their order, seen from above, and the lines that are excited."""
+    from tactile_resonance.report.drawing import new_figure
+    from tactile_resonance.scan.measurement import excitation_of
+
+    figure = new_figure(13, 5)
+    figure.suptitle(f"plan of {scene.name}")
+    above, lines = figure.subplots(1, 2)
+    x, y = zip(*(point.position_m[:2] for point in plan.points), strict=True)
+    x_mm, y_mm = ([1e3 * value for value in values] for values in (x, y))
+    above.plot(x_mm, y_mm, "-", color="0.7", lw=0.8)
+    above.plot(x_mm, y_mm, "o", ms=5)
+    above.plot(x_mm[0], y_mm[0], "s", ms=9, mfc="none", color="C3", label="first")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{len(plan.points)} points")
+    above.legend()
+    first = excitation_of(plan.measurement, seed=1)
+    lines.vlines(first.frequency_hz, 0, 1e3 * first.amplitude_v, lw=0.8)
+    for k, band in enumerate(plan.measurement.bands):
+        lines.axvspan(band.low_hz, band.high_hz, color=f"C{k + 1}", alpha=0.2)
+    lines.set(xlabel="frequency [Hz]", ylabel="amplitude of each line [mV]")
+    lines.set_title("excited lines; shaded: bands in which poles are identified")
+    return figure

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan in words, and what became of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tactile_resonance.scan.decision import Precise, Separate
+from tactile_resonance.scan.plan import Plan
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.references import SILENT
+from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import Output, ScanScene
+from tactile_resonance.scan.surface import TouchRequest
+
+Rows = list[tuple[str, str]]
+
+
+def touches(scene: ScanScene, points: int) -> tuple[int, int]:
+    """How often the tissue is touched before the first of so many points is measured, and in all."""
+    before = len(scene.surface.points_m) if isinstance(scene.surface, TouchRequest) else 0
+    before += scene.normals.touches * points if scene.normals else 0
+    return before, before + points
+
+
+def plan_rows(scene: ScanScene, plan: Plan) -> Rows:
+    """What a scan will excite, compute, publish and draw, with names for people.
+
+    Parameters
+    ----------
+    scene : ScanScene
+    plan : Plan
+        Of that scene.
+    """
+    design, count = plan.measurement, len(plan.points)
+    before, in_all = touches(scene, count)
+    stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
+    rows = [
+        (
+            "touches",
+            f"{in_all}: {count} points" + (f", {before} for surface and normals" if before else ""),
+        ),
+        (
+            "excited",
+            f"{design.grid.value} grid of {design.lines} lines, {stretches} Hz, at "
+            f"{design.level_v:.3g} V rms",
+        ),
+        (
+            "sampled",
+            f"{design.sample_rate_hz:g} Hz, blocks of {design.samples} samples, {design.block_s:g} s",
+        ),
+        ("measured", f"{scene.blocks.least} to {scene.blocks.most} blocks a point"),
+        ("until", _wanted(scene)),
+    ]
+    for band in design.bands:
+        order = (
+            "one to three modes, as the data choose" if band.order == 0 else f"order {band.order}"
+        )
+        of_data = "" if band.order == 0 else f" and {band.residual_terms} residual terms"
+        rows.append(("poles", f"{band.low_hz:g} to {band.high_hz:g} Hz, {order}{of_data}"))
+    if Output.DISTORTION in scene.outputs:
+        rows.append(("distortion", "even and odd, at input and output, in each band of poles"))
+    rows.append(("FRF", "at all lines that are excited"))
+    if scene.tissue_classes:
+        rows.append(("tissue", ", ".join(each.name for each in scene.tissue_classes)))
+    rows.append(("published", "excitation, record, frf, poles, point_result of every point"))
+    drawn = ["report.html"]
+    if Output.MAP in scene.outputs:
+        drawn += [*map_names(len(design.bands)), "map.mcap"]
+    rows.append(("drawn", ", ".join(drawn)))
+    rows.append(("time", f"{plan.shortest_s:.0f} to {plan.longest_s:.0f} s"))
+    for left in plan.skipped:
+        saved = f"; saves up to {left.saved_s:.1f} s" if left.saved_s else ""
+        rows.append(("skipped", f"{left.what}: {left.why}{saved}"))
+    return rows
+
+
+def map_names(bands: int) -> list[str]:
+    """Names of the figures of the map, one for each band."""
+    return [f"pole_map{f'_{k + 1}' if k else ''}.png" for k in range(bands)]
+
+
+def plan_against_outcome(scene: ScanScene, run: RunContent) -> list[tuple[str, str, str]]:
+    """What was planned and what came, by name.
+
+    Parameters
+    ----------
+    scene : ScanScene
+        Of the run.
+    run : RunContent
+        As far as it has come.
+    """
+    results, count = run.latest, len(run.points)
+    done = [result for result in results if result.outcome is PointOutcome.DONE]
+    blocks = [scene.blocks.least * count, scene.blocks.most * count]
+    taken_s = float(np.nansum([result.duration_s for result in results]))
+    planned_s = [run.facts.get(name) for name in ("shortest_s", "longest_s")]
+    rows = [
+        ("points", f"{count}", f"{len(results)} finished, {len(done)} with poles"),
+        ("blocks", f"{blocks[0]} to {blocks[1]}", f"{sum(result.blocks for result in results)}"),
+    ]
+    if all(isinstance(seconds, (int, float)) for seconds in planned_s):
+        rows.append(
+            ("time", f"{planned_s[0]:.0f} to {planned_s[1]:.0f} s", f"{taken_s:.0f} s at points")
+        )
+    for k, band in enumerate(scene.sensor.bands):
+        of_band = [result.of_band(k) for result in done]
+        found = [result for result in of_band if not result.failed]
+        name = f"poles, {band.low_hz:g} to {band.high_hz:g} Hz"
+        rows.append((name, _wanted(scene), f"{len(found)} found{_reached(scene, found)}"))
+    if Output.DISTORTION in scene.outputs:
+        told = sum(bool(result.distortion) for result in done)
+        rows.append(("distortion", "at every point", f"at {told} of {len(done)}"))
+    if Output.SILENT in scene.outputs:
+        came = any(f"-{SILENT}." in file.name for file in run.files)
+        rows.append(("silent record", "before the first point", "taken" if came else "missing"))
+    return rows
+
+
+def _wanted(scene: ScanScene) -> str:
+    """When a point's blocks are enough."""
+    wanted = scene.precision
+    if isinstance(wanted, Separate):
+        return f"{wanted.first.name} and {wanted.second.name} separated at {100 * wanted.probability:g} %"
+    if isinstance(wanted, Precise):
+        parts = []
+        if wanted.f0_std_hz is not None:
+            parts.append(f"f0 +- {wanted.f0_std_hz:g} Hz")
+        if wanted.damping_ratio_std is not None:
+            parts.append(f"damping ratio +- {wanted.damping_ratio_std:g}")
+        return ", ".join(parts)
+    return "the most blocks"
+
+
+def _reached(scene: ScanScene, found: Sequence[PointResult]) -> str:
+    """How precise poles are, and how many of them as wanted."""
+    std = np.array([result.std for result in found]).reshape(-1, 2)
+    known = std[np.all(np.isfinite(std), axis=1)]
+    if not len(known):
+        return ""
+    text = f", +- {np.median(known[:, 0]):.2g} Hz and {np.median(known[:, 1]):.1g} (median)"
+    if isinstance(scene.precision, Precise):
+        asked = (scene.precision.f0_std_hz, scene.precision.damping_ratio_std)
+        met = [all(a is None or s <= a for a, s in zip(asked, row, strict=True)) for row in known]
+        text += f", {sum(met)} as precise as wanted"
+    return text

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a plan says of a scene, and what is said of it once it was carried out."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.cli import main
+from tactile_resonance.configuration import share_path
+from tactile_resonance.poles.structure import PoleBand
+from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide_bands
+from tactile_resonance.scan.plan import compile_scene
+from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
+from tactile_resonance.scan.scene import Output, read_run_scene, read_scan_scene
+from tactile_resonance.scan.surface import NormalRequest, TouchRequest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import SPREAD_HZ, Bench, scan, scene
+
+
+def told(asked):
+    rows = plan_rows(asked, compile_scene(asked))
+    return {name: [text for other, text in rows if other == name] for name, _ in rows}
+
+
+def test_a_plan_says_what_each_part_of_a_scene_leads_to():
+    asked = scene(points=3)
+    rows = told(asked)
+    assert rows["touches"] == ["3: 3 points"]
+    assert rows["poles"] == ["200 to 300 Hz, order 2 and 6 residual terms"]
+    assert rows["drawn"] == ["report.html, pole_map.png, map.mcap"]
+    assert any("distortion is not wanted" in text for text in rows["skipped"])
+    bands = (PoleBand(600.0, 800.0, 0),)
+    asked = replace(
+        asked,
+        sensor=replace(asked.sensor, further_bands=bands),
+        outputs=(Output.POLES, Output.DISTORTION),
+        normals=NormalRequest(touches=4),
+        surface=TouchRequest(((0.0, 0.0), (0.01, 0.0), (0.0, 0.01))),
+    )
+    rows = told(asked)
+    assert rows["touches"] == ["18: 3 points, 15 for surface and normals"]
+    assert rows["poles"][1] == "600 to 800 Hz, one to three modes, as the data choose"
+    assert rows["distortion"] == ["even and odd, at input and output, in each band of poles"]
+    assert rows["drawn"] == ["report.html"]
+    assert any("no map is wanted" in text for text in rows["skipped"])
+
+
+def test_the_outcome_stands_beside_the_plan(tmp_path):
+    asked = scene(points=4)
+    _, run, _ = scan(tmp_path / "run", asked, Bench(failing=(2,)))
+    rows = {name: (planned, came) for name, planned, came in plan_against_outcome(asked, run)}
+    assert rows["points"] == ("4", "4 finished, 3 with poles")
+    assert rows["blocks"] == ("8 to 32", "12")
+    planned, came = rows["poles, 200 to 300 Hz"]
+    assert planned == f"f0 +- {SPREAD_HZ / 2:g} Hz"
+    assert came.startswith("3 found, +- 0.01 Hz")
+    assert came.endswith("3 as precise as wanted")
+
+
+def test_a_point_is_enough_once_each_band_is():
+    class Band:
+        def __init__(self, std_hz, further=()):
+            self.main, self.further = self, further
+            self.estimate = np.array([254.0, 0.03])
+            self.covariance = self.noise = np.diag([std_hz**2, 1e-12])
+
+        @property
+        def bands(self):
+            return (self, *self.further)
+
+    wanted, limits = Precise(f0_std_hz=0.01), BlockLimits(1, 8)
+    for first, second, verdict in (
+        (0.009, 0.009, Verdict.PRECISE),
+        (0.009, 0.012, Verdict.CONTINUE),
+        (0.012, 0.009, Verdict.CONTINUE),
+    ):
+        poles = Band(first, (Band(second),))
+        assert decide_bands(poles, 2, wanted, limits, 0.4).verdict is verdict
+    # as precise as it gets
+    poles = Band(0.009, (Band(0.012),))
+    assert decide_bands(poles, 8, wanted, limits, 0.4).stop
+
+
+def test_the_command_compiles_the_packages_own_scenes(capsys, tmp_path):
+    path = share_path("config/scenes/demo.yaml")
+    figure = tmp_path / "plan.png"
+    assert main(["plan", str(path), "--figure", str(figure)]) == 0
+    text = capsys.readouterr().out
+    assert "16 points" in text
+    assert "expected  on gel10_gel16 (simulated) after" in text
+    assert figure.stat().st_size > 10_000
+
+
+def test_a_run_of_an_earlier_version_is_read_with_outputs_that_are_refused_today(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text("force_n: 0.01\npositions: {list: [[0, 0]]}\noutputs: [map, relaxation]\n")
+    assert read_run_scene(path).outputs == (Output.POLES, Output.MAP)
+    with pytest.raises(ValueError, match="relaxation"):
+        read_scan_scene(path)
