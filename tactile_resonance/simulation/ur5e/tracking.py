@@ -78,7 +78,7 @@ class Lag:
         now = line[1]
         if self._fraction:
             now = [b + self._fraction * (a - b) for a, b in zip(line[0], now, strict=True)]
-        if now == before == self.value:  # at rest
+        if now is before and tuple(now) == self.value:  # at rest
             return self.value
         self._delayed = now
         axes = zip(self.value, before, now, strict=True)
