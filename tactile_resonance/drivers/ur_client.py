@@ -246,10 +246,10 @@ class Client:
             if not self._led:
                 self._follow_time(session)
             return
-        if motion.commanded and self._exchange.silence_s() > config.owner_timeout_s:
-            return
         now_ns = time.monotonic_ns()
-        if now_ns - self._fed_ns > 1e9 / (3 * config.watchdog_hz):
+        if now_ns - self._fed_ns <= 1e9 / (3 * config.watchdog_hz):
+            return
+        if not motion.commanded or self._exchange.silence_s() <= config.owner_timeout_s:
             self._feed(session)
             self._fed_ns = now_ns
 
