@@ -138,7 +138,7 @@ def test_three_touches_are_checked_by_none(ideal):
         ({"points": POINTS[:2]}, "points: got 2; accepted is three points or more"),
         ({"points": [Point(x=0.01 * k) for k in range(4)]}, "points: "),
         ({"force_n": -0.01}, "force_n: got -0.01; accepted is a number above 0"),
-        ({"force_n": math.nan}, "force_n: got nan; accepted is a finite number"),
+        ({"force_n": math.nan}, "force_n: got nan; accepted is a number above 0"),
         ({"sensor": "nose"}, "got 'nose'; accepted is one of config/sensors"),
         ({"file": "/nowhere/table.yaml"}, "file: got '/nowhere/table.yaml'; accepted is a path in"),
         ({"file": "../../../table.yaml"}, "accepted is a path in"),
