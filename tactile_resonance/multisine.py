@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -337,9 +338,7 @@ def design_multisine(
     return scaled_to(unscaled, level_v, scale_by)
 
 
-def _stretches(
-    band_hz: tuple[float, float] | Sequence[tuple[float, float]], most_hz: float
-) -> list[tuple[float, float]]:
+def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:
     """Ends of each band."""
     try:
         pairs = [band_hz] if np.ndim(band_hz) == 1 else band_hz
