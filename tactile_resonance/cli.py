@@ -77,7 +77,6 @@ def _parser() -> OneLineParser:
         calibrate_table,
         check_robot,
         compile,
-        demo,
         figures,
         plan,
         reidentify,
@@ -94,8 +93,8 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(demo, analyze, reidentify, report, figures, benchmark),
-        *(plan, scan, calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
+        *(plan, scan, analyze, reidentify, report, figures, benchmark),
+        *(calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
     ):
         command.add_parser(commands)
     return parser
