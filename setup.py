@@ -56,7 +56,11 @@ setup(
     author_email=manifest.find("maintainer").get("email"),
     packages=find_namespace_packages(include=[NAME, f"{NAME}.*"], exclude=["*.__pycache__"]),
     package_data={"": ["py.typed", "*.css", "*.html", "*.js", "*.json", "*.yaml"]},
-    data_files=shared("config") + shared("msg"),  # msg: definitions for recordings made without ROS
+    data_files=[
+        *shared("config"),
+        *shared("msg"),  # definitions for recordings made without ROS
+        (f"share/{NAME}", ["package.xml"]),  # the version
+    ],
     python_requires=">=3.10,<3.14",
     install_requires=[
         "numpy>=1.24,<3",

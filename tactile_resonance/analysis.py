@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import band, number, require_kind
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
 from tactile_resonance.frf.estimate import frf_of_record
@@ -25,7 +26,7 @@ from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.recording.recording import Recording
 
 
@@ -89,14 +90,41 @@ def analyse(
     Raises
     ------
     ValueError
-        If the band holds too few lines for the model, or the method does not fit the record.
+        If an argument is not accepted, the band holds too few lines for the model, or the method does
+        not fit the record.
+
+    Examples
+    --------
+    Two periods of a resonance at 250 Hz, damping ratio 2 %, and the lines between that an odd grid leaves out:
+
+    >>> import numpy as np
+    >>> multisine = tr.design_multisine(
+    ...     sample_rate_hz=5e3, samples_per_period=4000, band_hz=(200.0, 300.0), grid=tr.Grid.ODD
+    ... )
+    >>> u = np.tile(multisine.period(), (2, 1))
+    >>> s, w0 = 2j * np.pi * np.fft.rfftfreq(4000, 1 / 5e3), 2 * np.pi * 250
+    >>> y = np.fft.irfft(0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2) * np.fft.rfft(u))
+    >>> y += 1e-3 * np.random.default_rng(0).standard_normal(y.shape)
+    >>> recording = tr.make_recording(u, y, sample_rate_hz=5e3)
+    >>> analysis = tr.analyse(recording, band_hz=(200, 300), with_distortion=True)
+    >>> analysis.poles.status.value, analysis.frf.g.shape
+    ('ok', (40,))
+    >>> bool(analysis.distortion.even.rms_level_db < -40)
+    True
     """
+    require_kind(recording, "recording", Recording)
+    structure = checked_structure(structure)
+    require_kind(candidates, "candidates", Sequence)
+    for candidate in candidates:
+        require_kind(candidate, "candidates", ModelStructure)
+    channel_delay_s = number(channel_delay_s, "channel_delay_s")
+    if band_hz is not None:
+        band_hz = band(band_hz, most_hz=recording.sample_rate_hz / 2)
     if poles_method not in POLES_METHODS:
         raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
     recording.require_driven()
     if poles_method == "joint" and channel_delay_s:
-        raise ValueError("method: joint takes no channel delay, use frf")
-    structure = structure or ModelStructure()
+        raise ValueError("poles_method: joint takes no channel delay, use frf")
     warnings = list(recording.notes)
     record = Spectrum.of(recording.u, recording.y)
     rate_hz, harmonics = recording.sample_rate_hz, recording.excited_harmonics
@@ -144,7 +172,7 @@ def analyse(
             record, sample_rate_hz=rate_hz, harmonics=harmonics, method=frf_method
         )
     if poles.status is PolesStatus.TOO_FEW_LINES:
-        raise ValueError(f"band: {poles.message}")
+        raise ValueError(f"band_hz: {poles.message}")
     frf = faults.marked(frf)
     warnings += [
         f"{name}: {of.message}" for name, of in (("frf", frf), ("poles", poles)) if of.message

@@ -20,6 +20,19 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"tactile_resonance: {message} (see {self.prog} --help)\n")
 
 
+class Version(argparse.Action):
+    """Prints the version, which stands in package.xml, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """End with status 0."""
+        from tactile_resonance.configuration import share_path
+
+        manifest = share_path("package.xml").read_text(encoding="utf-8")
+        version = manifest.partition("<version>")[2].partition("</version>")[0]
+        print(f"tactile_resonance {version}")
+        parser.exit()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
     with contextlib.suppress(ValueError):  # of another thread than the main one
@@ -63,7 +76,7 @@ def _parser() -> OneLineParser:
         benchmark,
         calibrate_table,
         check_robot,
-        demo,
+        compile,
         figures,
         plan,
         reidentify,
@@ -77,10 +90,11 @@ def _parser() -> OneLineParser:
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(demo, analyze, reidentify, report, figures, benchmark),
-        *(plan, scan, calibrate_table, simulate_ur, simulate_cell, check_robot),
+        *(plan, scan, analyze, reidentify, report, figures, benchmark),
+        *(calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
     ):
         command.add_parser(commands)
     return parser

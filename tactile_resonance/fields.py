@@ -54,6 +54,13 @@ def require(condition: bool, field: str, value: object, accepted: str) -> None:
         raise ValueError(f"{field}: got {cut(_SHOWN.repr(value))}; accepted is {accepted}")
 
 
+def require_kind(value: object, field: str, *kinds: type) -> None:
+    """Raise ``ValueError`` naming field, type and what is accepted, unless `value` is of one of `kinds`."""
+    if not isinstance(value, kinds):
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{field}: got a {type(value).__name__}; accepted is a {names}")
+
+
 def check_within(owner: object, **ranges: tuple[float, float]) -> None:
     """`require` each named number of a dataclass to be in its range, ends included; None passes."""
     for name, (low, high) in ranges.items():
@@ -173,15 +180,44 @@ def one_of(
 
 
 def number(value: object, field: str) -> float:
-    """Return `value` as a finite float; ``ValueError`` if it is not."""
+    """Return `value` as a finite float; ``ValueError`` if it is not. Of numpy scalars and arrays of () too."""
+    plain = _plain(value)
     # an integer may be beyond all floats, which math.isfinite does not take
     good = (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and abs(value) <= sys.float_info.max
+        isinstance(plain, (int, float))
+        and not isinstance(plain, bool)
+        and abs(plain) <= sys.float_info.max
     )
     require(good, field, value, "a finite number")
-    return float(value)  # type: ignore[arg-type]
+    return float(plain)
+
+
+def whole(value: object, field: str, least: int = 0) -> int:
+    """Return `value` as an integer from `least` on, also where it is a float such as 2000.0."""
+    plain = _plain(value)
+    real = isinstance(plain, (int, float)) and not isinstance(plain, bool)
+    good = real and least <= plain < math.inf and plain % 1 == 0
+    require(good, field, value, f"a whole number, at least {least}")
+    return int(plain)
+
+
+def band(value: Any, field: str = "band_hz", most_hz: float = math.inf) -> tuple[float, float]:
+    """Return `value` as the two ends of a band [Hz]; ``ValueError`` unless 0 <= low < high <= `most_hz`."""
+    try:
+        low, high = (number(edge, field) for edge in value)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    ends = "(low, high) in Hz with 0 <= low < high"
+    if most_hz < math.inf:
+        ends += f" <= {most_hz:g}, half the sample rate"
+    # rounding: half of a rate that is no binary fraction
+    require(0 <= low < high <= most_hz * (1 + 1e-9), field, value, ends)
+    return low, high
+
+
+def _plain(value: Any) -> Any:
+    """A numpy scalar, or an array of shape (), as Python's own number."""
+    return value.item() if getattr(value, "ndim", None) == 0 else value
 
 
 def numbers(value: object, field: str, count: int | None = None) -> tuple[float, ...]:

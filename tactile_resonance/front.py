@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.analysis import analyse
+from tactile_resonance.fields import require_kind, whole
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
-from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.recording import Recording
@@ -25,6 +26,9 @@ from tactile_resonance.recording.store_recording import read_store_recording, re
 
 if TYPE_CHECKING:
     from tactile_resonance.scan.run_content import RunContent
+
+FIELDS = {"u", "y", "sample_rate_hz", "samples_per_period", "segments", "excited_harmonics"}
+"""What `read_record` passes on to the reader of a file."""
 
 WITHOUT_ROSBAGS = "rosbags not found, which reads runs: pip install 'rosbags>=0.11.1,<0.12'"
 
@@ -62,16 +66,27 @@ def read_record(
     --------
     >>> recording = tr.read_record("runs/demo", measurement_id=3)  # doctest: +SKIP
     """
+    require_kind(path, "path", str, PathLike)
     path = Path(path)
+    if measurement_id is not None:
+        measurement_id = whole(measurement_id, "measurement_id")
+    if periods is not None:
+        periods = whole(periods, "periods", 1)
+    fields = {name: value for name, value in fields.items() if value is not None}
+    unknown = sorted(set(fields) - FIELDS)
+    if unknown:
+        accepted = ", ".join(sorted(FIELDS))
+        raise ValueError(f"{', '.join(unknown)}: unknown; accepted are {accepted}")
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such file or folder", str(path))
     if not path.is_dir():
         if measurement_id is not None:
-            raise ValueError(f"measurement: {measurement_id}, only for a folder of records")
+            raise ValueError(
+                f"measurement_id: {measurement_id}, only for a folder of records; {path} is a file"
+            )
         return read_recording(path, periods=periods, **fields)
-    for name in ("sample_rate_hz", "samples_per_period", "segments", "excited_harmonics"):
-        if fields.get(name) is not None:
-            raise ValueError(f"{name}: not for a folder of records, which say it themselves")
+    for name in fields:
+        raise ValueError(f"{name}: only for a file; {path} is a folder, whose records say it")
     if not (path / "run.json").is_file():
         return read_store_recording(path, measurement_id, periods)
     try:
@@ -104,17 +119,17 @@ def read_run(path: str | PathLike[str]) -> RunContent:
     >>> run = tr.read_run("runs/demo")  # doctest: +SKIP
     >>> [result.f0_hz for result in run.results]  # doctest: +SKIP
     """
+    require_kind(path, "path", str, PathLike)
+    path = Path(path)
+    if not (path / "run.json").is_file():
+        what = "a folder without run.json" if path.is_dir() else "a file"
+        what = what if path.exists() else "not there"
+        raise ValueError(f"path: {path} is {what}; accepted is the folder of a scan's run")
     try:
         from tactile_resonance.scan import run_content
     except ImportError as error:
         raise ValueError(f"{path}: {WITHOUT_ROSBAGS}") from error
-    return run_content.read_run(Path(path))
-
-
-def _require(data: object, kinds: tuple[type, ...]) -> None:
-    if not isinstance(data, kinds):
-        accepted = " or ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"data: got a {type(data).__name__}; accepted is a {accepted}")
+    return run_content.read_run(path)
 
 
 def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> FRF:
@@ -157,7 +172,7 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     >>> bool(np.all(np.abs(poles.main.estimate - [250, 0.02]) < 4 * poles.main.std))
     True
     """
-    _require(recording, (Recording,))
+    require_kind(recording, "recording", Recording)
     recording.require_driven()
     record = Spectrum.of(recording.u, recording.y)
     harmonics = recording.excited_harmonics
@@ -193,7 +208,7 @@ def identify_poles(
     Raises
     ------
     ValueError
-        If the band holds too few lines for the model.
+        If an argument is not accepted, or the band holds too few lines with finite values for the model.
 
     Examples
     --------
@@ -211,7 +226,10 @@ def identify_poles(
     >>> print(f"{poles.main.f0_hz:.3f} Hz +- {poles.main.std[0]:.3f}, {poles.status.value}")
     249.999 Hz +- 0.004, ok
     """
-    _require(data, (Recording, FRF))
+    require_kind(data, "data", Recording, FRF)
     if isinstance(data, FRF):
-        return identify_frf(data, band_hz, structure)
+        poles = identify_frf(data, band_hz, structure)
+        if poles.status is PolesStatus.TOO_FEW_LINES:
+            raise ValueError(f"band_hz: {poles.message}")
+        return poles
     return analyse(data, band_hz=band_hz, structure=structure).poles

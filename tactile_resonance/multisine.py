@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import number, numbers, require, whole
 from tactile_resonance.poles.structure import PoleBand
 
 FloatArray = npt.NDArray[np.float64]
@@ -262,21 +264,35 @@ def design_multisine(
     ----------
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     section 2.6.2 (random-phase multisine).
+
+    Examples
+    --------
+    Every line of 2.5 Hz from 200 to 300 Hz, 0.5 V rms:
+
+    >>> multisine = tr.design_multisine(
+    ...     sample_rate_hz=5e3, samples_per_period=2000, band_hz=(200.0, 300.0), level_v=0.5, seed=1
+    ... )
+    >>> multisine.frequency_hz[:3].tolist(), multisine.harmonics.size
+    ([200.0, 202.5, 205.0], 41)
+    >>> u = multisine.period()  # samples of one period [V]
+    >>> print(u.shape, f"{u.std():.3f} V rms")
+    (2000,) 0.500 V rms
     """
-    _check_period(sample_rate_hz, samples_per_period)
-    resolution_hz = sample_rate_hz / samples_per_period
-    stretches_hz = np.reshape(np.asarray(band_hz, float), (-1, 2))
-    for low_hz, high_hz in stretches_hz:
-        if not (0 < low_hz <= high_hz < sample_rate_hz / 2):
-            raise ValueError(
-                f"band_hz: {low_hz:g}..{high_hz:g}, expected 0 < low <= high < {sample_rate_hz / 2:g}"
-            )
-    if not (np.isfinite(level_v) and level_v > 0):
-        raise ValueError(f"level_v: {level_v}, expected a positive voltage")
+    rate_hz = number(sample_rate_hz, "sample_rate_hz")
+    samples = whole(samples_per_period, "samples_per_period", 4)
+    _check_period(rate_hz, samples)
+    resolution_hz = rate_hz / samples
+    stretches_hz = _stretches(band_hz, rate_hz / 2)
+    require(number(level_v, "level_v") > 0, "level_v", level_v, "a voltage above 0")
+    block_lines = whole(block_lines, "block_lines", 2)
+    seed, realisation = whole(seed, "seed"), whole(realisation, "realisation")
+    choices = ", ".join(f"{kind.name} ({kind.value!r})" for kind in Grid if kind is not Grid.CUSTOM)
+    require(grid in [*Grid, *(kind.value for kind in Grid)], "grid", grid, f"Grid of {choices}")
+    grid = Grid(grid)
     if scale_by not in ("rms", "peak"):
         raise ValueError(f"scale_by: {scale_by!r}, accepted are 'rms' and 'peak'")
     # 1e-9: a band edge that is a line stays in the band whatever the rounding of the division
-    ends = stretches_hz / resolution_hz + [-1e-9, 1e-9]
+    ends = np.array(stretches_hz) / resolution_hz + [-1e-9, 1e-9]
     harmonics = np.concatenate(
         [
             harmonics_on_grid(
@@ -286,7 +302,7 @@ def design_multisine(
         ]
     )
     frequency_hz = np.asarray(harmonics * resolution_hz, float)
-    hum = mains_lines(frequency_hz, resolution_hz, mains_hz, lines_beside)
+    hum = mains_lines(frequency_hz, resolution_hz, numbers(mains_hz, "mains_hz"), lines_beside)
     if hum.all():
         raise ValueError(
             f"mains_hz: {list(mains_hz)} leave no line of {frequency_hz[0]:g}..{frequency_hz[-1]:g} Hz"
@@ -294,7 +310,10 @@ def design_multisine(
     harmonics = harmonics[~hum]
     shape = np.ones(harmonics.size)
     if relative_amplitude is not None:
-        shape = np.asarray(relative_amplitude, float)
+        try:
+            shape = np.asarray(relative_amplitude, float)
+        except (TypeError, ValueError):
+            shape = np.empty(0)
         if shape.shape != harmonics.shape or not np.all(shape > 0) or np.any(np.isinf(shape)):
             raise ValueError(
                 f"relative_amplitude: shape {shape.shape}, expected {harmonics.shape} positive values"
@@ -304,11 +323,11 @@ def design_multisine(
         harmonics=harmonics,
         amplitude_v=shape,
         phase_rad=phase,
-        sample_rate_hz=float(sample_rate_hz),
-        samples_per_period=int(samples_per_period),
-        periods=periods,
+        sample_rate_hz=rate_hz,
+        samples_per_period=samples,
+        periods=whole(periods, "periods", 1),
         realisation=realisation,
-        realisations=realisations,
+        realisations=whole(realisations, "realisations", 1),
         grid=grid,
         seed=seed,
         measurement_id=measurement_id,
@@ -317,6 +336,19 @@ def design_multisine(
         bands=bands,
     )
     return scaled_to(unscaled, level_v, scale_by)
+
+
+def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:
+    """Ends of each band."""
+    try:
+        pairs = [band_hz] if np.ndim(band_hz) == 1 else band_hz
+        ends = [(number(low, "band_hz"), number(high, "band_hz")) for low, high in pairs]
+    except (TypeError, ValueError):
+        ends = []
+    good = bool(ends) and all(0 < low <= high < most_hz for low, high in ends)
+    accepted = f"(low, high) in Hz with 0 < low <= high < {most_hz:g}, or several of them"
+    require(good, "band_hz", band_hz, accepted)
+    return ends
 
 
 def scaled_to(excitation: Excitation, level_v: float, scale_by: str) -> Excitation:

@@ -136,20 +136,49 @@ def damaged(**changes):
 
 
 BAD = {
-    "missing sensor": (damaged(y=None), (), "y: no such field"),
-    "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y: 12000 samples are NaN or infinite"),
-    "constant": (damaged(u=np.ones(6 * N)), (), r"u: constant (1 V)"),
-    "one period": (damaged(samples_per_period=6 * N), (), "periods: 1 period of 1 realisation"),
+    "missing sensor": (
+        damaged(y=None),
+        (),
+        "y (--y): got 'y'; accepted is a field of bad.npz, which holds",
+    ),
+    "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y (--y): 12000 samples are NaN or infinite"),
+    "constant": (damaged(u=np.ones(6 * N)), (), "u (--u): constant (1 V)"),
+    "one period": (
+        damaged(samples_per_period=6 * N),
+        (),
+        "(samples_per_period, --samples-per-period, is their length)",
+    ),
     "narrow band": (damaged(), ("--band", 249, 251), "holds 1 excited lines"),
-    "band reversed": (damaged(), ("--band", 300, 200), "band: 300 200"),
-    "no rate": (damaged(sample_rate_hz=None), (), "sample_rate_hz: missing"),
-    "zero rate": (damaged(sample_rate_hz=0.0), (), "sample_rate_hz: 0"),
-    "zero rate option": (damaged(), ("--sample-rate", 0), "sample_rate_hz: 0"),
+    "band reversed": (damaged(), ("--band", 300, 200), "band_hz (--band): got [300.0, 200.0]"),
+    "no rate": (damaged(sample_rate_hz=None), (), "sample_rate_hz (--sample-rate): missing"),
+    "zero rate": (damaged(sample_rate_hz=0.0), (), "sample_rate_hz (--sample-rate): got 0.0"),
+    "zero rate option": (
+        damaged(),
+        ("--sample-rate", 0),
+        "sample_rate_hz (--sample-rate): got 0.0",
+    ),
     "broken period": (damaged(samples_per_period=1999), (), "expected a multiple of the period"),
-    "order": (damaged(), ("--order", 0), "order: 0"),
-    "orders": (damaged(), ("--order", "auto", "--numerator-order", 7), "numerator_order: chosen"),
-    "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "json: /nonexistent"),
-    "figure kind": (damaged(), ("--plot", "out.docx"), "plot: out.docx"),
+    "order": (damaged(), ("--order", 0), "order (--order): 0"),
+    "orders": (
+        damaged(),
+        ("--order", "auto", "--numerator-order", 7),
+        "numerator_order (--numerator-order): got",
+    ),
+    "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "--json: /nonexistent"),
+    "measurement": (damaged(), ("--measurement", 3), "measurement_id (--measurement): 3, only for"),
+    "period": (
+        damaged(),
+        ("--samples-per-period", 3),
+        "samples_per_period (--samples-per-period): got",
+    ),
+    "periods": (
+        damaged(),
+        ("--periods", 0),
+        "periods (--periods): got 0; accepted is a whole number",
+    ),
+    "segments": (damaged(), ("--segments", "5:3"), "segments (--segments): 5:3, expected"),
+    "lines": (damaged(), ("--harmonics", "1:1000"), "excited_harmonics (--harmonics): "),
+    "figure kind": (damaged(), ("--plot", "out.docx"), "--plot: out.docx"),
 }
 
 
@@ -399,3 +428,25 @@ def told(arguments):
         return cli.main(["analyze", *arguments])
     except SystemExit as ended:
         return ended.code
+
+
+def test_lines_that_are_not_named_leave_no_cost(good, capsys):
+    """Every other line named: what else is excited counts as a disturbance, of which no cost follows."""
+    assert cli.main(["analyze", str(good), "--band", "200", "300", "--harmonics", "40:160:2"]) == 0
+    printed = capsys.readouterr().out
+    assert "all bins as excitation" in printed
+    assert "no cost (noise known from the residuals alone)" in printed
+    assert "nan" not in printed
+
+
+def test_a_good_record_from_rest_has_no_note_but_that_of_its_lines(tmp_path, capsys):
+    """Its first period has not settled and its phase turns at the mode: neither needs attention."""
+    content = record(periods=4)
+    time_s = np.arange(4 * N) / RATE_HZ
+    content["y"] += np.exp(-DAMPING * 2 * np.pi * F0_HZ * time_s) * np.cos(1570 * time_s)
+    path = tmp_path / "a.npz"
+    for harmonics in (None, np.arange(80, 121)):
+        np.savez(path, **content, **({} if harmonics is None else {"excited_harmonics": harmonics}))
+        assert cli.main(["analyze", str(path), "--band", "200", "300"]) == 0
+        notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note")]
+        assert not any("delay" in note or "settled" in note for note in notes)

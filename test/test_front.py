@@ -4,21 +4,40 @@
 import doctest
 import subprocess
 import sys
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 import tactile_resonance as tr
-from tactile_resonance import front
 from tactile_resonance.recording.store import RecordStore
 from test.recording import stores
 
+MODULES = (
+    "tactile_resonance",
+    "tactile_resonance.analysis",
+    "tactile_resonance.front",
+    "tactile_resonance.multisine",
+    "tactile_resonance.poles.identify",
+    "tactile_resonance.poles.joint",
+    "tactile_resonance.recording.recording",
+)
+"""Those with the examples of the public functions."""
 
-def test_examples_run():
-    for module in (tr, front):
-        result = doctest.testmod(module, extraglobs={"tr": tr})
-        assert result.attempted > 0
-        assert result.failed == 0
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_run(name):
+    result = doctest.testmod(import_module(name), extraglobs={"tr": tr})
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_every_public_function_and_plan_has_an_example():
+    for name in tr.__all__:
+        value = getattr(tr, name)
+        if not isinstance(value, type) or value is tr.PoleEstimator:
+            assert ">>> " in value.__doc__, name
+            assert value.__module__ in MODULES
 
 
 def test_every_public_name_is_there():
@@ -81,8 +100,8 @@ def test_a_folder_of_stored_records_is_read_as_it_was_measured(tmp_path):
 
 
 def test_something_else_than_a_recording_is_refused():
-    for call in (tr.estimate_frf, tr.identify_poles):
-        with pytest.raises(ValueError, match="data: got a str; accepted is a Recording"):
+    for call in (tr.estimate_frf, tr.identify_poles, tr.analyse):
+        with pytest.raises(ValueError, match="got a str; accepted is a Recording"):
             call("record.npz")
 
 
@@ -100,10 +119,118 @@ def test_run_without_rosbags_is_refused_with_what_to_install(tmp_path, monkeypat
 
 
 def test_fields_of_a_file_are_refused_for_a_folder(tmp_path):
-    with pytest.raises(ValueError, match="sample_rate_hz: not for a folder"):
+    with pytest.raises(ValueError, match="sample_rate_hz: only for a file; .* is a folder"):
         tr.read_record(tmp_path, sample_rate_hz=1e3)
     (tmp_path / "x.npz").touch()
-    with pytest.raises(ValueError, match="measurement: 3, only for a folder"):
+    with pytest.raises(
+        ValueError, match="measurement_id: 3, only for a folder of records; .* is a file"
+    ):
         tr.read_record(tmp_path / "x.npz", 3)
     with pytest.raises(FileNotFoundError, match="nothing_here"):
         tr.read_record(tmp_path / "nothing_here")
+
+
+RATE_HZ, SAMPLES = 5e3, 2000
+
+
+@pytest.fixture(scope="module")
+def recording():
+    multisine = tr.design_multisine(
+        sample_rate_hz=RATE_HZ, samples_per_period=SAMPLES, band_hz=(200.0, 300.0), seed=1
+    )
+    u = np.tile(multisine.period(), (3, 1))
+    s, w0 = 2j * np.pi * np.fft.rfftfreq(SAMPLES, 1 / RATE_HZ), 2 * np.pi * 250
+    y = np.fft.irfft(0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2) * np.fft.rfft(u))
+    y += 1e-3 * np.random.default_rng(0).standard_normal(y.shape)
+    harmonics = multisine.harmonics
+    return tr.make_recording(u, y, sample_rate_hz=RATE_HZ, excited_harmonics=harmonics)
+
+
+BANDS = (250, "200-300", ("200", "300"), (200,), (200, 250, 300), (np.nan, 300), (None, 300))
+"""None of them a band; nor are those with another order, or a negative or complex end."""
+
+
+@pytest.mark.parametrize("band_hz", [*BANDS, (300, 200), (-5, 300), (200, 300j)], ids=repr)
+def test_what_is_no_band_is_refused_alike_everywhere(recording, band_hz):
+    frf = tr.estimate_frf(recording)
+    for call in (
+        lambda: tr.identify_poles(recording, band_hz),
+        lambda: tr.identify_poles(frf, band_hz),
+        lambda: tr.identify_batch(frf, band_hz),
+        lambda: tr.analyse(recording, band_hz=band_hz),
+        lambda: tr.design_multisine(band_hz=band_hz),
+        lambda: tr.PoleEstimator(RATE_HZ, SAMPLES, 3, recording.excited_harmonics, band_hz),
+    ):
+        with pytest.raises(ValueError, match=r"^band_hz: .*(accepted is|expected) \(low, high\)"):
+            call()
+
+
+def test_a_band_without_lines_is_refused_for_recording_and_response_alike(recording):
+    frf = tr.estimate_frf(recording)
+    for data in (recording, frf):
+        with pytest.raises(ValueError, match="^band_hz: 0 lines .*10 parameters need at least 6"):
+            tr.identify_poles(data, (1000, 2000))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: tr.read_record(5), "path: got a int; accepted is a str or PathLike"),
+        (lambda r: tr.read_run(None), "path: got a NoneType; accepted is a str or PathLike"),
+        (lambda r: tr.read_record("x", "3"), "measurement_id: got '3'; accepted is a whole number"),
+        (lambda r: tr.read_record("x", rate=3), "rate: unknown; accepted are excited_harmonics, s"),
+        (lambda r: tr.read_record("x", periods=2.5), "periods: got 2.5; accepted is a whole"),
+        (lambda r: tr.estimate_frf(r, method="lpm"), "method: 'lpm', accepted are local"),
+        (lambda r: tr.analyse(r.u), "recording: got a ndarray; accepted is a Recording"),
+        (lambda r: tr.analyse(r, structure={}), "structure: got a dict; accepted is a Model"),
+        (lambda r: tr.analyse(r, candidates=2), "candidates: got a int; accepted is a Sequence"),
+        (lambda r: tr.analyse(r, candidates=[2]), "candidates: got a int; accepted is a Model"),
+        (lambda r: tr.analyse(r, channel_delay_s="1"), "channel_delay_s: got '1'; accepted is"),
+        (lambda r: tr.analyse(r, poles_method=[]), "poles_method: .*, accepted are auto"),
+        (lambda r: tr.identify_batch("x"), "frf: got a str; accepted is a FRF"),
+        (lambda r: tr.identify_poles(tr.FRF("f", "g")), "frf.g: .*expected|accepted"),
+        (lambda r: tr.identify_poles(tr.FRF([1.0], [1.0]), structure="2"), "structure: got a str"),
+        (
+            lambda r: tr.identify_spectra("f", 1, 1, 0),
+            "frequency_hz: got 'f'; accepted is an array",
+        ),
+        (lambda r: tr.ModelStructure(delay=np.nan), "delay: got nan; accepted is true or false"),
+        (lambda r: tr.PoleEstimator("x", 9, 3, [4], (1, 2)), "sample_rate_hz: 'x', expected"),
+        (lambda r: tr.PoleEstimator(5e3, 9, 3, [2.5], (1, 2)), "harmonics: .*2.5.*expected whole"),
+        (lambda r: tr.design_multisine(sample_rate_hz="1"), "sample_rate_hz: got '1'; accepted"),
+        (lambda r: tr.design_multisine(samples_per_period=9.5), "samples_per_period: got 9.5; acc"),
+        (lambda r: tr.design_multisine(level_v=np.nan), "level_v: got nan; accepted is a finite"),
+        (lambda r: tr.design_multisine(grid="even"), r"grid: got 'even'; accepted is Grid of FULL"),
+        (lambda r: tr.design_multisine(seed="a"), "seed: got 'a'; accepted is a whole number"),
+        (lambda r: tr.design_multisine(realisation=-1), "realisation: got -1; accepted is a whole"),
+        (lambda r: tr.design_multisine(mains_hz=50.0), "mains_hz: got 50.0; accepted is a list"),
+        (lambda r: tr.design_multisine(relative_amplitude="x"), "relative_amplitude: .*positive"),
+    ],
+)
+def test_wrong_arguments_are_named_with_what_is_accepted(recording, call, message):
+    with pytest.raises(ValueError, match=f"^({message})"):
+        call(recording)
+
+
+def test_wrong_arrays_are_named_with_the_shape_accepted(recording):
+    plan = tr.PoleEstimator(RATE_HZ, SAMPLES, 3, recording.excited_harmonics, (200.0, 300.0))
+    for u, y, message in (
+        ("a", recording.y, "u: values of type <U1, expected real numbers"),
+        (recording.u[..., :5], recording.y, r"u: shape \(1, 3, 5\), expected \(..., 3, 2000\)"),
+        (recording.u, recording.y[:, :2], r"y: shape \(1, 2, 2000\), expected \(..., 3, 2000\)"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}"):
+            plan(u, y)
+    poles = plan(np.full_like(recording.u, np.nan), recording.y)
+    assert np.isnan(poles.f0_hz).all()
+
+
+def test_grids_may_be_named():
+    named, grid = (tr.design_multisine(grid=of).harmonics for of in ("odd", tr.Grid.ODD))
+    assert np.array_equal(named, grid)
+
+
+def test_a_folder_that_holds_no_run_is_refused(tmp_path):
+    for path, what in ((tmp_path, "a folder without run.json"), (tmp_path / "a", "not there")):
+        with pytest.raises(ValueError, match=f"path: .* is {what}; accepted is the folder of a sc"):
+            tr.read_run(path)

@@ -70,3 +70,12 @@ def test_analyze_prints_what_a_silent_record_holds(tmp_path, capsys):
     assert "tone at 249.9 Hz: fits hum of 50 Hz, 0.0001 V rms in the sensor" in out
     assert main(["analyze", str(path), "--silent", "--json", str(tmp_path / "a.json")]) != 0
     assert "json: not with --silent" in capsys.readouterr().err
+
+
+def test_a_silent_record_needs_no_period(tmp_path, capsys):
+    """Nor does its length have to be a multiple of anything."""
+    u, y = np.random.default_rng(1).standard_normal((2, 20011))
+    path = tmp_path / "silent.npz"
+    np.savez(path, u=u, y=y, sample_rate_hz=RATE_HZ)
+    assert main(["analyze", str(path), "--silent"]) == 0
+    assert capsys.readouterr().out.startswith("actuator: noise ")

@@ -83,9 +83,8 @@ def build(anew: bool) -> None:
 def compile_fits() -> None:
     """Compile the cost of the pole fits into numba's cache, so that no first use has to."""
     with step("compiling the pole fits (about a minute)"):
-        kernels = "from tactile_resonance.poles.tables import compiled; compiled()"
         failure = "the pole fits could not be compiled"
-        run([ROOT / "tools" / "run.sh", "python", "-c", kernels], "kernels.log", failure)
+        run([ROOT / "tools" / "run.sh", "tactile_resonance", "compile"], "kernels.log", failure)
 
 
 def _environment() -> dict[str, str]:

@@ -17,6 +17,7 @@ from tactile_resonance.analysis import (
     analyse,
     analysis_as_json,
 )
+from tactile_resonance.fields import band
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record
@@ -26,6 +27,23 @@ from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.silent import silent_record
 
 MOST_HARMONICS = 10**7
+
+OPTIONS = {
+    "measurement_id": "--measurement",
+    "u": "--u",
+    "y": "--y",
+    "sample_rate_hz": "--sample-rate",
+    "samples_per_period": "--samples-per-period",
+    "periods": "--periods",
+    "segments": "--segments",
+    "excited_harmonics": "--harmonics",
+    "band_hz": "--band",
+    "order": "--order",
+    "numerator_order": "--numerator-order",
+    "poles_method": "--method",
+    "channel_delay_s": "--channel-delay",
+}
+"""Fields of the library, as its messages begin with them, that an option gives."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -43,8 +61,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--measurement", type=int, metavar="ID", help="which one of a folder with several"
     )
-    parser.add_argument("--u", default="u", metavar="FIELD", help="actuator field (default: u)")
-    parser.add_argument("--y", default="y", metavar="FIELD", help="sensor field (default: y)")
+    parser.add_argument("--u", metavar="FIELD", help="actuator field (default: u)")
+    parser.add_argument("--y", metavar="FIELD", help="sensor field (default: y)")
     parser.add_argument("--sample-rate", type=float, metavar="HZ", help="wins over the file's")
     parser.add_argument("--samples-per-period", type=int, metavar="N", help="wins over the file's")
     parser.add_argument(
@@ -57,7 +75,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--segments",
         type=parse_segments,
         metavar="START:STOP,...",
-        help="cut realisations out of a longer recording (samples, stop excluded)",
+        help="cut realisations out of a longer recording (samples, stop excluded); each is one period "
+        "unless --samples-per-period or --periods says otherwise",
     )
     parser.add_argument(
         "--harmonics",
@@ -120,7 +139,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--silent",
         action="store_true",
-        help="the record was taken without drive: name its tones (hum) and its noise level",
+        help="the record was taken without drive and needs no period: name its tones (hum) and its noise level",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
@@ -167,10 +186,19 @@ def parse_harmonics(text: str) -> npt.NDArray[np.int64]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, analyse, then write: nothing is written unless all went well."""
+    """Read, analyse, then write; a message that begins with a field also names the option for it."""
+    try:
+        return _run(options)
+    except ValueError as error:
+        field, colon, rest = str(error).partition(":")
+        if not colon or field not in OPTIONS:
+            raise
+        raise ValueError(f"{field} ({OPTIONS[field]}):{rest}") from error
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Nothing is written unless all went well."""
     _check_outputs(options)
-    if options.periods is not None and options.periods < 1:
-        raise ValueError(f"periods: {options.periods}, expected at least 1")
     recording = read_record(
         options.record,
         options.measurement,
@@ -182,24 +210,23 @@ def run(options: argparse.Namespace) -> int:
         segments=options.segments,
         excited_harmonics=options.harmonics,
     )
-    band_hz = _band(options.band, recording.sample_rate_hz)
+    rate_hz = recording.sample_rate_hz
+    band_hz = None if options.band is None else band(options.band, most_hz=rate_hz / 2)
     if options.silent:
         for name in ("json", "plot"):
             if getattr(options, name) is not None:
-                raise ValueError(f"{name}: not with --silent, which prints")
-        rate_hz = recording.sample_rate_hz
+                raise ValueError(f"--{name}: not with --silent, which prints")
         found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
         print(found.text())
         return 0
     structures = [ModelStructure.with_residual(2 if options.order is None else options.order)]
     if options.order is None:
         if options.numerator_order is not None:
-            raise ValueError("numerator_order: chosen with --order auto, expected none")
+            raise ValueError("numerator_order: got a number; with --order auto it is chosen")
         structures = list(CANDIDATES)
     elif options.numerator_order is not None:
         structures = [replace(structures[0], numerator_order=options.numerator_order)]
     if options.domain == "z":
-        rate_hz = recording.sample_rate_hz
         structures = [replace(s, domain="z", sample_rate_hz=rate_hz) for s in structures]
     analysis = analyse(
         recording,
@@ -234,26 +261,18 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _band(band_hz: list[float] | None, sample_rate_hz: float) -> tuple[float, float] | None:
-    if band_hz is None:
-        return None
-    low_hz, high_hz = band_hz
-    if not 0 <= low_hz < high_hz <= sample_rate_hz / 2:
-        raise ValueError(
-            f"band: {low_hz:g} {high_hz:g}, expected 0 <= LO < HI <= {sample_rate_hz / 2:g} Hz"
-        )
-    return low_hz, high_hz
-
-
 def as_text(analysis: Analysis) -> str:
     """What a person reads first."""
     frf, poles = analysis.frf, analysis.poles
+    cost = f"cost {poles.cost:.4g} (expected {poles.expected_cost:.4g})"
+    if not np.isfinite(poles.cost):
+        cost = "no cost (noise known from the residuals alone)"
     lines = [
         f"FRF: {frf.frequency_hz.size} lines, {frf.frequency_hz[0]:g}-{frf.frequency_hz[-1]:g} Hz, "
         f"{frf.realisations} x {frf.periods} periods, {frf.method}",
         f"fit: {poles.method}, {poles.lines} lines, {poles.band_hz[0]:g}-{poles.band_hz[1]:g} Hz, "
-        f"orders {poles.structure.numerator_order}/{poles.structure.order}, cost {poles.cost:.4g} "
-        f"(expected {poles.expected_cost:.4g}), variance {poles.variance_model}",
+        f"orders {poles.structure.numerator_order}/{poles.structure.order}, {cost}, "
+        f"variance {poles.variance_model}",
     ]
     for k, pole in enumerate(poles.poles_rad_s):
         f0_std, damping_std = np.sqrt(np.diag(poles.best_covariance[k]))
@@ -277,15 +296,15 @@ def _check_outputs(options: argparse.Namespace) -> None:
         if path is None:
             continue
         if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-            raise ValueError(f"{name}: {path}, expected a file in a folder that can be written")
+            raise ValueError(f"--{name}: {path}, expected a file in a folder that can be written")
         if path.exists() and not path.is_file():
             raise ValueError(
-                f"{name}: {path} is not a regular file, expected a new one or one to replace"
+                f"--{name}: {path} is not a regular file, expected a new one or one to replace"
             )
         if path.exists() and options.record.exists() and path.samefile(options.record):
-            raise ValueError(f"{name}: {path} is the record itself, expected another file")
+            raise ValueError(f"--{name}: {path} is the record itself, expected another file")
     if options.json is not None and options.json == options.plot:
-        raise ValueError(f"json, plot: both {options.json}, expected two files")
+        raise ValueError(f"--json, --plot: both {options.json}, expected two files")
     accepted = (".png", ".pdf", ".svg")
     if options.plot is not None and options.plot.suffix.lower() not in accepted:
-        raise ValueError(f"plot: {options.plot}, accepted are {', '.join(accepted)}")
+        raise ValueError(f"--plot: {options.plot}, accepted are {', '.join(accepted)}")

@@ -92,9 +92,16 @@ def add_scene_options(parser: argparse.ArgumentParser, scene: str, output: str) 
 def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
     """Job of the options of a new run."""
     from tactile_resonance.configuration import share_path
+    from tactile_resonance.scan.notes import parse_notes
 
+    parse_notes(options.notes, "--notes")
     if not 1 <= options.seed <= 2**31:
-        raise ValueError(f"seed: {options.seed}, expected 1 to 2^31")
+        raise ValueError(f"--seed: {options.seed}, expected 1 to 2^31")
+    if options.scene is not None and not options.scene.is_file():
+        what = "a folder" if options.scene.is_dir() else "not there"
+        raise ValueError(f"--scene: {options.scene} is {what}; accepted is a scene file")
+    if options.output is not None and options.output.is_file():
+        raise ValueError(f"--output: {options.output} is a file; accepted is a new or empty folder")
     folder = options.output or Path("runs") / time.strftime(f"{output}-%Y%m%d-%H%M%S")
     return Job(
         (options.scene or share_path(f"config/scenes/{scene}")).resolve(),
@@ -102,15 +109,8 @@ def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
         options.robot_host,
         options.seed,
         real_time=options.real_time,
-        notes=_checked_notes(options.notes),
+        notes=options.notes,
     )
-
-
-def _checked_notes(text: str) -> str:
-    from tactile_resonance.scan.notes import parse_notes
-
-    parse_notes(text, "notes")
-    return text
 
 
 def run_job(job: Job) -> int:

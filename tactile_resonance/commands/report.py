@@ -24,10 +24,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read the run, draw, write each file whole."""
     # only here: the command answers --help without the library for recordings
-    try:
-        from tactile_resonance.scan.run_content import read_run
-    except ImportError as error:
-        raise ValueError(f"report: {error.name} not found; pip install rosbags") from error
+    from tactile_resonance.front import read_run
+
+    content = read_run(options.run_folder)
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_table import point_table, table_notes
@@ -42,7 +41,6 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.bench_truth import truths_of
     from tactile_resonance.scan.plan_text import map_names
 
-    content = read_run(options.run_folder)
     truths = truths_of(content)
     pole_maps, pictures = pole_maps_of(content), []
     name = options.run_folder.resolve().name

@@ -168,7 +168,7 @@ class _Bench:
         try:
             bus = SocketcandServer(robot.reactor, options.can_port, cell.receive)
         except ValueError as error:
-            raise ValueError(f"can-port: {error}") from error
+            raise ValueError(f"--can-port: {error}") from error
         robot.time.seeds.append(lambda seed: cell.reseed((options.seed + 1, *seed)))
         attach(robot, self.tabletop)
         attach_cell(robot, self.tabletop.plant, cell, bus)
@@ -181,7 +181,7 @@ def require_loopback(host: str) -> None:
     except ValueError:
         loopback = False
     if not loopback:
-        raise ValueError(f"host: {host!r}, expected an address 127.x.y.z")
+        raise ValueError(f"--host: {host!r}, expected an address 127.x.y.z")
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -189,15 +189,15 @@ def _check(options: argparse.Namespace) -> None:
     for name in ("control_port", "can_port"):
         port = getattr(options, name)
         if not 1024 <= port <= 65535:
-            raise ValueError(f"{name.replace('_', '-')}: {port}, expected 1024 to 65535")
+            raise ValueError(f"--{name.replace('_', '-')}: {port}, expected 1024 to 65535")
     if not all(abs(value) <= 10.0 for value in options.table):
-        raise ValueError(f"table: {options.table}, expected numbers within +-10")
+        raise ValueError(f"--table: {options.table}, expected numbers within +-10")
     if not 0 <= options.priority <= 99:
-        raise ValueError(f"priority: {options.priority}, expected 0 to 99")
+        raise ValueError(f"--priority: {options.priority}, expected 0 to 99")
     if options.tissue is not None and options.scene is not None:
-        raise ValueError("tissue, scene: both given, expected one of them")
+        raise ValueError("--tissue, --scene: both given, expected one of them")
     if options.seed < 0:
-        raise ValueError(f"seed: {options.seed}, expected at least 0")
+        raise ValueError(f"--seed: {options.seed}, expected at least 0")
     _check_used(options)
 
 
@@ -212,4 +212,4 @@ def _check_used(options: argparse.Namespace) -> None:
         given = getattr(options, name) != BENCH_DEFAULTS[name]
         if given and all(getattr(options, other) is None for other in others):
             wanted = " or ".join(f"--{other}" for other in others)
-            raise ValueError(f"{name.replace('_', '-')}: serves only with {wanted}")
+            raise ValueError(f"--{name.replace('_', '-')}: serves only with {wanted}")

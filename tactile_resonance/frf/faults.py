@@ -135,7 +135,7 @@ def find_faults(
         Ends of the range of each channel [V]. Without them, saturation shows only as a flat top.
     transient_removed : bool
         The FRF comes from a method that removes transients (local polynomial), or the first period
-        is dropped: one that has not settled, or a slow drift, then does no harm.
+        is dropped: one that has not settled is then not reported, and a slow drift does no harm.
 
     Returns
     -------
@@ -361,9 +361,12 @@ def lost_samples(x: _Channel) -> Fault | None:
 
 
 def unsettled(x: _Channel) -> Fault | None:
-    """Whether the first period differs from the others by more than noise; needs three periods."""
+    """Whether the first period differs from the others by more than noise; needs three periods.
+
+    Not looked for where transients do no harm: records that begin from rest all have one.
+    """
     periods = x.periods
-    if periods < 3:
+    if periods < 3 or not x.transient_spoils:
         return None
     spectra = x.by_period[:, x.harmonics]  # (P, F)
     mean = spectra[1:].mean(axis=0)
@@ -377,7 +380,7 @@ def unsettled(x: _Channel) -> Fault | None:
         return None
     level = 10 * np.log10(difference / np.sum(np.abs(mean) ** 2))
     text = f"The first period of the {x.name} has not settled: {level:.0f} dB off the others"
-    return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), x.transient_spoils, text)
+    return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), True, text)
 
 
 CHECKS = (saturation, offset, drift, hum, lost_samples, unsettled)

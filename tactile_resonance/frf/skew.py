@@ -107,7 +107,9 @@ def suspected_skew(frf: FRF) -> Fault | None:
         return None
     delay, intercept, residual, std = _linear_phase(f, g)
     turned = abs(2 * np.pi * delay * f[-1])
-    straight = np.sqrt(np.mean(residual**2)) < 0.05 * max(turned, 0.1)
+    # against what it turns over the lines: near a mode it turns too, but along no straight line
+    turned_over_lines = abs(2 * np.pi * delay * (f[-1] - f[0]))
+    straight = np.sqrt(np.mean(residual**2)) < 0.05 * max(turned_over_lines, 0.1)
     through_origin = abs(np.sin(intercept)) < 0.1 * max(turned, 1.0)
     if turned < 0.05 or not straight or not through_origin or abs(delay) < 5 * std:
         return None

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF
 
 FloatArray = npt.NDArray[np.float64]
@@ -25,7 +26,8 @@ def checked_frf(frf: FRF) -> FRF:
     ValueError
         Names the field, its value, and what is accepted.
     """
-    g = np.asarray(frf.g, complex)
+    require_kind(frf, "frf", FRF)
+    g = _numbers(frf.g, "frf.g", complex)
     frequency_hz = checked_lines(frf.frequency_hz, "frf.frequency_hz")
     if g.shape[-1:] != frequency_hz.shape:
         raise ValueError(
@@ -63,7 +65,7 @@ def checked_spectra(
         Names the field, its value, and what is accepted.
     """
     lines_hz = checked_lines(frequency_hz, "frequency_hz")
-    z, c = np.asarray(spectra, complex), np.asarray(covariance, complex)
+    z, c = _numbers(spectra, "spectra", complex), _numbers(covariance, "covariance", complex)
     lines = lines_hz.size
     if z.shape[-2:] != (2, lines) or c.shape[-3:] != (2, 2, lines):
         raise ValueError(
@@ -104,7 +106,7 @@ def checked_lines(frequency_hz: npt.ArrayLike, name: str) -> FloatArray:
     ValueError
         Names the first line that is not finite, negative or not above the one before.
     """
-    lines_hz = np.asarray(frequency_hz, float)
+    lines_hz = _numbers(frequency_hz, name, float)
     if lines_hz.ndim != 1:
         raise ValueError(f"{name}: shape {lines_hz.shape}, expected (F,)")
     good = np.isfinite(lines_hz) & (lines_hz >= 0)
@@ -129,15 +131,17 @@ def checked_band(
     if band_hz is None:
         lines_hz = frequency_hz if frequency_hz.size else np.full(1, np.nan)
         return float(lines_hz[0]), float(lines_hz[-1])
+    return band(band_hz)
+
+
+def _numbers(values: npt.ArrayLike, name: str, kind: type) -> npt.NDArray:
+    """Array of a kind; ``ValueError`` naming the field where the values are no array of numbers."""
     try:
-        low, high = (float(edge) for edge in band_hz)
+        return np.asarray(values, kind)
     except (TypeError, ValueError):
-        low = high = np.nan
-    if not low < high:
-        raise ValueError(f"band_hz: {band_hz!r}, expected (low, high) with low < high")
-    return low, high
+        require(False, name, values, "an array of numbers")
+        raise
 
 
 def _check_dof(dof: float, name: str) -> None:
-    if not (np.ndim(dof) == 0 and np.isfinite(dof) and dof >= 0):
-        raise ValueError(f"{name}: {dof}, expected a number of degrees of freedom, 0 or above")
+    require(number(dof, name) >= 0, name, dof, "a number of degrees of freedom, 0 or above")

@@ -86,7 +86,7 @@ class JointPlan:
     Examples
     --------
     >>> plan = JointPlan(50e3, 20000, 8, np.arange(4, 4001), (200.0, 300.0))
-    >>> poles = plan(u, y)  # u, y: (..., 8, 20000)
+    >>> poles = plan(u, y)  # u, y: (..., 8, 20000)  # doctest: +SKIP
     """
 
     sample_rate_hz: float
@@ -407,8 +407,25 @@ class PoleEstimator(JointPlan):
 
     Examples
     --------
-    >>> plan = PoleEstimator(50e3, 20000, 8, np.arange(4, 4001), (200.0, 300.0))
-    >>> poles = plan(u, y)  # u, y: (..., M, 8, 20000)
+    Three points, each of two realisations of four periods: a resonance at 250, 251 and 252 Hz.
+
+    >>> import numpy as np
+    >>> u, y = np.empty((2, 3, 2, 4, 2000))  # (points, realisations, periods, samples per period)
+    >>> s = 2j * np.pi * np.fft.rfftfreq(2000, 1 / 5e3)
+    >>> for m in range(2):
+    ...     multisine = tr.design_multisine(
+    ...         sample_rate_hz=5e3, samples_per_period=2000, band_hz=(200.0, 300.0), realisation=m
+    ...     )
+    ...     u[:, m] = multisine.period()
+    ...     for point, f0_hz in enumerate((250.0, 251.0, 252.0)):
+    ...         w0 = 2 * np.pi * f0_hz
+    ...         g = 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
+    ...         y[point, m] = np.fft.irfft(g * np.fft.rfft(multisine.period()))
+    >>> y += 1e-3 * np.random.default_rng(0).standard_normal(y.shape)
+    >>> plan = tr.PoleEstimator(5e3, 2000, 4, multisine.harmonics, (200.0, 300.0))
+    >>> poles = plan(u, y)
+    >>> poles.f0_hz.round(2)[:, 0].tolist()
+    [250.0, 251.0, 252.0]
     """
 
     def from_bins(self, u: ComplexArray, y: ComplexArray) -> PolesBatch:

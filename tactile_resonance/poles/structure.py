@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from math import inf
 from numbers import Integral
 
+from tactile_resonance.fields import require, require_kind
+
 DEFAULT_RESIDUAL_TERMS = 6
 
 
@@ -49,6 +51,7 @@ class ModelStructure:
             whole = isinstance(value, Integral) and not isinstance(value, bool)
             if not (whole and value >= least):
                 raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
+        require(isinstance(self.delay, bool), "delay", self.delay, "true or false")
         if self.domain not in ("s", "z"):
             raise ValueError(f"domain: {self.domain!r}, accepted are 's' and 'z'")
         if self.domain == "z" and not (self.sample_rate_hz and 0 < self.sample_rate_hz < inf):
@@ -104,3 +107,11 @@ class PoleBand:
     def ends_hz(self) -> tuple[float, float]:
         """Both ends."""
         return self.low_hz, self.high_hz
+
+
+def checked_structure(structure: ModelStructure | None) -> ModelStructure:
+    """Return the structure, that of one mode when absent; ``ValueError`` if it is something else."""
+    if structure is None:
+        return ModelStructure()
+    require_kind(structure, "structure", ModelStructure)
+    return structure

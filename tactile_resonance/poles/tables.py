@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba.core import event
 
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.likelihood import (
@@ -217,8 +218,34 @@ def in_blocks(values: Sequence[npt.NDArray], points: int = 1) -> FloatArray:
 def compiled() -> int:
     """How many kernels were not in the cache and had to be compiled, of those that fits call.
 
-    Some ten seconds of work, once per installation: what was compiled is said on the log.
+    About a minute of work, once per installation, which the log says before it begins.
     """
+    with event.install_listener("numba:compile", _Notice()):
+        _call_kernels()
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in likelihood.KERNELS)
+
+
+class _Notice(event.Listener):
+    """Says on the log that kernels are compiled, as the first of them begins."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: object) -> None:
+        """Say it once."""
+        if not self._said:
+            logging.getLogger(__name__).warning(
+                "compiling the pole fits, once per installation: about a minute; ahead of the first use: "
+                "tactile_resonance compile"
+            )
+        self._said = True
+
+    def on_end(self, event: object) -> None:
+        """Nothing to say."""
+
+
+def _call_kernels() -> None:
+    """Call each kernel that a fit calls, on a little data."""
     bins, undriven = 4 * BLOCK, 3 * BLOCK
     s = 1j * np.linspace(0.8, 1.2, bins)
     one = np.ones((bins, 1), complex)
@@ -247,9 +274,3 @@ def compiled() -> int:
     bases = (two, one[undriven:], one[undriven:])
     at, inverse = theta[:, 0, :3], inverse[:, :3, :3]
     likelihood.best_fall(data, 1, bases, at, inverse, np.ones(1), 9.0, two, modes)
-    missing = sum(sum(kernel.stats.cache_misses.values()) for kernel in likelihood.KERNELS)
-    if missing:
-        logging.getLogger(__name__).warning(
-            "pole fits: %d kernels compiled, which is done once per installation", missing
-        )
-    return missing

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.io
 
+from tactile_resonance.fields import require, whole
 from tactile_resonance.recording.recording import Recording, make_recording
 
 ACCEPTED = ".npz, .mat and .csv"
@@ -50,18 +51,14 @@ def read_recording(
         If the file cannot be opened.
     """
     fields = read_fields(path)
-    for name in (u, y):
-        if name not in fields:
-            raise ValueError(
-                f"{name}: no such field in {path.name}, which holds {', '.join(sorted(fields))}"
-            )
+    for option, name in (("u", u), ("y", y)):
+        present = isinstance(name, str) and name in fields
+        held = f"a field of {path.name}, which holds {', '.join(sorted(fields))}"
+        require(present, option, name, held)
     if sample_rate_hz is None:
         sample_rate_hz = _sample_rate(fields, path)
     if samples_per_period is None and "samples_per_period" in fields:
-        value = _scalar(fields, "samples_per_period")
-        if value % 1:
-            raise ValueError(f"samples_per_period: {value:g}, expected a whole number")
-        samples_per_period = int(value)
+        samples_per_period = whole(_scalar(fields, "samples_per_period"), "samples_per_period", 4)
     if excited_harmonics is None:
         excited_harmonics = fields.get("excited_harmonics")
     return make_recording(
@@ -143,7 +140,7 @@ def _sample_rate(fields: Mapping[str, np.ndarray], path: Path) -> float:
         if step.size == 0 or not np.all(np.abs(step - step.mean()) < 0.01 * step.mean()):
             raise ValueError("time_s: not evenly spaced, expected one sample rate")
         return float(1 / step.mean())
-    raise ValueError(f"sample_rate_hz: missing in {path.name}, give it as --sample-rate")
+    raise ValueError(f"sample_rate_hz: missing in {path.name}, expected there or given")
 
 
 def _scalar(fields: Mapping[str, np.ndarray], name: str) -> float:

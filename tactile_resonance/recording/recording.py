@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import number, require, whole
+
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 1e12
 
 
@@ -39,7 +41,17 @@ class Recording:
         return self.sample_rate_hz / self.u.shape[-1]
 
     def require_driven(self) -> None:
-        """Raise ``ValueError`` where a channel is constant over a realisation: nothing was driven."""
+        """Raise ``ValueError`` where no response can be estimated.
+
+        From one period alone, or where a channel is constant over a realisation: nothing was driven.
+        """
+        realisations, periods, samples = self.u.shape
+        if realisations < 2 and periods < 2:
+            raise ValueError(
+                f"periods: {periods} period of {realisations} realisation, {samples} samples; expected at "
+                "least 2 periods (samples_per_period, --samples-per-period, is their length) or 2 "
+                "realisations: one alone has no covariance"
+            )
         for name, samples in (("u", self.u), ("y", self.y)):
             flat = np.ptp(samples, axis=(1, 2)) == 0
             if np.any(flat):
@@ -68,7 +80,7 @@ def make_recording(
     u, y : (samples,), (P, N) or (M, P, N)
     sample_rate_hz : float
     samples_per_period : int, optional
-        Needed for one-dimensional channels unless `periods` divides them.
+        Of channels that are not cut into periods; without it and `periods` each realisation is one period.
     periods : int, optional
         How many periods to use, from the first. Where `samples_per_period` is not known: into how many
         periods a one-dimensional channel divides.
@@ -82,12 +94,22 @@ def make_recording(
     ------
     ValueError
         Names the field, its value, and what is accepted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> u, y = np.random.default_rng(0).standard_normal((2, 8000))  # your samples [V]
+    >>> recording = tr.make_recording(u, y, sample_rate_hz=5e3, samples_per_period=2000)
+    >>> recording.u.shape, recording.resolution_hz
+    ((1, 4, 2000), 2.5)
     """
-    if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ:
-        raise ValueError(
-            f"sample_rate_hz: {sample_rate_hz:g}, expected a positive frequency, {MIN_RATE_HZ:g} to "
-            f"{MAX_RATE_HZ:g} Hz"
-        )
+    rate_hz = number(sample_rate_hz, "sample_rate_hz")
+    accepted = f"a positive frequency, {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz"
+    require(MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ, "sample_rate_hz", sample_rate_hz, accepted)
+    if samples_per_period is not None:
+        samples_per_period = whole(samples_per_period, "samples_per_period", 4)
+    if periods is not None:
+        periods = whole(periods, "periods", 1)
     channels = [_as_samples(x, name) for x, name in ((u, u_name), (y, y_name))]
     if channels[0].shape != channels[1].shape:
         raise ValueError(
@@ -103,28 +125,25 @@ def make_recording(
     ]  # (M, P, N) or (M, 1, n)
     channels = [x.reshape(x.shape[0], -1, n) for x in channels]
     if periods is not None:
-        if not 1 <= periods <= channels[0].shape[1]:
+        if periods > channels[0].shape[1]:
             raise ValueError(
                 f"periods: {periods}, accepted is 1..{channels[0].shape[1]}, the periods recorded"
             )
         channels = [x[:, :periods] for x in channels]
     for x, name in zip(channels, (u_name, y_name), strict=False):
         _check_samples(x, name)
-    realisations, used = channels[0].shape[:2]
-    if realisations < 2 and used < 2:
-        raise ValueError(
-            f"periods: {used} period of {realisations} realisation, expected at least 2 periods or "
-            "2 realisations: one alone has no covariance"
-        )
-    return Recording(
-        channels[0], channels[1], float(sample_rate_hz), _harmonics(excited_harmonics, n)
-    )
+    return Recording(channels[0], channels[1], rate_hz, _harmonics(excited_harmonics, n))
 
 
 def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different length
+        array = np.empty(0, object)
     if array.dtype.kind not in "iuf":
-        raise ValueError(f"{name}: values of type {array.dtype}, expected real numbers [V]")
+        raise ValueError(
+            f"{name}: values of type {array.dtype}, expected an array of real numbers [V]"
+        )
     array = np.squeeze(array) if array.ndim == 2 and 1 in array.shape else array
     if array.ndim not in (1, 2, 3) or array.size == 0:
         raise ValueError(
@@ -140,15 +159,20 @@ def _cut(
     """(M, 1, length) one segment a realisation."""
     if samples.ndim != 1:
         raise ValueError(f"segments: {name} has shape {samples.shape}, expected (samples,)")
-    for start, stop in segments:
-        if not 0 <= start < stop <= samples.size:
+    try:
+        pairs = [(whole(start, "segments"), whole(stop, "segments")) for start, stop in segments]
+    except (TypeError, ValueError):
+        pairs = []
+    require(bool(pairs), "segments", segments, "a list of (start, stop) in samples")
+    for start, stop in pairs:
+        if not start < stop <= samples.size:
             raise ValueError(
                 f"segments: {start}:{stop}, expected 0 <= START < STOP <= {samples.size}"
             )
-    lengths = {stop - start for start, stop in segments}
+    lengths = {stop - start for start, stop in pairs}
     if len(lengths) != 1:
         raise ValueError(f"segments: lengths {sorted(lengths)}, expected one length for all")
-    return np.stack([samples[start:stop] for start, stop in segments])[:, None]
+    return np.stack([samples[start:stop] for start, stop in pairs])[:, None]
 
 
 def _period_length(
@@ -156,18 +180,11 @@ def _period_length(
 ) -> int:
     cut_in_periods = len(shape) > 1 and shape[-2] > 1
     if samples_per_period is None:
-        if cut_in_periods:
+        if cut_in_periods or periods is None:
             return shape[-1]
-        if periods is None:
-            raise ValueError(
-                f"samples_per_period: missing, expected how many of the {shape[-1]} samples of "
-                f"{name} are one period"
-            )
-        if periods < 1 or shape[-1] % periods:
+        if shape[-1] % periods:
             raise ValueError(f"periods: {periods}, expected a divisor of {shape[-1]} samples")
         return shape[-1] // periods
-    if samples_per_period < 4:
-        raise ValueError(f"samples_per_period: {samples_per_period}, expected at least 4")
     if cut_in_periods and shape[-1] != samples_per_period:
         raise ValueError(
             f"samples_per_period: {samples_per_period}, but {name} has shape {shape}: expected "
@@ -193,8 +210,8 @@ def _harmonics(values: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | 
         return None
     array = np.asarray(values).ravel()
     last = (n - 1) // 2
-    whole = array.dtype.kind in "iuf" and np.all(np.mod(array, 1) == 0)
-    if not whole or array.size == 0 or array.min() < 1 or array.max() > last:
+    integral = array.dtype.kind in "iuf" and np.all(np.mod(array, 1) == 0)
+    if not integral or array.size == 0 or array.min() < 1 or array.max() > last:
         raise ValueError(
             f"excited_harmonics: {array[:5]}..., expected whole numbers from 1 to {last}"
         )

@@ -50,7 +50,7 @@ def with_entry(row, column, value):
         ({"frequency_hz": LINES_HZ[:30]}, None, "frf.g: shape"),
         ({"frequency_hz": LINES_HZ[:, None]}, None, "frf.frequency_hz: shape"),
         ({"variance_noise": np.ones(30)}, None, "frf.variance_noise: shape"),
-        ({"noise_dof": -1}, None, "frf.noise_dof: -1"),
+        ({"noise_dof": -1}, None, "frf.noise_dof: got -1"),
         ({}, (300, 200), "band_hz: "),
         ({}, (np.nan, 200), "band_hz: "),
         ({}, (200,), "band_hz: "),
@@ -69,7 +69,7 @@ def test_a_bad_frf_is_named(changes, band_hz, said):
         ({"covariance": spectra()["covariance"][..., :30]}, "spectra, covariance: shapes"),
         ({"covariance": np.ones((3, 2, 2, 41))}, "covariance: shape"),
         ({"frequency_hz": LINES_HZ[::-1]}, "frequency_hz: 297.5 Hz after 300"),
-        ({"dof": -1}, "dof: -1"),
+        ({"dof": -1}, "dof: got -1"),
         ({"band_hz": (300, 200)}, "band_hz: "),
         # one triangle alone, a symmetric matrix, more covariance than variances allow, none below 0
         ({"covariance": with_entry(0, 1, 5e-7)}, "200 Hz, expected a Hermitian matrix"),

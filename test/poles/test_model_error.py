@@ -117,11 +117,13 @@ def test_a_model_error_that_the_cost_does_not_show_is_told_by_its_smoothness():
     assert np.mean(richer.has_status(PolesStatus.MODEL_ERROR)) < 0.02
 
 
-@pytest.mark.parametrize("band", [(40, 110), (1, 200)])
-def test_one_realisation_of_a_nonlinear_circuit(shared_data, band):
+@pytest.mark.parametrize(
+    ("band", "ends"), [((40, 110), (48946, 57646, 66346, 75046)), ((1, 200), (48946,))]
+)
+def test_one_realisation_of_a_nonlinear_circuit(shared_data, band, ends):
     """Measured: odd distortion stands far above what the even lines show, and the status says so."""
     data = scipy.io.loadmat(shared_data / "silverbox" / "SNLS80mV.mat")
-    for end in (48946, 57646, 66346, 75046):
+    for end in ends:
         u, y = (data[name].ravel()[end - 8192 : end][None] for name in ("V1", "V2"))
         poles = identify_poles_from_records(
             u,

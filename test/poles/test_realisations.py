@@ -99,19 +99,28 @@ def test_distortion_is_told_from_noise_and_from_model_error(realisations, period
     assert stats.binom.cdf(coverage * RUNS, RUNS, 0.94) > 0.0005
 
 
-@pytest.mark.parametrize(("cubic", "snr_db"), [(2.8e-5, 40.0), (2.5e-4, 60.0)])
+NOT_LINEAR = (RATE_HZ, SAMPLES, 2, LINES, (200.0, 300.0), BARE)
+
+
+@pytest.fixture(scope="module", params=[(2.8e-5, 40.0), (2.5e-4, 60.0)])
+def not_linear(request):
+    """Records u, y (960, 2, samples) of a resonator that is not linear, and (960, 2) poles of each alone."""
+    u, y = records(np.random.default_rng(14), 960, 2, *request.param)
+    alone = JointPlan(*NOT_LINEAR)(u, y)
+    return u, y, np.stack([alone.f0_hz[:, 0], alone.damping_ratio[:, 0]], axis=-1)
+
+
 @pytest.mark.parametrize("realisations", [2, 4, 8])
 def test_ellipse_holds_the_linear_approximation_of_a_resonator_that_is_not_linear(
-    realisations, cubic, snr_db
+    realisations, not_linear
 ):
     """Each realisation is another system: 3 to 40 % of ellipses from the scatter on lines would hold it."""
     groups = 120
-    u, y = records(np.random.default_rng(14), groups * realisations, 2, cubic, snr_db)
-    u, y = (v.reshape(groups, realisations, *v.shape[1:]) for v in (u, y))
-    options = (RATE_HZ, SAMPLES, 2, LINES, (200.0, 300.0), BARE)
-    result, alone = PoleEstimator(*options)(u, y), JointPlan(*options)(u, y)
-    each = np.stack([alone.f0_hz[..., 0], alone.damping_ratio[..., 0]], axis=-1)
-    truth = each.mean(axis=(0, 1))
+    truth = not_linear[2].mean(axis=0)
+    u, y, each = (
+        v[: groups * realisations].reshape(groups, realisations, *v.shape[1:]) for v in not_linear
+    )
+    result = PoleEstimator(*NOT_LINEAR)(u, y)
     errors = np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], axis=-1) - truth
     coverage = judge(errors, result.total_covariance[:, 0], np.eye(2))[1]
     assert stats.binom.cdf(coverage * groups, groups, 0.94) > 0.0005

@@ -188,9 +188,9 @@ def test_distortion_on_lines_of_an_odd_random_grid_is_no_tone():
 
 
 def test_noise_is_no_tone():
-    """None of 3000: at most one of a thousand by the 95 % bound of Clopper and Pearson, 3.00 / 3000."""
+    """None of 1500: at most one of 500 by the 95 % bound of Clopper and Pearson, 3.00 / 1500."""
     plant = Plant(0.02, 40.0, 2)
-    found = runs([plant], 3000, lambda rng, u, y: (u, y))
+    found = runs([plant], 1500, lambda rng, u, y: (u, y))
     assert not any("tone" in poles.message for poles in found)
 
 

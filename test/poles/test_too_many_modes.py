@@ -26,7 +26,7 @@ from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
-RUNS = 150
+RUNS = 100
 
 
 def from_frfs(order, stated=1e-6):

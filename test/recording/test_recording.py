@@ -44,12 +44,21 @@ def test_single_precision_is_not_copied():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sample_rate_hz": 0.0}, "sample_rate_hz: 0, expected a positive"),
-        ({"sample_rate_hz": float("nan")}, "sample_rate_hz: nan"),
+        ({"sample_rate_hz": 0.0}, "sample_rate_hz: got 0.0; accepted is a positive"),
+        ({"sample_rate_hz": float("nan")}, "sample_rate_hz: got nan; accepted is a finite number"),
+        ({"sample_rate_hz": "10"}, "sample_rate_hz: got '10'; accepted is a finite number"),
+        ({"samples_per_period": 6.5}, "samples_per_period: got 6.5; accepted is a whole number"),
+        ({"periods": "2"}, "periods: got '2'; accepted is a whole number, at least 1"),
+        ({"segments": 5}, r"segments: got 5; accepted is a list of \(start, stop\)"),
+        ({"segments": [(0,)]}, r"segments: got \[\(0,\)\]; accepted is a list"),
+        ({"segments": [(0, float("nan"))]}, "segments: got .*nan.*; accepted is a list"),
+        ({"u": [[1.0, 2.0], [3.0]]}, "u: values of type object, expected an array of real"),
+        ({"u": None}, "u: values of type object, expected an array of real"),
         ({"samples_per_period": 5}, "u: 24 samples, expected a multiple of the period of 5"),
-        ({"samples_per_period": 0}, "samples_per_period: 0"),
-        ({"samples_per_period": None}, "missing, expected how many of the 24 samples of u"),
-        ({"samples_per_period": 24}, "periods: 1 period of 1 realisation"),
+        (
+            {"samples_per_period": 0},
+            "samples_per_period: got 0; accepted is a whole number, at least 4",
+        ),
         ({"samples_per_period": None, "periods": 7}, "periods: 7, expected a divisor"),
         ({"periods": 9}, r"periods: 9, accepted is 1\.\.4"),
         ({"segments": [(0, 30)]}, "segments: 0:30"),
@@ -68,6 +77,28 @@ def test_bad_input_names_field_and_value(change, message):
     good = {"u": U, "y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}
     with pytest.raises(ValueError, match=message):
         make_recording(**(good | change))
+
+
+@pytest.mark.parametrize("samples_per_period", [None, 24])
+def test_one_period_is_read_and_refused_where_a_covariance_is_needed(samples_per_period):
+    recording = make_recording(U, Y, sample_rate_hz=10.0, samples_per_period=samples_per_period)
+    assert recording.u.shape == (1, 1, 24)
+    with pytest.raises(
+        ValueError, match="periods: 1 period of 1 realisation, 24 samples; expected"
+    ):
+        recording.require_driven()
+    two = make_recording(U, Y, sample_rate_hz=10.0, segments=[(0, 12), (12, 24)])
+    assert two.u.shape == (2, 1, 12)
+    two.require_driven()
+
+
+def test_numbers_may_be_those_of_numpy():
+    """As `numpy.load` gives them: arrays of shape (), whole numbers as floats."""
+    recording = make_recording(
+        U, Y, sample_rate_hz=np.array(10.0), samples_per_period=np.array(6.0), periods=np.int64(2)
+    )
+    assert recording.u.shape == (1, 2, 6)
+    assert recording.sample_rate_hz == 10.0
 
 
 def test_a_channel_without_drive_is_read_and_refused_where_a_drive_is_needed():
@@ -115,7 +146,7 @@ def test_files_that_are_no_record(tmp_path, fields):
 
 
 def test_missing_fields_are_named_with_those_present(tmp_path, fields):
-    for name in ("u", "y", "sample_rate_hz", "samples_per_period"):
+    for name in ("u", "y", "sample_rate_hz"):
         left = {key: value for key, value in fields.items() if key != name}
         np.savez(tmp_path / "a.npz", **left)
         with pytest.raises(ValueError, match=name):

@@ -86,8 +86,8 @@ def test_damage_is_named_and_never_read_as_data(tmp_path):
     write_stored(path, expected)
     whole = path.read_bytes()
     rng = np.random.default_rng(1)
-    spoilt = [whole[:length] for length in rng.integers(0, len(whole), 100)]
-    for bit in rng.integers(0, 8 * len(whole), 1500):
+    spoilt = [whole[:length] for length in rng.integers(0, len(whole), 40)]
+    for bit in rng.integers(0, 8 * len(whole), 500):
         content = bytearray(whole)
         content[bit // 8] ^= 1 << (bit % 8)
         spoilt.append(bytes(content))

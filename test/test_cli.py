@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command itself: its version, and what it says before it compiles."""
+
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from tactile_resonance import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["--version"])
+    version = ElementTree.parse(ROOT / "package.xml").findtext("version")
+    assert capsys.readouterr().out == f"tactile_resonance {version}\n"
+
+
+def test_compiling_is_announced_once_and_before_it_begins():
+    """A cheap function in place of the kernels, compiled twice; what the cache holds is not announced."""
+    code = """
+import numba, sys
+from tactile_resonance.poles import tables
+
+def kernels():
+    add = numba.njit(lambda x: x + 1)
+    print("called", file=sys.stderr)
+    add(1), add(1.0)
+
+tables._call_kernels = kernels
+tables.compiled()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    called, *said = done.stderr.splitlines()
+    assert called == "called"
+    (line,) = said
+    assert line.startswith("compiling the pole fits, once per installation: about a minute")
+    assert line.endswith("tactile_resonance compile")
+
+
+def test_compile_says_that_nothing_is_missing(capsys):
+    """The tests before have compiled, or set-up has."""
+    assert cli.main(["compile"]) == 0
+    assert cli.main(["compile"]) == 0
+    assert capsys.readouterr().out.count("pole fits: ") == 2
+
+
+def test_files_and_folders_taken_for_each_other_are_named(tmp_path, capsys):
+    file = tmp_path / "file.yaml"
+    file.touch()
+    for arguments, message in (
+        (["report", file], f"path: {file} is a file; accepted is the folder of a scan's run"),
+        (["report", tmp_path], f"path: {tmp_path} is a folder without run.json"),
+        (["scan", "--scene", tmp_path], f"--scene: {tmp_path} is a folder; accepted is a scene"),
+        (["scan", "--scene", tmp_path / "no"], "no is not there; accepted is a scene file"),
+        (["demo", "--output", file], f"--output: {file} is a file; accepted is a new or empty"),
+        (["analyze", tmp_path, "--sample-rate", "1"], "(--sample-rate): only for a file"),
+        (["analyze", file], "file.yaml: no record, accepted are .npz, .mat and .csv"),
+    ):
+        assert cli.main([os.fspath(argument) for argument in arguments]) == 1
+        assert message in capsys.readouterr().err
