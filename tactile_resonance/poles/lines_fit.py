@@ -106,7 +106,7 @@ class LinesPlan:
 
     def fit(self, data: BinData) -> LinesFit:
         """Fit of all points of a batch."""
-        batch = data.y.shape[0]
+        batch = len(data.y_planes)
         if self.structure.order > LARGEST_BATCHED_ORDER:
             return self.rebased(data)._fit_dense(data)
         if self.structure.delay:

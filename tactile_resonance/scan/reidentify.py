@@ -40,7 +40,7 @@ from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import read_plan
 from tactile_resonance.scan.scene import SensorUse
 
-BYTES_AT_ONCE = 8_000_000
+BYTES_AT_ONCE = 16_000_000
 """Of the bins that a process takes together."""
 STATUS = "poles_status"
 # What one process is given beforehand, so that none waits for work.
