@@ -32,7 +32,7 @@ from tactile_resonance.poles.covariance import modes_in_band, pole_quantities
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.joint_noise import NoiseBands
-from tactile_resonance.poles.judgement import Judged, assemble
+from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.likelihood import invert
 from tactile_resonance.poles.model import RationalModel, Variable
@@ -45,8 +45,6 @@ ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-# Records whose arrays fit the cache.
-CHUNK = 250
 METHOD = "joint maximum likelihood of poles and transient"
 
 
@@ -161,11 +159,7 @@ class JointPlan:
     def _poles(self, u: ComplexArray, y: ComplexArray, method: str) -> PolesBatch:
         *shape, records, size = y.shape
         u, y = (values.reshape(-1, records, size) for values in (u, y))
-        chunk = max(1, CHUNK // records)
-        starts = range(0, max(len(y), 1), chunk)
-        judged = Judged.joined(
-            [fit_records(self, u[k : k + chunk], y[k : k + chunk]) for k in starts]
-        )
+        judged = fit_records(self, u, y)
         model = self.model_of(judged.theta)
         return assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
 

@@ -36,6 +36,8 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
+# Records that are fitted together: enough for what a call costs, few enough for the cache.
+CHUNK = 1000
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
 # How often the noise of one record is taken anew, and the change of its variance below which it is the same.
@@ -135,23 +137,64 @@ class _Round:
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
-    """Fit of a few points.
+    """Fits of points.
 
     Parameters
     ----------
     plan : JointPlan
     u, y : (batch, M, K) complex
         At its bins, of M records each.
+
+    Notes
+    -----
+    Of one record: one step from start values the residuals are all but noise, unless the input's noise is
+    far above the output's or the same in both. Where the noise then looks other than flat, or the model
+    wrong, its level is taken once more, from where the fit ended.
     """
+    judged = _in_chunks(plan, u, y)
+    doubtful = np.full(len(y), _returns(plan, y.shape[1]))
+    for _ in range(MOST_RETURNS):
+        doubtful &= (judged.suspect | (judged.kind != 0)) & _may_return(judged)
+        if not doubtful.any():
+            break
+        rows, before = np.flatnonzero(doubtful), judged.noise[:, 0]
+        again = _in_chunks(plan, u[rows], y[rows], judged.theta[rows, None])
+        judged = judged.replaced(rows, again)
+        doubtful &= np.abs(judged.noise[:, 0] - before) > SAME_LEVEL * before
+    return judged
+
+
+def _returns(plan: JointPlan, records: int) -> bool:
+    """Whether fits from start values are taken once more where they are in doubt."""
+    return records == 1 and plan.others_at.size > 0
+
+
+def _in_chunks(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
+) -> Judged:
+    """Fits of all points, some at a time, from coefficients (batch, M, n) near them or start values."""
+    size = max(1, CHUNK // y.shape[1])
+    parts = []
+    for k in range(0, max(len(y), 1), size):
+        here = slice(k, k + size)
+        parts.append(_fit(plan, u[here], y[here], None if start is None else start[here]))
+    return Judged.joined(parts)
+
+
+def _fit(plan: JointPlan, u: ComplexArray, y: ComplexArray, start: FloatArray | None) -> Judged:
+    """The fit of a few points."""
     usable = np.ones(len(y), bool)
     if not np.isfinite(u.sum() + y.sum()):  # finite as a whole only where every bin is
         usable = np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2)))
         u, y = (np.where(usable[:, None, None], v, 0) for v in (u, y))
     one = np.ones((len(y), 1, 1))
-    others = plan.others_at.size
+    others, records = plan.others_at.size, y.shape[1]
     rest = (None, None, one) if others else (None,)
     plain = BinData.of(y, u, others, one, *rest, order=plan.order)
-    return (_several if plain.records > 1 else _alone)(plan, plain, usable)
+    fitted = _from_noise(plan, plain, start)
+    if records > 1:
+        return _several(fitted, usable)
+    return _alone(fitted, usable, last=start is not None or not _returns(plan, records))
 
 
 def _from_noise(plan: JointPlan, plain: BinData, start: FloatArray | None = None) -> _Round:
@@ -179,29 +222,9 @@ def _may_return(fit: Judged | Solution) -> BoolArray:
     return np.asarray(fit.converged & finite)
 
 
-def _alone(plan: JointPlan, plain: BinData, usable: BoolArray) -> Judged:
-    """Points of one record each.
-
-    One step from start values the residuals are all but noise, unless the input's noise is far above
-    the output's or the same in both. Where the noise then looks other than flat, or the model wrong,
-    its level is taken once more, from where the fit ended.
-    """
-    returns = plain.undriven > 0
-    judged = _judged_alone(plan, _from_noise(plan, plain), usable, last=not returns)
-    doubtful = np.full(usable.size, returns)
-    for _ in range(MOST_RETURNS):
-        doubtful &= (judged.suspect | (judged.kind != 0)) & _may_return(judged)
-        if not doubtful.any():
-            break
-        rows, before = np.flatnonzero(doubtful), judged.noise[:, 0]
-        again = _from_noise(plan, plain.rows(rows), judged.theta[rows, None])
-        judged = judged.replaced(rows, _judged_alone(plan, again, usable[rows], last=True))
-        doubtful &= np.abs(judged.noise[:, 0] - before) > SAME_LEVEL * before
-    return judged
-
-
-def _judged_alone(plan: JointPlan, fitted: _Round, usable: BoolArray, last: bool) -> Judged:
-    """What a fit is worth; what it leaves out is compared with other fits where it is the `last` one."""
+def _alone(fitted: _Round, usable: BoolArray, last: bool) -> Judged:
+    """What a fit of one record is worth; compared with other fits where wrong, and the `last` one."""
+    plan = fitted.plan
     solution, data = fitted.solution, fitted.data
     batch, theta = usable.size, solution.theta[:, 0]
     inverse, condition = invert(solution.normal[:, 0].sum(axis=1))
@@ -218,8 +241,9 @@ def _judged_alone(plan: JointPlan, fitted: _Round, usable: BoolArray, last: bool
         lacking[rows] = lacking_terms(plan, part, theta[rows], inverse[rows], solution.cost[rows])
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
-        power = _mean_power(data)
-        suspect &= level.scale * data.variance_y.min(axis=(1, 2)) > ROUNDED * power
+        rows = np.flatnonzero(suspect)
+        of_noise = (level.scale * data.variance_y.min(axis=(1, 2)))[rows]
+        suspect[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
         lacking[~suspect] = np.nan
     wrong = suspect if last else suspect & ~_may_return(solution)  # others are fitted once more
     # real and imaginary part of a circular complex error have half its variance each
@@ -262,9 +286,8 @@ def _mean_power(data: BinData) -> FloatArray:
     return np.asarray(np.mean(y.real**2 + y.imag**2, axis=(1, 2)))
 
 
-def _several(plan: JointPlan, plain: BinData, usable: BoolArray) -> Judged:
-    """Points of M >= 2 realisations of the phases each: one system, transients of their own."""
-    first = _from_noise(plan, plain)
+def _several(first: _Round, usable: BoolArray) -> Judged:
+    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
     changed = _weighted_wrongly(first)
     rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
     parts = []

@@ -54,7 +54,7 @@ def falls_without_each(shared: ComplexArray, own: ComplexArray, error: ComplexAr
         rest = rest - of_own @ (of_own.T @ rest)
     of_shared = np.linalg.qr(rest.reshape(-1, n))[0].reshape(rest.shape)
     whole = np.concatenate([of_shared, np.broadcast_to(of_own, (records, *of_own.shape))], axis=-1)
-    q = whole.reshape(records, bins, 2, -1)
+    q = whole.reshape(records, bins, 2, whole.shape[-1])
     # (I - H) of each bin, 2 x 2: what of an error there the fit has left
     p, r = (1 - np.sum(q[..., k, :] ** 2, axis=-1) for k in (0, 1))
     b = -np.sum(q[..., 0, :] * q[..., 1, :], axis=-1)
@@ -67,7 +67,8 @@ def falls_without_each(shared: ComplexArray, own: ComplexArray, error: ComplexAr
 def _real_rows(values: ComplexArray) -> FloatArray:
     """(..., 2 K, n) real and imaginary parts of values (..., K, n), one after the other."""
     parts = np.stack([values.real, values.imag], axis=-2)
-    return parts.reshape(*values.shape[:-2], -1, values.shape[-1])
+    *shape, bins, n = values.shape
+    return parts.reshape(*shape, 2 * bins, n)
 
 
 def chances_of(

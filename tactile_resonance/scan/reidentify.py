@@ -22,9 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import read_dataclass, read_yaml, section
-from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
-from tactile_resonance.poles.realisations import PoleEstimator
 from tactile_resonance.poles.result import STATUSES, Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.rows_file import RowsWriter
