@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
     from tactile_resonance.poles.result import Poles
     from tactile_resonance.scan.plan import Plan
-    from tactile_resonance.scan.scene import ScanScene
     from tactile_resonance.simulation.tissue.hertz import Tissue
 
 
@@ -36,26 +35,24 @@ def run(options: argparse.Namespace) -> int:
     """Read the scene, compile it, print, draw."""
     # only here: the command answers --help without the libraries of scans
     from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.scan.plan import compile_scene
+    from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.plan_text import plan_rows
     from tactile_resonance.scan.scene import read_scan_scene
 
-    scene = read_scan_scene(options.scene)
-    plan = compile_scene(scene)
-    print(f"plan of {scene.name}")
-    for name, text in plan_rows(scene, plan):
+    plan = make_plan(read_scan_scene(options.scene))
+    print(f"plan of {plan.scene.name}")
+    for name, text in plan_rows(plan):
         print(f"{name:>12}  {text}")
-    for text in _expected(options.scene, scene, plan):
+    for text in _expected(options.scene, plan):
         print(f"{'expected':>12}  {text}")
     if options.figure is not None:
-        save_figure(_draw(scene, plan), options.figure)
+        save_figure(_draw(plan), options.figure)
         print(f"figure in {options.figure}")
     return 0
 
 
-def _expected(path: Path, scene: ScanScene, plan: Plan) -> list[str]:
+def _expected(path: Path, plan: Plan) -> list[str]:
     """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
-    from tactile_resonance.scan.plan import duration_s
     from tactile_resonance.simulation.tissue.library import read_tissues
     from tactile_resonance.simulation.tissue.scene import read_scene
 
@@ -69,7 +66,7 @@ def _expected(path: Path, scene: ScanScene, plan: Plan) -> list[str]:
         if tissue is None or tissue.name in tried:
             continue
         tried.add(tissue.name)
-        poles, count = _rehearsed(scene, plan, tissue)
+        poles, count = _rehearsed(plan, tissue)
         blocks.append(count)
         found = ", ".join(
             f"f0 {of.main.f0_hz:.2f} +- {of.main.std[0]:.2g} Hz, damping ratio "
@@ -81,11 +78,11 @@ def _expected(path: Path, scene: ScanScene, plan: Plan) -> list[str]:
         lines.append(f"on {tissue.name} (simulated) after {count} blocks: {found}")
     if blocks:
         mean = round(sum(blocks) / len(blocks))
-        lines.append(f"time {duration_s(plan.points, mean, plan.measurement):.0f} s")
+        lines.append(f"time {plan.duration_s(mean):.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
 
 
-def _rehearsed(scene: ScanScene, plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
+def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
     """Poles of one point measured block by block, and how many blocks that took."""
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
@@ -93,7 +90,7 @@ def _rehearsed(scene: ScanScene, plan: Plan, tissue: Tissue) -> tuple[Poles, int
     from tactile_resonance.scan.measurement import excitation_of
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
 
-    design, frf, blocks = plan.measurement, MeasurementFrf(0), 0
+    scene, design, frf, blocks = plan.scene, plan.measurement, MeasurementFrf(0), 0
     wanted = scene.precision if isinstance(scene.precision, Precise) else None
     excitation = excitation_of(design, seed=1)
     at_rest = SimulatedBench.from_configuration().start(tissue, force_n=scene.force_n, seed=1)
@@ -105,13 +102,13 @@ def _rehearsed(scene: ScanScene, plan: Plan, tissue: Tissue) -> tuple[Poles, int
     return poles, blocks
 
 
-def _draw(scene: ScanScene, plan: Plan) -> Figure:
+def _draw(plan: Plan) -> Figure:
     """Points in their order, seen from above, and the lines that are excited."""
     from tactile_resonance.report.drawing import new_figure
     from tactile_resonance.scan.measurement import excitation_of
 
     figure = new_figure(13, 5)
-    figure.suptitle(f"plan of {scene.name}")
+    figure.suptitle(f"plan of {plan.scene.name}")
     above, lines = figure.subplots(1, 2)
     x, y = zip(*(point.position_m[:2] for point in plan.points), strict=True)
     x_mm, y_mm = ([1e3 * value for value in values] for values in (x, y))

@@ -217,7 +217,6 @@ class ScanNode(ManagedNode):
             for cdr in recorded_results(run.content):  # of a run that is continued
                 self._publish(cdr)
             runner = ScanRunner(
-                started.scene,
                 plan,
                 run,
                 self._hands,

@@ -23,7 +23,6 @@ from tactile_resonance.scan.patterns import require_near
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
-from tactile_resonance.scan.surface import TouchRequest
 from tactile_resonance.strict_yaml import dump_yaml
 
 
@@ -91,17 +90,14 @@ class WantedScan:
 
     Attributes
     ----------
-    scene : ScanScene
-        With what the goal has in place of the file's.
+    plan : Plan
+        Of the scene, with what the goal has in place of the file's.
     text : str
-        The same as a scene file.
-    plan : Plan or None
-        None: the surface is to be found by touch.
+        That scene as a scene file.
     """
 
-    scene: ScanScene
+    plan: Plan
     text: str
-    plan: Plan | None
 
 
 def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
@@ -141,11 +137,8 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     text = dump_yaml(content)
     if goal.scene and not changes:
         text = path.read_text(encoding="utf-8")
-    if len(poses):
-        plan: Plan | None = plan_points(scene, _points(poses, scene.name))
-    else:
-        plan = None if isinstance(scene.surface, TouchRequest) else make_plan(scene)
-    return WantedScan(scene, text, plan)
+    plan = plan_points(scene, _points(poses, scene.name)) if len(poses) else make_plan(scene)
+    return WantedScan(plan, text)
 
 
 def resumed_run(goal: ScanGoal) -> Path:

@@ -25,16 +25,9 @@ def touches(scene: ScanScene, points: int) -> tuple[int, int]:
     return before, before + points
 
 
-def plan_rows(scene: ScanScene, plan: Plan) -> Rows:
-    """What a scan will excite, compute, publish and draw, with names for people.
-
-    Parameters
-    ----------
-    scene : ScanScene
-    plan : Plan
-        Of that scene.
-    """
-    design, count = plan.measurement, len(plan.points)
+def plan_rows(plan: Plan) -> Rows:
+    """What a scan will excite, compute, publish and draw, with names for people."""
+    scene, design, count = plan.scene, plan.measurement, len(plan.points)
     before, in_all = touches(scene, count)
     stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
     rows = [

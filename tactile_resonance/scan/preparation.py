@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from tactile_resonance.scan.clearance import TipUse
 from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.scan.normal_search import find_normals
-from tactile_resonance.scan.plan import Plan, clear_plan, make_plan, plan_with
+from tactile_resonance.scan.plan import Plan, make_plan
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import Plane, TouchRequest
 from tactile_resonance.scan.surface_search import find_surface
 
@@ -24,46 +23,37 @@ UNCHECKED = Skipped(
 )
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A plan to go by.
-
-    Attributes
-    ----------
-    plan : Plan
-    facts : dict
-        What the run keeps of surface and normals that were found.
-    """
-
-    plan: Plan
-    facts: dict[str, Any]
-
-
 def prepare(
-    scene: ScanScene,
-    plan: Plan | None,
+    plan: Plan,
     ball_radius_m: float,
     find: Callable[[ScanPoint, float, int], Touch],
     tip_use: Callable[[], TipUse | None] | None,
-) -> Prepared:
+) -> tuple[Plan, dict[str, Any]]:
     """Touch what the scene asks for, and leave out what is not clear, before and after normals are known.
 
     Parameters
     ----------
-    scene : ScanScene
-    plan : Plan or None
-        None: the surface is to be found by touch.
+    plan : Plan
+        As it was compiled: before anything was touched.
     ball_radius_m : float
     find : callable
         Touches a point with a force, one of so many.
     tip_use : callable or None
         How the sensor is used; it returns None where that is not to be had. None: nothing is moved.
 
+    Returns
+    -------
+    plan : Plan
+        To go by.
+    facts : dict
+        What the run keeps of surface and normals that were found.
+
     Raises
     ------
     ValueError
         Where a surface is not found, touches cannot be made, or no point is left.
     """
+    scene = plan.scene
     facts: dict[str, Any] = {}
     heading_rad, surface = scene.sensor.heading_rad, scene.surface
     if isinstance(surface, TouchRequest):
@@ -77,17 +67,16 @@ def prepare(
         facts["surface"] = found.as_json()
         surface = found.surface
         plan = make_plan(scene, surface)
-    assert plan is not None
     use: TipUse | None = None
     # of a plane contact control keeps the sensor clear itself
     if tip_use is not None and not isinstance(surface, Plane):
         use = tip_use()
         if use is None:
-            plan = replace(plan, skipped=(UNCHECKED, *plan.skipped))
-    plan = clear_plan(scene, plan, surface, use)
+            plan = replace(plan, left_out=(UNCHECKED, *plan.left_out))
+    plan = plan.clear_of(surface, use)
     asked = scene.normals
     if asked is None:
-        return Prepared(plan, facts)
+        return plan, facts
     force_n, count = asked.force_n or scene.force_n, len(plan.points)
     try:
         normals, left = find_normals(
@@ -100,5 +89,5 @@ def prepare(
     except (PointFailed, ScanEnded) as error:
         raise ValueError(f"normals: {error}") from error
     facts["normals"] = [normal.as_json() for normal in normals]
-    plan = plan_with(scene, plan, [normal.point for normal in normals], left)
-    return Prepared(clear_plan(scene, plan, surface, use), facts)
+    plan = plan.with_points([normal.point for normal in normals], left)
+    return plan.clear_of(surface, use), facts

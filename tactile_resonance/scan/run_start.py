@@ -25,7 +25,6 @@ from tactile_resonance.scan.goal import (
     resumed_run,
 )
 from tactile_resonance.scan.hands import Check, Hands, Touch
-from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.preparation import prepare
 from tactile_resonance.scan.progress import Phase, Progress
@@ -50,7 +49,6 @@ class NewRun:
 class StartedRun:
     """A run that is open, with all that a `ScanRunner` needs of it."""
 
-    scene: ScanScene
     plan: Plan
     run: RunDirectory
     seed: int
@@ -74,9 +72,9 @@ def new_run(goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool) -
         If it is wrong, or the run cannot begin in its folder.
     """
     wanted = read_goal(goal, frames)
-    _require_force(wanted.scene, forces)
+    _require_force(wanted.plan.scene, forces)
     path = Path(goal.run_directory) if goal.run_directory else files.unused()
-    needed = expected_bytes(len(wanted.scene.positions_m), design_measurement(wanted.scene))
+    needed = expected_bytes(len(wanted.plan.points), wanted.plan.measurement)
     RunDirectory.check_new(path, needed)
     return NewRun(wanted, path, needed)
 
@@ -115,7 +113,7 @@ def start_run(
     if goal.resume:
         return _resumed(resumed_run(goal), frames, hands)
     new = new_run(goal, frames, files, forces=hands.free_air)
-    scene = _placed(new.wanted.scene, frames, hands)
+    scene = _placed(new.wanted.plan.scene, frames, hands)
     radius_m = sensor_named(scene.sensor.name).tip.radius_m
 
     def find(point: ScanPoint, force_n: float, count: int) -> Touch:
@@ -123,10 +121,10 @@ def start_run(
         return hands.find(point, force_n, radius_m, check)
 
     use = None if tip_use is None else lambda: tip_use(scene.sensor.name)
-    made = prepare(scene, new.wanted.plan, radius_m, find, use)
+    plan, found = prepare(new.wanted.plan, radius_m, find, use)
     seed = goal.seed or seed
     facts = run_facts(
-        made.plan,
+        plan,
         seed,
         {
             "name": scene.name,
@@ -137,11 +135,11 @@ def start_run(
                 "base_frame": frames.base,
             },
             "frames": {name: pose.vector.tolist() for name, pose in frames.others.items()},
-            **made.facts,
+            **found,
         },
     )
-    run = RunDirectory.create(new.path, new.wanted.text, made.plan.points, facts, new.needed_bytes)
-    return StartedRun(scene, made.plan, run, seed)
+    run = RunDirectory.create(new.path, new.wanted.text, plan.points, facts, new.needed_bytes)
+    return StartedRun(plan, run, seed)
 
 
 def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
@@ -156,7 +154,7 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
         scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
-        return StartedRun(scene, plan_points(scene, run.content.points), run, int(facts["seed"]))
+        return StartedRun(plan_points(scene, run.content.points), run, int(facts["seed"]))
     except BaseException:
         run.close()
         raise

@@ -40,7 +40,7 @@ from tactile_resonance.scan.references import (
 )
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
-from tactile_resonance.scan.scene import OnFailure, Output, ScanScene
+from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 
 POLL_S = 0.05
@@ -58,7 +58,6 @@ class ScanRunner:
 
     Parameters
     ----------
-    scene : ScanScene
     plan : Plan
     run : RunDirectory
     hands : Hands
@@ -74,7 +73,6 @@ class ScanRunner:
 
     def __init__(
         self,
-        scene: ScanScene,
         plan: Plan,
         run: RunDirectory,
         hands: Hands,
@@ -83,7 +81,7 @@ class ScanRunner:
         seed: int = 1,
         publish: Callable[[bytes], None] = lambda cdr: None,
     ) -> None:
-        self._scene, self._plan, self._run = scene, plan, run
+        self._scene, self._plan, self._run = plan.scene, plan, run
         self._hands, self._controls, self._tell = hands, controls, tell
         self._publish = publish
         self._seed = seed

@@ -41,7 +41,9 @@ class Bench:
     seeds: list = field(default_factory=list)
     silent: list = field(default_factory=list)
     force_n: float = 0.01
-    rms_n: object = None  # of the force over the blocks so far, from the number of the measurement and of these
+    rms_n: object = (
+        None  # of the force over the blocks so far, from the number of the measurement and of these
+    )
     measurements: int = 0
     beside: Poles | None = None  # another mode, of lower frequency, reported before the main one
 
@@ -142,5 +144,5 @@ def scan(path, made, bench, controls=None):
     plan, run = begin(path, made)
     told = []
     with run:
-        summary = ScanRunner(made, plan, run, bench, controls or Controls(), told.append).run()
+        summary = ScanRunner(plan, run, bench, controls or Controls(), told.append).run()
     return summary, read_run(path), told

@@ -11,7 +11,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.clearance import TipUse, clear_points, lowest_at_depth, lowest_between
-from tactile_resonance.scan.plan import clear_plan, make_plan
+from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import ScanScene, SensorUse
 from tactile_resonance.scan.surface import HeightField, Plane
 from tactile_resonance.scan.touch import fit_surface
@@ -37,7 +37,7 @@ def planned(surface, xy, use=None, heading_rad=0.0):
     sensor = SensorUse(heading_rad=heading_rad)
     scene = ScanScene("test", 0.01, positions, surface=surface, sensor=sensor)
     plan = make_plan(scene)
-    return plan if use is None else clear_plan(scene, plan, surface, use)
+    return plan if use is None else plan.clear_of(surface, use)
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.4, -0.3)])
@@ -87,7 +87,9 @@ def test_bump_between_two_points_is_crossed_at_the_standoff_or_not_at_all(height
     bump = field(lambda x, y: height_m * np.exp(-(((y - 0.02) / 8e-3) ** 2)) + 0 * x)
     first, then = planned(bump, [[0.0, 0.0], [0.0, 0.04]]).points
     low = lowest_between(first, then, bump, USE)
-    assert low == pytest.approx(3e-3 - height_m, abs=0.02e-3)  # the ball's lowest point on top of it
+    assert low == pytest.approx(
+        3e-3 - height_m, abs=0.02e-3
+    )  # the ball's lowest point on top of it
     kept, left = clear_points((first, then), bump, USE)
     assert len(kept) == (2 if clear else 1)
     if not clear:

@@ -214,9 +214,7 @@ def observed(tmp_path, content):
     except ValueError as error:
         return str(error)
     with started.run:
-        summary = ScanRunner(
-            started.scene, started.plan, started.run, bench, Controls(), lambda _: None
-        ).run()
+        summary = ScanRunner(started.plan, started.run, bench, Controls(), lambda _: None).run()
     run = read_run(tmp_path / "run")
     results = [asdict(result) for result in run.latest]
     for result in results:
@@ -228,7 +226,7 @@ def observed(tmp_path, content):
         "log": bench.log,
         "frame": bench.frame_in_base.vector.tolist(),
         "results": results,
-        "drift": judge_drift(AirReference(*air), moved, started.scene.drift_limits),
+        "drift": judge_drift(AirReference(*air), moved, started.plan.scene.drift_limits),
         "maps": len(pole_maps_of(run)),
         "summary": summary.message,
         "found": {

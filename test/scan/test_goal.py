@@ -53,7 +53,7 @@ def test_poses_need_no_scene_and_give_points_at_exactly_these_places(tmp_path):
     wanted = read_goal(GOAL, FRAMES)
     assert tuple((*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points) == POSES
     assert wanted.plan.points[1].normal == pytest.approx(TILTED.apply([0, 0, 1]).tolist())
-    for scene in (wanted.scene, again(wanted, tmp_path)):
+    for scene in (wanted.plan.scene, again(wanted, tmp_path)):
         assert (scene.force_n, scene.frame_id) == (0.012, "table")
 
 
@@ -80,14 +80,14 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
         notes="{tip_wetness: wet}",
     )
     wanted = read_goal(goal, FRAMES)
-    for read in (wanted.scene, again(wanted, tmp_path)):
+    for read in (wanted.plan.scene, again(wanted, tmp_path)):
         assert read.force_n == 0.02
         assert read.precision == Precise(None, 1e-4)
         assert read.notes.tip_wetness == "wet"
         assert read.positions_m.tolist() == [list(pose[:3]) for pose in POSES]
     assert "gelatine_percent" in wanted.text  # the bench reads it too
     unset = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
-    assert (unset.scene.force_n, unset.scene.precision) == (0.01, Precise(0.05))
+    assert (unset.plan.scene.force_n, unset.plan.scene.precision) == (0.01, Precise(0.05))
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,10 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
         ({"damping_ratio_std": math.inf}, "damping_ratio_std: got inf"),
         ({"notes": "{tip_wetness: damp}"}, "notes.tip_wetness: got 'damp'"),
         ({"poses": ((0, math.nan, 0, 0, 0, 0, 1),)}, r"poses\[0\]: y: got nan"),
-        ({"poses": (POSES[0], (0, 1e200, 0, 0, 0, 0, 1))}, r"poses\[1\]: got \[0.0, 1e\+200, 0.0\]"),
+        (
+            {"poses": (POSES[0], (0, 1e200, 0, 0, 0, 0, 1))},
+            r"poses\[1\]: got \[0.0, 1e\+200, 0.0\]",
+        ),
         ({"poses": (POSES[0], (0,) * 7)}, r"poses\[1\].orientation: got \(0, 0, 0, 0\)"),
     ],
 )
@@ -141,7 +144,7 @@ def test_poses_in_a_third_frame_are_the_same_points_wherever_the_frame_stands(sc
     for named, stands in (("", TABLE_IN_BASE), (scene, phantom)):
         goal = ScanGoal(scene=named, poses=seen, frame_id="camera", force_n=0.012)
         wanted = read_goal(goal, frames)
-        assert wanted.scene.frame_id == ("phantom" if named else "table")
+        assert wanted.plan.scene.frame_id == ("phantom" if named else "table")
         points = [(*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points]
         for found, pose in zip(in_base(stands, points), places, strict=True):
             assert found[:3] == pytest.approx(pose[:3], abs=1e-12)
@@ -167,7 +170,7 @@ def test_the_frame_of_a_scene_must_be_known(scene, tmp_path):
         read_goal(ScanGoal(scene=scene), alone)
     # `table` in a scene is the table, whatever it is called here; in a goal frames are those of tf2
     (tmp_path / "slope.yaml").write_text(SCENE.replace("phantom", "table"))
-    assert read_goal(ScanGoal(scene=scene), alone).scene.frame_id == "left/table"
+    assert read_goal(ScanGoal(scene=scene), alone).plan.scene.frame_id == "left/table"
     with pytest.raises(ValueError, match="poses.header.frame_id: got 'table'; accepted is 'left"):
         read_goal(GOAL, alone)
 

@@ -17,7 +17,7 @@ from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.normal_search import find_normals, normal_of_touches, places_around
-from tactile_resonance.scan.plan import make_plan, plan_with, tip_orientation
+from tactile_resonance.scan.plan import make_plan, tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
@@ -205,7 +205,7 @@ def test_plan_goes_on_with_the_points_whose_normals_were_found():
         return touching(on_plane(np.zeros(3), [0.2, 0.0, 1.0]))(point)
 
     found, left = find_normals(plan.points, THREE, RADIUS_M, 0.0, touch)
-    after = plan_with(scene, plan, [normal.point for normal in found], left)
+    after = plan.with_points([normal.point for normal in found], left)
     (point,) = after.points
     beside = RADIUS_M * np.sin(np.arctan(0.2))  # where a ball straight above the place touches
     assert (point.index, point.label) == (0, "dome, point 1")
@@ -216,7 +216,7 @@ def test_plan_goes_on_with_the_points_whose_normals_were_found():
     assert after.skipped[0].why == "normals: adhesion"
     assert after.longest_s < plan.longest_s
     with pytest.raises(ValueError, match="all 1 are left out; the first: normals: adhesion"):
-        plan_with(scene, plan, [], left)
+        plan.with_points([], left)
 
 
 def test_scene_asks_for_it():

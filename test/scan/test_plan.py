@@ -14,7 +14,7 @@ from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.patterns import grid, inside_polygon, read_positions, spiral
-from tactile_resonance.scan.plan import Timing, duration_s, make_plan, tip_orientation
+from tactile_resonance.scan.plan import CONTACT_S, TRAVEL_M_S, make_plan, tip_orientation
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
@@ -130,20 +130,19 @@ def test_points_beside_or_too_steep_are_skipped_and_say_what_that_saves():
     assert len(plan.points) == 2
     left = {s.why: s for s in plan.skipped if "points" in s.what}
     assert set(left) == {"beside the surface", "steeper than 60 degrees"}
-    one_s = duration_s(plan.points[:1], asked.blocks.most, plan.measurement, Timing())
+    one_s = replace(plan, points=plan.points[:1]).longest_s
     assert left["beside the surface"].saved_s == pytest.approx(one_s)
     with pytest.raises(ValueError, match="1 beside the surface and 0 too steep"):
         make_plan(scene([[1.0, 0]], surface=surface))
-    with pytest.raises(ValueError, match="found by touch"):
-        make_plan(scene([[0, 0]], surface=TouchRequest(((0, 0), (1, 0), (0, 1)))))
+    # a surface that is still to be found is expected level
+    found = TouchRequest(((0, 0), (1, 0), (0, 1)), expected_height_m=0.02)
+    assert make_plan(scene([[0, 0]], surface=found)).points[0].position_m == (0.0, 0.0, 0.02)
 
 
 def test_time_adds_up():
     plan = make_plan(scene([[0, 0], [0.05, 0]]))
-    timing = Timing(travel_m_s=0.1, approach_s=1, settle_s=2, retract_s=3)
-    assert duration_s(plan.points, 5, plan.measurement, timing) == pytest.approx(
-        0.5 + 2 * (6 + 5 * 0.4)
-    )
+    assert plan.duration_s(5) == pytest.approx(0.05 / TRAVEL_M_S + 2 * (CONTACT_S + 5 * 0.4))
+    assert (plan.shortest_s, plan.longest_s) == (plan.duration_s(3), plan.duration_s(8))
     assert plan.shortest_s < plan.longest_s
 
 

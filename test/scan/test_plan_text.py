@@ -12,7 +12,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide_bands
-from tactile_resonance.scan.plan import compile_scene
+from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
@@ -22,7 +22,7 @@ from bench_hands import SPREAD_HZ, Bench, scan, scene
 
 
 def told(asked):
-    rows = plan_rows(asked, compile_scene(asked))
+    rows = plan_rows(make_plan(asked))
     return {name: [text for other, text in rows if other == name] for name, _ in rows}
 
 

@@ -47,11 +47,11 @@ def use():
 
 def test_points_that_are_not_clear_are_not_even_touched():
     scene, touched = scene_of(BANK, normals=NormalRequest(force_n=5e-3)), []
-    made = prepare(scene, make_plan(scene), RADIUS_M, finding(touched=touched), use)
-    assert [point.position_m[0] for point in made.plan.points] == pytest.approx([0.05, 0.06])
+    plan, facts = prepare(make_plan(scene), RADIUS_M, finding(touched=touched), use)
+    assert [point.position_m[0] for point in plan.points] == pytest.approx([0.05, 0.06])
     assert touched == [(n, 5e-3, 2) for n in (0, 0, 0, 1, 1, 1)]
-    assert len(made.facts["normals"]) == 2
-    assert made.plan.skipped[0].what == "the point at x = 0.00, y = 0.00 mm"
+    assert len(facts["normals"]) == 2
+    assert plan.skipped[0].what == "the point at x = 0.00, y = 0.00 mm"
 
 
 def test_normals_that_are_found_are_looked_at_again():
@@ -59,31 +59,31 @@ def test_normals_that_are_found_are_looked_at_again():
     level = HeightField(AXIS, AXIS, np.zeros((AXIS.size,) * 2))
     scene = scene_of(level, xy=((0.0, 0.0),), normals=NormalRequest())
     with pytest.raises(ValueError, match="all 1 are left out; the first: at the depth limit"):
-        prepare(scene, make_plan(scene), RADIUS_M, finding((0.17, 0.0)), use)
-    made = prepare(scene, make_plan(scene), RADIUS_M, finding((-0.17, 0.0)), use)
-    assert len(made.plan.points) == 1
-    np.testing.assert_allclose(made.plan.points[0].normal[0], 0.17 / np.hypot(1, 0.17))
+        prepare(make_plan(scene), RADIUS_M, finding((0.17, 0.0)), use)
+    plan, _ = prepare(make_plan(scene), RADIUS_M, finding((-0.17, 0.0)), use)
+    assert len(plan.points) == 1
+    np.testing.assert_allclose(plan.points[0].normal[0], 0.17 / np.hypot(1, 0.17))
 
 
 def test_surface_is_found_first_and_points_are_on_it():
     corners = ((-0.02, -0.02), (0.08, -0.02), (0.08, 0.02), (-0.02, 0.02))
     touched = []
     scene = scene_of(TouchRequest(corners, "plane"), normals=NormalRequest(touches=4))
-    made = prepare(scene, None, RADIUS_M, finding((0.1, 0.05), touched, bad=[1]), use)
+    plan, facts = prepare(make_plan(scene), RADIUS_M, finding((0.1, 0.05), touched, bad=[1]), use)
     assert len(touched) == 4 + 4 + 1 + 4  # the second point is given up at its first touch
-    assert [round(point.position_m[0], 6) for point in made.plan.points] == [0.0, 0.06]
-    assert len(made.facts["surface"]["touches"]) == 4
-    assert made.plan.skipped[0].why == "normals: adhesion"
+    assert [round(point.position_m[0], 6) for point in plan.points] == [0.0, 0.06]
+    assert len(facts["surface"]["touches"]) == 4
+    assert plan.skipped[0].why == "normals: adhesion"
 
 
 @pytest.mark.parametrize("surface", [Plane(), BANK])
 def test_what_is_not_looked_at_is_noted(surface):
     scene = scene_of(surface)
     plan = make_plan(scene)
-    assert prepare(scene, plan, RADIUS_M, finding(), None).plan == plan  # nothing is moved
-    made = prepare(scene, plan, RADIUS_M, finding(), lambda: None)
-    assert (UNCHECKED in made.plan.skipped) is (surface is BANK)
-    assert made.plan.points == plan.points
+    assert prepare(plan, RADIUS_M, finding(), None)[0] == plan  # nothing is moved
+    noted, _ = prepare(plan, RADIUS_M, finding(), lambda: None)
+    assert (UNCHECKED in noted.skipped) is (surface is BANK)
+    assert noted.points == plan.points
 
 
 def test_touches_that_cannot_be_made_refuse_the_scan():
@@ -92,7 +92,7 @@ def test_touches_that_cannot_be_made_refuse_the_scan():
 
     scene = scene_of(Plane(), normals=NormalRequest())
     with pytest.raises(ValueError, match="normals: the tip is not moved"):
-        prepare(scene, make_plan(scene), RADIUS_M, find, use)
+        prepare(make_plan(scene), RADIUS_M, find, use)
     scene = scene_of(TouchRequest(((0, 0), (1, 0), (0, 1)), "plane"))
     with pytest.raises(ValueError, match=r"surface\.touch: the tip is not moved"):
-        prepare(scene, None, RADIUS_M, find, use)
+        prepare(make_plan(scene), RADIUS_M, find, use)

@@ -74,7 +74,7 @@ def test_a_silent_record_is_taken_before_all_else_where_the_scene_asks_for_it(tm
     ]
     # it is taken once
     with RunDirectory.open(tmp_path / "run") as again:
-        ScanRunner(made, make_plan(made), again, bench, Controls(), print).run()
+        ScanRunner(make_plan(made), again, bench, Controls(), print).run()
     assert len([entry for entry in bench.log if entry[1] == "silent"]) == 1
 
 
@@ -229,15 +229,14 @@ def test_skip_repeat_and_cancel(tmp_path):
     made = scene(5)
     with RunDirectory.open(tmp_path / "run") as again:
         bench = Bench()
-        summary = ScanRunner(
-            made, make_plan(made), again, bench, Controls(), lambda progress: None
-        ).run()
+        summary = ScanRunner(make_plan(made), again, bench, Controls(), lambda progress: None).run()
     assert summary.complete
     assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [3, 4]
 
 
 @pytest.mark.parametrize(
-    ("request_", "first"), [(Request.SKIP, PointOutcome.SKIPPED), (Request.REPEAT, PointOutcome.DONE)]
+    ("request_", "first"),
+    [(Request.SKIP, PointOutcome.SKIPPED), (Request.REPEAT, PointOutcome.DONE)],
 )
 def test_what_is_asked_of_a_point_during_the_reference_does_not_end_the_scan(
     tmp_path, request_, first
@@ -263,10 +262,10 @@ def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     made = scene(2)
     plan, run = begin(tmp_path / "run", made)
     with run:
-        ScanRunner(made, plan, run, Bench(), controls, lambda progress: None).run()
+        ScanRunner(plan, run, Bench(), controls, lambda progress: None).run()
         controls.ask(Request.REPEAT)
         again = Bench()
-        ScanRunner(made, plan, run, again, controls, lambda progress: None).run()
+        ScanRunner(plan, run, again, controls, lambda progress: None).run()
     assert again.seeds == [(1, 1, 1)]  # it has noise of its own
     content = read_run(tmp_path / "run")
     assert [(r.index, r.attempt) for r in content.results] == [(0, 0), (1, 0), (1, 1)]
@@ -280,7 +279,7 @@ def test_a_paused_scan_waits_with_the_tip_free(tmp_path):
     plan, run = begin(tmp_path / "run", made)
     phases = []
     with run:
-        scanning = ScanRunner(made, plan, run, bench, controls, lambda p: phases.append(p.phase))
+        scanning = ScanRunner(plan, run, bench, controls, lambda p: phases.append(p.phase))
         thread = threading.Thread(target=scanning.run)
         thread.start()
         while "paused" not in phases:
@@ -306,7 +305,7 @@ SCANS = """
         run = RunDirectory.open(path) if path.exists() else t.begin(path, made)[1]
         bench = t.Bench(on_measure=lambda bench, blocks: time.sleep(3e-3))
         with run:
-            ScanRunner(made, make_plan(made), run, bench, Controls(), lambda progress: None).run()
+            ScanRunner(make_plan(made), run, bench, Controls(), lambda progress: None).run()
     for line in sys.stdin:  # a scan in a process of its own for each, which is killed so much later
         process = os.fork()
         if process == 0:

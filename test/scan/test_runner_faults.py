@@ -111,7 +111,7 @@ def test_every_attempt_is_told_with_what_became_of_it(tmp_path):
             cdrs.append(cdr)
             on_disk.append(len(run.content.files))
 
-        runner.ScanRunner(made, plan, run, bench, controls, lambda _: None, 1, publish).run()
+        runner.ScanRunner(plan, run, bench, controls, lambda _: None, 1, publish).run()
     told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in cdrs]
     assert [(r.kind, r.index, r.attempt, r.outcome, r.measurement_id) for r in told] == [
         (PointKind.AIR, 5, 0, PointOutcome.DONE, 1006),
@@ -129,7 +129,9 @@ def test_every_attempt_is_told_with_what_became_of_it(tmp_path):
     assert np.isfinite([r.f0_hz for r in told]).tolist() == [True, True, False, True, *[False] * 3]
     # what counts is on disk before it is told, and told again of a run that is gone on with
     assert on_disk == [1, 2, 2, 3, 4, 5, 5]
-    kept = [cdr for cdr, r in zip(cdrs, told, strict=True) if r.outcome is not PointOutcome.DISCARDED]
+    kept = [
+        cdr for cdr, r in zip(cdrs, told, strict=True) if r.outcome is not PointOutcome.DISCARDED
+    ]
     assert list(recorded_results(run.content)) == kept
 
 
@@ -145,9 +147,7 @@ def test_a_reference_that_fails_is_told_and_so_is_one_that_ends_the_scan(tmp_pat
     plan, run = begin(tmp_path / "run", made)
     told = []
     with run:
-        runner.ScanRunner(
-            made, plan, run, Failing(), Controls(), lambda _: None, 1, told.append
-        ).run()
+        runner.ScanRunner(plan, run, Failing(), Controls(), lambda _: None, 1, told.append).run()
     told = [from_message(message_types().deserialize_cdr(cdr, TYPE)) for cdr in told]
     assert [(r.kind, r.index, r.outcome, r.reason, r.measurement_id) for r in told] == [
         (PointKind.AIR, 1, PointOutcome.DISCARDED, "frf: lost", 7),
