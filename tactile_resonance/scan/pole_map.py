@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -131,14 +132,16 @@ class PoleMap:
 
     def without(self, result: PointResult) -> PoleMap:
         """The same with nothing at the place of a result."""
-        place_m, frame = result.position_m, result.frame_id
-        kept = (
-            p
-            for p in self.points
-            if p.result.frame_id != frame
-            or np.linalg.norm(p.result.position_m - place_m) > SAME_PLACE_M
-        )
-        return replace(self, points=tuple(kept))
+
+        def elsewhere(other: PointResult) -> bool:
+            if other.frame_id != result.frame_id:
+                return True
+            apart_m = math.hypot(
+                other.x_m - result.x_m, other.y_m - result.y_m, other.z_m - result.z_m
+            )
+            return apart_m > SAME_PLACE_M
+
+        return replace(self, points=tuple(p for p in self.points if elsewhere(p.result)))
 
     @cached_property
     def estimated(self) -> tuple[MapPoint, ...]:
