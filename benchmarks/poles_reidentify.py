@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.rows_file import Rows, RowsWriter
-from tactile_resonance.scan.kept_bins import NAME, Kind, finish, kept_bins
+from tactile_resonance.scan.kept_bins import NAME, BinsKind, finish, kept_bins
 from tactile_resonance.scan.reidentify import reidentify
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -70,7 +70,7 @@ def _stored(run: Path, points: int) -> int:
     RunDirectory.create(run, "name: million\n", [place], {}).close()
     bins = PLANT.bins()
     lines = HARMONICS[np.isin(HARMONICS * PLANT.periods, bins)]
-    kind = Kind(
+    kind = BinsKind(
         *(int(bins[0]), 1, bins.size, tuple(lines.tolist())),
         *(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, PLANT.periods),
     )

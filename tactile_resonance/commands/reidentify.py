@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"output: {output}, expected a file in a folder that can be written")
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
     begun_s = time.monotonic()
-    with _Bar() as bar:
+    with _Progress() as bar:
         counts, left_out = reidentify(options.runs, csv, npz, band_hz, structure, bar.show)
     print(f"{counts.total()} points in {time.monotonic() - begun_s:.1f} s: {csv}, {npz}")
     for status, count in counts.most_common():
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-class _Bar:
+class _Progress:
     """How far it is: a bar on a terminal, a line every tenth elsewhere."""
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class _Bar:
         self._bar = tqdm(unit="point", unit_scale=True, file=sys.stderr, leave=False, disable=None)
         self._told = ("", 0)
 
-    def __enter__(self) -> _Bar:
+    def __enter__(self) -> _Progress:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -38,7 +38,7 @@ _PLACES = [("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")] + [
 
 
 @dataclass(frozen=True)
-class Kind:
+class BinsKind:
     """What the records of some points have in common; see `BandBins`."""
 
     first_bin: int
@@ -50,7 +50,7 @@ class Kind:
     periods: int
 
     @classmethod
-    def of(cls, bins: BandBins) -> Kind:
+    def of(cls, bins: BandBins) -> BinsKind:
         """Of the bins of a point."""
         realisations, count = bins.u.shape
         return cls(
@@ -90,14 +90,14 @@ class KeptBins:
     ----------
     run : Path
     band_hz : (low, high)
-    kinds : tuple of (Kind, Rows)
+    kinds : tuple of (BinsKind, Rows)
     left_out : tuple of str
         Points without bins, and why.
     """
 
     run: Path
     band_hz: tuple[float, float]
-    kinds: tuple[tuple[Kind, Rows], ...]
+    kinds: tuple[tuple[BinsKind, Rows], ...]
     left_out: tuple[str, ...]
 
     @property
@@ -124,7 +124,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         if content["format"] != FORMAT or content["files"] != _files(run):
             return None
         kinds = [
-            Kind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
+            BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
         ]
         rows = [Rows.of(path, f"points_{k}") for k in range(len(kinds))]
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):  # damaged: it is made again
@@ -136,7 +136,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
 
 def bins_of_point(
     run: Path, result: PointResult, band_hz: tuple[float, float]
-) -> tuple[Kind, npt.NDArray] | str:
+) -> tuple[BinsKind, npt.NDArray] | str:
     """Kind and row (1,) of a point of a run, from its records; why there is none as text."""
     name = f"point {result.index}"
     if not result.measurement_id:
@@ -157,7 +157,7 @@ def bins_of_point(
         return f"{name}: {error}"
     if bins is None:
         return f"{name}: no excited line in {band_hz[0]:g}-{band_hz[1]:g} Hz"
-    kind = Kind.of(bins)
+    kind = BinsKind.of(bins)
     row = np.zeros(1, kind.dtype)
     for field in PLACE:
         row[field] = getattr(result, field)
@@ -187,7 +187,7 @@ def keep_bins(
         If the folder cannot be written.
     """
     files, content = _files(run), read_run(run)
-    kinds: dict[Kind, str] = {}
+    kinds: dict[BinsKind, str] = {}
     left_out = list(content.problems)
     with RowsWriter(run / NAME) as writer:
         for found in of_points(run, list(content.latest), band_hz):
@@ -204,7 +204,7 @@ def keep_bins(
 
 def finish(
     writer: RowsWriter,
-    kinds: list[Kind],
+    kinds: list[BinsKind],
     band_hz: tuple[float, float],
     files: dict[str, int],
     left_out: list[str],

@@ -29,8 +29,8 @@ from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.rows_file import RowsWriter
 from tactile_resonance.scan.kept_bins import (
     PLACE,
+    BinsKind,
     KeptBins,
-    Kind,
     bins_of_point,
     keep_bins,
     kept_bins,
@@ -182,7 +182,7 @@ def _keep(
     return keep_bins(run, band_hz, of_points)
 
 
-def _bins_of_point(job: tuple) -> tuple[Kind, npt.NDArray] | str:
+def _bins_of_point(job: tuple) -> tuple[BinsKind, npt.NDArray] | str:
     return bins_of_point(*job)
 
 
@@ -197,7 +197,7 @@ def _jobs(
 
 
 @lru_cache(maxsize=32)
-def _plan(kind: Kind, band_hz: tuple[float, float], structure: ModelStructure) -> JointPlan:
+def _plan(kind: BinsKind, band_hz: tuple[float, float], structure: ModelStructure) -> JointPlan:
     return (JointPlan if kind.realisations == 1 else PoleEstimator)(
         kind.sample_rate_hz,
         kind.samples_per_period,
@@ -230,7 +230,7 @@ def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     return rows, _as_csv(rows, name_of_run)
 
 
-def _unsure(batch: PolesBatch, kind: Kind) -> npt.NDArray[np.bool_]:
+def _unsure(batch: PolesBatch, kind: BinsKind) -> npt.NDArray[np.bool_]:
     """(n,) points whose fit shows that something is not as the model says."""
     sure = np.isin(batch.status_code, [STATUSES.index(status) for status in _SURE])
     if kind.realisations == 1:  # others have distortion, which no line has as much of as the next
