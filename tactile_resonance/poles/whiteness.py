@@ -65,8 +65,9 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
     -----
     The mean power of the first J coefficients over that of the others is F-distributed, with 2 J and
     2 (F - J) degrees of freedom, whatever the level of the noise. What the fit took out of the first
-    ones makes the test conservative. F to normal by Paulson's cube roots, see
-    `noise_level.f_quantile`.
+    ones makes the test conservative. F to normal by cube roots: Paulson, *An
+    approximate normalization of the analysis of variance distribution*, Ann. Math. Stat. 13 (1942)
+    233-235.
     """
     score, levels = _best_level(residual, parameters)
     with np.errstate(divide="ignore", invalid="ignore"):
