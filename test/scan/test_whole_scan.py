@@ -159,7 +159,7 @@ def test_report_of_a_run_with_failures_and_gaps(tmp_path, capsys):
 
 def test_report_of_no_run_says_so(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 1
-    assert "cannot be read as a run" in capsys.readouterr().err
+    assert "is a folder without run.json" in capsys.readouterr().err
 
 
 def test_table_and_recording_hold_the_same_bits(run_folder):
