@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
@@ -15,7 +13,7 @@ from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_sp
 from tactile_resonance.poles.judgement import Judged, assemble
 from tactile_resonance.poles.line_tones import poles_without_tones
 from tactile_resonance.poles.line_weights import lines_of_frf, lines_of_spectra
-from tactile_resonance.poles.lines_fit import LinesFit, LinesPlan
+from tactile_resonance.poles.lines_fit import LinesPlan
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
 from tactile_resonance.poles.noise_level import KINDS, VarianceModel
 from tactile_resonance.poles.result import (
@@ -246,7 +244,7 @@ def _identify(
     unknown = np.full_like(covariance, np.nan)
     total = covariance if total_known else unknown
     if noise is not None:
-        covariance = _propagated(plan, fit, data, noise)
+        covariance = plan.propagated(fit, data, noise)
     cost, expected = fit.cost, known.expected_cost(parameters)
     suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
     suspect |= are_smooth(fit.residual, parameters)
@@ -314,14 +312,3 @@ def _nothing(plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Judged:
 def _where(rows: npt.NDArray[np.bool_], those: FloatArray, others: FloatArray) -> FloatArray:
     """(batch, n, n) matrices of some points, and of the others."""
     return np.where(rows[:, None, None], those, others)
-
-
-def _propagated(plan: LinesPlan, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
-    """Covariance (batch, n, n) from a variance (batch, F) other than the one weighted with."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        finite, weighted = np.isfinite(data.variance_y), data.variance_y**2 / noise[:, None]
-        changed = replace(data, variance_y=np.where(finite, weighted, np.inf))
-    inner = plan.weighted_normal(changed, fit.theta)
-    n = inner.shape[-1]
-    inverse = 2 * fit.covariance[:, :n, :n]
-    return 0.5 * inverse @ inner @ inverse

@@ -59,6 +59,8 @@ class LinesFit:
     converged : (batch,) bool
     residual : (batch, F) complex
         Weighted residuals; 0 on lines that were left out.
+    jacobian : (batch, F, 2, n) float or None
+        Of real and imaginary parts of the weighted residuals, where each point was fitted alone.
     """
 
     theta: FloatArray
@@ -68,6 +70,7 @@ class LinesFit:
     condition_number: FloatArray
     converged: npt.NDArray[np.bool_]
     residual: ComplexArray
+    jacobian: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +195,20 @@ class LinesPlan:
                 break
         return plan
 
-    def weighted_normal(self, data: BinData, theta: FloatArray) -> FloatArray:
-        """(batch, n, n) ``Re J^H J`` for the weights of `data`."""
-        return likelihood.moments(self.problem.tables, data.arrays, theta[:, None])[2][:, 0, 1]
+    def propagated(self, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
+        """Covariance (batch, n, n) of a fit where the variance (batch, F) is not that of `data`."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            finite = np.isfinite(data.variance_y)
+            if fit.jacobian is None:
+                weighted = np.where(finite, data.variance_y**2 / noise[:, None], np.inf)
+                arrays = replace(data, variance_y=weighted).arrays
+                theta = fit.theta[:, None]
+                normal = likelihood.moments(self.problem.tables, arrays, theta)[2][:, 0, 1]
+            else:
+                ratio = np.where(finite, noise[:, None] / data.variance_y, 0.0)[:, 0]  # (batch, F)
+                normal = np.einsum("bfpi,bf,bfpj->bij", fit.jacobian, ratio, fit.jacobian)
+        inverse = 2 * fit.covariance
+        return 0.5 * inverse @ normal @ inverse
 
     def model_of(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
         """The model with coefficients (batch, n), those of A first."""
@@ -231,6 +245,7 @@ class LinesPlan:
             np.array(conditions),
             np.array([s.converged for s in solutions]),
             np.stack([s.turned[0] for s in solutions]),
+            np.stack([s.jacobian[0] for s in solutions]),
         )
 
     def _best_of_starts(self, row: BinData, phase: FloatArray | None) -> DenseSolution:

@@ -288,3 +288,31 @@ def test_delay_beside_correlated_noise_is_at_the_least_cost():
     )
     # nearer to the minimum than a hundredth of the standard deviation at fixed coefficients
     assert abs(slope / bend) < 0.01 * np.sqrt(2 / bend)
+
+
+@pytest.mark.parametrize("delay", [False, True])
+def test_noise_covariance_beside_a_total_variance(delay):
+    # Of the least squares of all coefficients, the delay's among them, weighted by the total variance.
+    structure = ModelStructure(2, 2, delay=delay)
+    rng = np.random.default_rng(3)
+    total = 1e-6 * rng.uniform(0.5, 2.0, LINES_HZ.size)
+    noise = total * rng.uniform(0.1, 0.9, LINES_HZ.size)
+    g = G * np.exp(-1e-3 * S * delay)
+
+    def std_of(spread, weights):
+        """Standard deviations of f0 and damping ratio over fits to 400 draws."""
+        error = circular(np.random.default_rng(4), (400, LINES_HZ.size), 1.0) * np.sqrt(spread)
+        batch = identify_batch(
+            FRF(LINES_HZ, g + error, variance_total=np.tile(weights, (400, 1)), total_dof=1000),
+            structure=structure,
+        )
+        return np.std([batch.f0_hz[:, 0], batch.damping_ratio[:, 0]], axis=1)
+
+    batch = identify_batch(
+        FRF(LINES_HZ, g[None], noise[None], total[None], noise_dof=1000, total_dof=1000),
+        structure=structure,
+    )
+    for covariance, spread in ((batch.covariance, noise), (batch.total_covariance, total)):
+        stated = np.sqrt(np.diagonal(covariance[0, 0]))
+        # 400 draws tell a deviation to 3.5 %: four of these
+        assert stated == pytest.approx(std_of(spread, total), rel=0.15)
