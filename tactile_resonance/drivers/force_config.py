@@ -67,7 +67,7 @@ class ForceConfig:
     Attributes
     ----------
     kind : str
-        can, rtde or topic.
+        What brings the wrenches; also selects the class of the configuration.
     rate_hz : float
     noise_rms_n : float
         Of one sample, white, on each axis [N].
@@ -230,7 +230,9 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     path = shared_file(path, "config/force")
     content = read_yaml(path)
     where = f"{path.name}:"
-    kind = read(Literal["can", "rtde", "topic"], content.get("kind"), f"{where} kind")
+    kind = content.get("kind")
+    known = type(kind) is str and kind in _KINDS
+    require(known, f"{where} kind", kind, f"one of {', '.join(_KINDS)}")
     given: dict[str, Any] = {}
     if kind == "can":
         frames = read_file_name(content.get("frames"), f"{where} frames")

@@ -54,6 +54,7 @@ BLIND = [[0.0] * 5 + [1e-3]] * 2 + [[float(i == j) for j in range(6)] for i in r
     ("change", "reason"),
     [
         ({"kind": "usb"}, "kind: got 'usb'; accepted is one of can, rtde, topic"),
+        ({"kind": ["can"]}, r"kind: got \['can'\]; accepted is one of can, rtde, topic"),
         ({"rate_hz": 999}, "rate_hz: got 999.0; accepted is one of"),
         ({"rate_hz": "fast"}, "rate_hz: got 'fast'"),
         ({"noise_rms_n": -1}, "noise_rms_n: got -1.0"),
