@@ -12,7 +12,13 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.point_result import NAN, PointOutcome, PointResult, band_results
+from tactile_resonance.scan.point_result import (
+    NAN,
+    PointOutcome,
+    PointResult,
+    band_results,
+    mode_columns,
+)
 from tactile_resonance.scan.references import AirReference, relative_to_air
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene
@@ -123,11 +129,7 @@ def with_poles(
         force_min_n=contact.spread.min_n,
         force_max_n=contact.spread.max_n,
         contact_age_s=age_s,
-        f0_hz=float(mode.estimate[0]),
-        f0_std_hz=float(mode.std[0]),
-        damping_ratio=float(mode.estimate[1]),
-        damping_ratio_std=float(mode.std[1]),
-        f0_damping_covariance_hz=float(mode.covariance[0, 1]),
+        **mode_columns(mode.estimate, mode.covariance),
         f0_drift_hz_per_s=float(mode.drift[0]),
         f0_drift_std_hz_per_s=float(mode.drift_std[0]),
         damping_drift_per_s=float(mode.drift[1]),
@@ -148,15 +150,7 @@ def with_poles(
     call = classify(at.compared, at.covariance, classes, unknown_level)
     known = bool(np.all(np.isfinite(at.compared)))
     if at.referred:
-        std = np.sqrt(np.diag(at.covariance))
-        result = replace(
-            result,
-            nominal_f0_hz=float(at.compared[0]),
-            nominal_f0_std_hz=float(std[0]),
-            nominal_damping_ratio=float(at.compared[1]),
-            nominal_damping_ratio_std=float(std[1]),
-            nominal_f0_damping_covariance_hz=float(at.covariance[0, 1]),
-        )
+        result = replace(result, **mode_columns(at.compared, at.covariance, "nominal_"))
     return replace(
         result,
         tissue_class=call.name,

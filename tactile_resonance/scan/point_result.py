@@ -225,16 +225,36 @@ def from_message(message: Any) -> PointResult:
     )
 
 
+def mode_columns(
+    estimate: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64], prefix: str = ""
+) -> dict[str, Any]:
+    """Numbers of one mode, by the names of their fields in `PointResult` and `BandResult`.
+
+    Parameters
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio.
+    covariance : (2, 2) float
+    prefix : str
+        Of the names.
+    """
+    f0_std_hz, damping_ratio_std = np.sqrt(np.diag(covariance))
+    columns = {
+        "f0_hz": float(estimate[0]),
+        "f0_std_hz": float(f0_std_hz),
+        "damping_ratio": float(estimate[1]),
+        "damping_ratio_std": float(damping_ratio_std),
+        "f0_damping_covariance_hz": float(covariance[0, 1]),
+    }
+    return {prefix + name: value for name, value in columns.items()}
+
+
 def band_results(poles: Poles) -> tuple[BandResult, ...]:
     """Of the bands beyond the first, of each the pole with the highest peak."""
     return tuple(
         BandResult(
             *band.band_hz,
-            f0_hz=band.main.f0_hz,
-            f0_std_hz=float(band.main.std[0]),
-            damping_ratio=band.main.damping_ratio,
-            damping_ratio_std=float(band.main.std[1]),
-            f0_damping_covariance_hz=float(band.main.covariance[0, 1]),
+            **mode_columns(band.main.estimate, band.main.covariance),
             poles_status=band.status.value,
         )
         for band in poles.further
