@@ -38,7 +38,7 @@ PARAMETERS = (
     Parameter(
         "publish_rate_hz",
         25.0,
-        "Rate of pose, wrench and state [Hz], 25 Hz at most while no contact is under way; a change of the "
+        "Rate of pose, wrench and state [Hz], 50 Hz at most while no contact is under way; a change of the "
         "state is published at once. The wrench is the mean since the last one.",
         1.0,
         500.0,

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poles of all points of runs again: those of `analyze`, whole files or none, and in pieces of bounded size."""
 
+import array
 import csv
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 import zipfile
 from pathlib import Path
@@ -257,17 +260,28 @@ def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
         (tmp_path / name).write_text("before")
     run = make_run(tmp_path / "run", [list(measurement(100 + k)) for k in range(12)])
     command = [sys.executable, "-m", "tactile_resonance.cli", "reidentify", str(run)]
+    # its first line fits into the pipe, at the second it waits: so it is interrupted before it has ended
+    read, write = os.pipe()
+    size = fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(write, bytes(size - 40))
     process = subprocess.Popen(
         [*command, "--output", str(tmp_path / "out")],
-        stdout=subprocess.PIPE,
+        stdout=write,
         stderr=subprocess.PIPE,
         start_new_session=True,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
-    assert "bins of run" in process.stdout.readline()
+    os.close(write)
+    deadline = time.monotonic() + 60
+    waiting = array.array("i", [size - 40])
+    while waiting[0] == size - 40 and time.monotonic() < deadline:
+        time.sleep(0.01)
+        fcntl.ioctl(read, termios.FIONREAD, waiting)
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=60)
+    assert b"bins of run" in os.read(read, size)
+    os.close(read)
     assert process.returncode == 130
     assert told == "tactile_resonance: interrupted\n"
     deadline = time.monotonic() + 20
