@@ -39,14 +39,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--order",
         type=int,
-        default=2,
         metavar="N",
-        help="of the denominator, two per mode (default: 2)",
+        help="of the denominator, two per mode (default: that of each run's scene)",
     )
     parser.add_argument(
         "--numerator-order",
         type=int,
-        help="default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model",
+        help="with --order; default: six residual terms beside the modes, order + 5; 2 with --order 2 is the "
+        "bare second-order model",
     )
     parser.set_defaults(run=run)
 
@@ -58,8 +58,10 @@ def run(options: argparse.Namespace) -> int:
         from tactile_resonance.scan.reidentify import reidentify
     except ImportError as error:
         raise ValueError(f"reidentify: {error.name} not found; pip install rosbags") from error
-    structure = ModelStructure.with_residual(options.order)
+    structure = None if options.order is None else ModelStructure.with_residual(options.order)
     if options.numerator_order is not None:
+        if structure is None:
+            raise ValueError(f"numerator-order: {options.numerator_order}, expected beside --order")
         structure = replace(structure, numerator_order=options.numerator_order)
     band_hz = None
     if options.band is not None:

@@ -25,7 +25,7 @@ from tactile_resonance.fields import read_dataclass, read_yaml, section
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.result import STATUSES, Poles, PolesBatch, PolesStatus
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.rows_file import RowsWriter
 from tactile_resonance.scan.kept_bins import (
     PLACE,
@@ -61,8 +61,8 @@ Task = TypeVar("Task")
 Found = TypeVar("Found")
 
 
-def scene_band(run: Path) -> tuple[float, float]:
-    """Band (low, high) [Hz] that a run was scanned for.
+def scene_band(run: Path) -> PoleBand:
+    """Main band that a run was scanned for, and the model there.
 
     Raises
     ------
@@ -73,15 +73,14 @@ def scene_band(run: Path) -> tuple[float, float]:
     where = f"{path}:"
     content = read_yaml(path)
     sensor = section(content, "sensor", where) if "sensor" in content else {}
-    use = read_dataclass(SensorUse, sensor, f"{where} sensor")
-    return use.band_low_hz, use.band_high_hz
+    return read_dataclass(SensorUse, sensor, f"{where} sensor").bands[0]
 
 
-def row_type(structure: ModelStructure) -> np.dtype:
+def row_type(places: int) -> np.dtype:
     """Of the result of a point: the mode with the highest peak, then others with ``_2``, ``_3`` ... behind."""
     modes = [
         name if place == 0 else f"{name}_{place + 1}"
-        for place in range(max(structure.order // 2, 1))
+        for place in range(max(places, 1))
         for name in _MODE
     ]
     return np.dtype(
@@ -110,7 +109,7 @@ def reidentify(
     band_hz : (low, high), optional
         Of each run's scene when absent.
     structure : ModelStructure, optional
-        One mode and six residual terms when absent.
+        That of the main band of each run's scene when absent; one mode where the data chose there.
     progress : callable
         Told what is done, how many points are, and of how many.
 
@@ -128,21 +127,30 @@ def reidentify(
     OSError
         If a file cannot be read or written, or a process was ended from outside.
     """
-    structure = structure or ModelStructure()
     for run in runs:
         read_plan(run)
-    bands = [band_hz or scene_band(run) for run in runs]
-    dtype, counts, left_out = row_type(structure), Counter[str](), []
+    wanted = [scene_band(run) for run in runs]
+    bands = [band_hz or band.ends_hz for band in wanted]
+    structures = [
+        structure or ModelStructure.with_residual(band.order or 2, band.residual_terms)
+        for band in wanted
+    ]
+    dtype = row_type(max(each.order // 2 for each in structures))
+    counts, left_out = Counter[str](), list[str]()
     part = csv.with_name(csv.name + ".part")
     with _Processes() as processes:
         kept = []
-        for run, band in zip(runs, bands, strict=True):
+        for run, band, model in zip(runs, bands, structures, strict=True):
             kept.append(kept_bins(run, band) or _keep(processes, run, band, progress))
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
             for kind, _ in kept[-1].kinds:
-                _plan(kind, band, structure)  # raises what does not suit
+                _plan(kind, band, model)  # raises what does not suit
         total, done = sum(of_run.count for of_run in kept), 0
-        jobs = (job for k, run in enumerate(kept) for job in _jobs(k, run, bands[k], structure))
+        jobs = (
+            (dtype, *job)
+            for k, run in enumerate(kept)
+            for job in _jobs(k, run, bands[k], structures[k])
+        )
         try:
             with RowsWriter(npz) as writer, part.open("w", encoding="utf-8") as text:
                 text.write(",".join(dtype.names or ()) + "\n")
@@ -210,14 +218,14 @@ def _plan(kind: BinsKind, band_hz: tuple[float, float], structure: ModelStructur
 
 def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     """(n,) results of some points of one kind, and their lines of the table."""
-    run, name_of_run, kind, source, start, stop, band_hz, structure = job
+    dtype, run, name_of_run, kind, source, start, stop, band_hz, structure = job
     points = source.read(start, stop)
     plan = _plan(kind, band_hz, structure)
     first = plan.bins[0] - kind.first_bin
     here = slice(first, first + plan.bins.size)
     u, y = (points[name][..., here].astype(complex) for name in ("u", "y"))  # (n, M, K)
     batch = plan.from_bins(u[:, 0], y[:, 0]) if kind.realisations == 1 else plan.from_bins(u, y)
-    rows = np.zeros(points.size, row_type(structure))
+    rows = np.zeros(points.size, dtype)
     _fill_nan(rows)
     rows["run"] = run
     for name in PLACE:

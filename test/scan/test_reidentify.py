@@ -136,6 +136,31 @@ def analyzed(run, key, output, *options):
     return json.loads(output.read_text())
 
 
+def test_band_and_model_are_those_of_the_scene(tmp_path, capsys):
+    scene = (
+        "name: y\nsensor: {band_low_hz: 215.0, band_high_hz: 285.0, order: 4, residual_terms: 8}\n"
+    )
+    modes = ((240.0, 0.02), (262.0, 0.03))
+    two = make_run(tmp_path / "two", [list(measurement(100, modes=modes))], scene)
+    one = make_run(tmp_path / "one", [list(measurement(100))])
+    for run in (one, two):
+        assert main(["reidentify", str(run)]) == 0
+    alone, pair = (table(run / "reidentified.csv")[0] for run in (one, two))
+    assert "f0_hz_2" not in alone
+    found = sorted([float(pair["f0_hz"]), float(pair["f0_hz_2"])])
+    assert found == pytest.approx([240.0, 262.0], abs=0.1)
+    with np.load(two / "reidentified.npz") as result:
+        assert result["bands_hz"].tolist() == [[215.0, 285.0]]
+    # in one table both have as many columns as the run with most modes
+    assert main(["reidentify", str(one), str(two), "--output", str(tmp_path / "both")]) == 0
+    rows = table(tmp_path / "both.csv")
+    assert rows[0]["f0_hz"] == alone["f0_hz"]
+    assert rows[0]["f0_hz_2"] == "nan"
+    assert rows[1]["f0_hz_2"] == pair["f0_hz_2"]
+    assert main(["reidentify", str(one), "--numerator-order", "2"]) == 1
+    assert "--order" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("order", [2, 4])
 def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
     output = tmp_path / "again"
