@@ -156,6 +156,8 @@ def decide_bands(
 ) -> Decision:
     """Whether the main modes of all bands are as precise as wanted; the first that is not decides.
 
+    One for which more blocks are of use comes before one for which they are not.
+
     Parameters
     ----------
     poles : Poles
@@ -167,7 +169,8 @@ def decide_bands(
         decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
         for mode in (band.main for band in poles.bands)
     ]
-    return next((decision for decision in of_bands if not decision.stop), of_bands[0])
+    imprecise = [each for each in of_bands if each.verdict is not Verdict.PRECISE] or of_bands
+    return next((each for each in imprecise if not each.stop), imprecise[0])
 
 
 def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:

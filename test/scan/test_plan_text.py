@@ -80,9 +80,16 @@ def test_a_point_is_enough_once_each_band_is():
     ):
         poles = Band(first, (Band(second),))
         assert decide_bands(poles, 2, wanted, limits, 0.4).verdict is verdict
-    # as precise as it gets
-    poles = Band(0.009, (Band(0.012),))
-    assert decide_bands(poles, 8, wanted, limits, 0.4).stop
+    # as precise as it gets: what is not precise says why it ends
+    for first, second, blocks, verdict in (
+        (0.009, 0.012, 8, Verdict.MOST_BLOCKS),
+        (0.012, 0.009, 8, Verdict.MOST_BLOCKS),
+        (0.009, 0.2, 2, Verdict.HOPELESS),
+        (0.009, 0.009, 8, Verdict.PRECISE),
+    ):
+        decision = decide_bands(Band(first, (Band(second),)), blocks, wanted, limits, 0.4)
+        assert decision.stop
+        assert decision.verdict is verdict
 
 
 def test_the_command_compiles_the_packages_own_scenes(capsys, tmp_path):
