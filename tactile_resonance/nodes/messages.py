@@ -188,7 +188,8 @@ def _bins(message: msg.FRF) -> tuple[BandBins, ...]:
         )
     ends = np.cumsum(counts)[:-1] * records
     u, y = (np.split(complex_of(message, f"bins_{c}_"), ends) for c in ("actuator", "sensor"))
-    harmonics = array_of(message.bins_harmonics).astype(np.int64)
+    # a line where two bands touch came with both
+    harmonics = np.unique(array_of(message.bins_harmonics).astype(np.int64))
     bins = harmonics * message.bins_periods
     return tuple(
         BandBins(

@@ -154,6 +154,18 @@ def test_frf(complete):
     assert_equal(origin, ORIGIN)
 
 
+def test_bands_that_touch_share_a_line():
+    bins = BandBins(40, complex_normal(1, 13), complex_normal(1, 13), np.arange(10, 14), 1e3, 64, 4)
+    further = BandBins(52, complex_normal(1, 9), complex_normal(1, 9), np.arange(13, 16), 1e3, 64, 4)
+    for first, second in ((bins, further), (further, bins)):
+        frf = FRF(np.arange(3.0), complex_normal(3), bins=first, further_bins=(second,), periods=4)
+        back, _ = messages.frf_from_message(
+            through_the_wire(messages.frf_to_message(frf, ORIGIN, 1.5, False))
+        )
+        for one, other in zip((back.bins, *back.further_bins), (first, second), strict=True):
+            assert_equal(one, other)
+
+
 @pytest.mark.parametrize("modes", [0, 1, 3])
 def test_poles(modes):
     poles = Poles(
