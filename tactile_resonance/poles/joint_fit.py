@@ -351,8 +351,8 @@ def _from_scatter(fitted: _Round) -> _Round:
 def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
     """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
     plan, solution, levels = fitted.plan, fitted.solution, fitted.levels
-    batch, _, _ = solution.theta.shape
-    a, b, _ = plan.problem.sizes
+    batch, records, _ = solution.theta.shape
+    a, b, own = plan.problem.sizes
     common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
     suspect = are_smooth(common, plan.structure.parameters)
     if suspect.any():
@@ -362,7 +362,7 @@ def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
     theta = solution.theta
     judged = Judged(
         theta=np.concatenate(
-            [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, -1)], axis=1
+            [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, records * own)], axis=1
         ),
         lines=np.where(usable, plan.excited_at.size, 0),
         condition=levels.inverse.condition,

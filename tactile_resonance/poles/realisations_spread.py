@@ -126,7 +126,7 @@ class Spread:
         p = special.fdtrc(self.records - 1, self.dof[:, None, None], self.ratio)
         p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2), initial=np.inf)
         known = self.known & np.isfinite(p)
-        return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** self.ratio[0].size, np.nan)
+        return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** (2 * self.ratio.shape[1]), np.nan)
 
     @property
     def weight(self) -> FloatArray:

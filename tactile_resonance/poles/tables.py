@@ -189,7 +189,8 @@ class Tables(NamedTuple):
 
 def from_planes(blocks: FloatArray, undriven: int, driven: int) -> ComplexArray:
     """Complex values (points, M, K) of `planes`."""
-    values = (blocks[..., 0, :] + 1j * blocks[..., 1, :]).reshape(*blocks.shape[:2], -1)
+    points, records, count = blocks.shape[:3]
+    values = (blocks[..., 0, :] + 1j * blocks[..., 1, :]).reshape(points, records, count * BLOCK)
     first = -(-undriven // BLOCK) * BLOCK
     return np.concatenate([values[..., :undriven], values[..., first : first + driven]], axis=-1)
 

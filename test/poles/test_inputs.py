@@ -25,7 +25,7 @@ from tactile_resonance.poles.identify import (
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import (
     identify_poles_from_bins,
 )
@@ -209,6 +209,10 @@ def test_no_points_give_no_results(shape, order):
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
     samples = np.empty((*shape, PERIODS, SAMPLES))
     assert plan(samples, samples).f0_hz.shape == (*shape, 1)
+    for periods in (1, PERIODS):
+        several = PoleEstimator(RATE_HZ, SAMPLES, periods, HARMONICS, (200, 300), BARE)
+        samples = np.empty((*shape, 2, periods, SAMPLES))
+        assert several(samples, samples).f0_hz.shape == (*shape, 1)
 
 
 @pytest.mark.parametrize(
