@@ -220,8 +220,9 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "ndim", None) == 0 else value
 
 
-def numbers(value: object, field: str, count: int | None = None) -> tuple[float, ...]:
-    """Return a list of finite numbers as a tuple, of length `count` where that is given."""
+def numbers(value: Any, field: str, count: int | None = None) -> tuple[float, ...]:
+    """Return a list, or an array (n,), of finite numbers as a tuple, of length `count` where that is given."""
+    value = value.tolist() if getattr(value, "ndim", None) == 1 else value
     return _tuple((float, ...) if count is None else (float,) * count, value, field)
 
 

@@ -58,7 +58,7 @@ def test_odd_random_grid_leaves_out_one_of_each_block():
 @pytest.mark.parametrize("grid", [Grid.FULL, Grid.ODD, Grid.ODD_RANDOM])
 def test_lines_at_harmonics_of_the_mains_are_not_excited(grid):
     whole = design_multisine(grid=grid, seed=5)
-    left = design_multisine(grid=grid, seed=5, mains_hz=(50.0, 60.0))
+    left = design_multisine(grid=grid, seed=5, mains_hz=np.array([50.0, 60.0]))
     # on the grid of 2.5 Hz these are multiples of 20 and 24; one line beside each is left out too
     far = [min(n % 20, -n % 20) > 1 and min(n % 24, -n % 24) > 1 for n in whole.harmonics]
     np.testing.assert_array_equal(left.harmonics, whole.harmonics[far])
