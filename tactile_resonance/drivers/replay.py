@@ -236,6 +236,7 @@ def _is_silent(measurement: StoredMeasurement) -> bool:
 
 def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:
     """The recording of a file as if a device had taken it; ids are 0, times unknown."""
+    recording.require_repeated()  # without its period a file would be one long one
     harmonics = recording.excited_harmonics
     if harmonics is None:
         harmonics = find_excited_harmonics(Spectrum.of(recording.u, recording.y))

@@ -40,11 +40,8 @@ class Recording:
         """Distance of the lines [Hz]."""
         return self.sample_rate_hz / self.u.shape[-1]
 
-    def require_driven(self) -> None:
-        """Raise ``ValueError`` where no response can be estimated.
-
-        From one period alone, or where a channel is constant over a realisation: nothing was driven.
-        """
+    def require_repeated(self) -> None:
+        """Raise ``ValueError`` where one period is all there is."""
         realisations, periods, samples = self.u.shape
         if realisations < 2 and periods < 2:
             raise ValueError(
@@ -52,6 +49,13 @@ class Recording:
                 "least 2 periods (samples_per_period, --samples-per-period, is their length) or 2 "
                 "realisations: one alone has no covariance"
             )
+
+    def require_driven(self) -> None:
+        """Raise ``ValueError`` where no response can be estimated.
+
+        From one period alone, or where a channel is constant over a realisation: nothing was driven.
+        """
+        self.require_repeated()
         for name, samples in (("u", self.u), ("y", self.y)):
             flat = np.ptp(samples, axis=(1, 2)) == 0
             if np.any(flat):

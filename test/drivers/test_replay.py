@@ -202,6 +202,15 @@ def test_a_plain_file_is_one_measurement(tmp_path, lines):
         device.plan(ASKED)
 
 
+def test_a_file_that_names_no_period_is_refused(tmp_path):
+    """As one period it would tell no noise."""
+    excitation = design_multisine(sample_rate_hz=1000.0, samples_per_period=100, band_hz=(20.0, 200.0))
+    u = np.tile(excitation.period(), 4)
+    np.savez(tmp_path / "m.npz", u=u, y=0.1 * u, sample_rate_hz=1000.0)
+    with pytest.raises(ValueError, match="samples_per_period"):
+        ReplayDevice(tmp_path / "m.npz")
+
+
 def test_what_is_no_recording_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no measurement in it"):
         ReplayDevice(tmp_path)
