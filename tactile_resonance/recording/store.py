@@ -82,7 +82,7 @@ class RecordStore:
         folder = self._folder_of(excitation.measurement_id)
         write_stored(folder / f"excitation-{excitation.realisation:05d}.npz", excitation)
 
-    def add_record(self, record: Record, written: Callable[[], None] = lambda: None) -> None:
+    def add_record(self, record: Record, written: Callable[[], None] | None = None) -> None:
         """Write one block; OSError where that fails.
 
         `written` is called once a kill of this process cannot lose it any more, before the disk has it.

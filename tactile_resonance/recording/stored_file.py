@@ -31,7 +31,7 @@ _DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedErr
 
 
 def write_stored(
-    path: Path, value: Excitation | Record, written: Callable[[], None] = lambda: None
+    path: Path, value: Excitation | Record, written: Callable[[], None] | None = None
 ) -> None:
     """Write one object durably: a reader, or a power cut, finds the whole file or none.
 
@@ -42,7 +42,7 @@ def write_stored(
     value : Excitation or Record
         Each field becomes one array named after it (``origin.contact.force_n``). Integer arrays are
         held in the smallest signed type that holds them exactly.
-    written : callable
+    written : callable, optional
         See `write_whole`.
 
     Raises
@@ -50,7 +50,7 @@ def write_stored(
     ValueError
         If an array is neither of signed integers nor floating point.
     OSError
-        If it cannot be written; nothing is left behind.
+        If it cannot be written; nothing is left behind, unless `written` was called.
     """
     content: Fields = {"format": np.array(_FORMAT.format(type(value).__name__))}
     _flatten("", value, content)

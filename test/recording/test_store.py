@@ -237,6 +237,30 @@ def test_a_failed_write_leaves_nothing_that_looks_whole(tmp_path, monkeypatch):
     assert [p.name for p in next(tmp_path.iterdir()).iterdir()] == ["excitation-00000.npz"]
 
 
+def test_what_was_handed_out_stays_where_the_disk_fails_then(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def gone():
+        raise RuntimeError("the publisher is gone")
+
+    store, told = RecordStore(tmp_path), []
+    planned = stores.excitations()
+    store.begin(planned)
+    store.add_excitation(planned[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            store.add_record(stores.record(planned[0], 0), lambda: told.append(0))
+    with pytest.raises(RuntimeError, match="publisher"):
+        store.add_record(stores.record(planned[0], 1), gone)
+    (measurement,) = read_store(tmp_path).measurements
+    assert told == [0]
+    for block, record in enumerate(measurement.records):
+        assert_same(record, stores.record(planned[0], block))
+    assert len(measurement.records) == 2
+
+
 WRITER = """
 import sys
 from pathlib import Path
