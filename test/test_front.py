@@ -234,3 +234,25 @@ def test_a_folder_that_holds_no_run_is_refused(tmp_path):
     for path, what in ((tmp_path, "a folder without run.json"), (tmp_path / "a", "not there")):
         with pytest.raises(ValueError, match=f"path: .* is {what}; accepted is the folder of a sc"):
             tr.read_run(path)
+
+
+@pytest.mark.parametrize(("strongest", "f0_hz"), [(0, 250.0), (1, 1550.0)])
+def test_a_band_that_is_found_does_not_span_what_was_not_excited(strongest, f0_hz):
+    """As of a scan's run in several bands: around 250 Hz and around 1550 Hz, nothing between."""
+    stretches_hz = [(230.0, 270.0), (1480.0, 1620.0)]
+    multisine = tr.design_multisine(band_hz=stretches_hz)
+    s = 2j * np.pi * np.fft.rfftfreq(20_000, 1 / 50e3)
+    g = 0
+    for k, mode_hz in enumerate((250.0, 1550.0)):
+        w0 = 2 * np.pi * mode_hz
+        size = 1.0 if k == strongest else 0.01
+        g = g + size * 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
+    u = np.tile(multisine.period(), (4, 1))
+    y = np.fft.irfft(g * np.fft.rfft(u))
+    y += 1e-5 * np.random.default_rng(0).standard_normal(y.shape)
+    recording = tr.make_recording(u, y, sample_rate_hz=50e3)
+    poles = tr.identify_poles(recording)
+    low_hz, high_hz = stretches_hz[strongest]
+    assert low_hz <= poles.band_hz[0] < poles.band_hz[1] <= high_hz
+    assert poles.status.value == "ok"
+    assert np.all(np.abs(poles.main.estimate - [f0_hz, 0.02]) < 4 * poles.main.std)

@@ -11,10 +11,13 @@ from tactile_resonance.frf.result import FRF
 # out.
 HALF_WIDTHS = 5.0
 FEWEST_LINES_EACH_SIDE = 20
+# Lines that are so many times as far apart as those beside them belong to two stretches, between which nothing
+# was excited.
+GAP = 10.0
 
 
 def strongest_resonance_band(frf: FRF) -> tuple[float, float]:
-    """Band around the line where the response moves fastest along its arc.
+    """Band around the line where the response moves fastest along its arc, within one stretch of lines.
 
     Parameters
     ----------
@@ -44,4 +47,8 @@ def strongest_resonance_band(frf: FRF) -> tuple[float, float]:
     left = centre - int(np.argmin(above[centre::-1])) if not above[: centre + 1].all() else 0
     right = centre + int(np.argmin(above[centre:])) if not above[centre:].all() else f.size - 2
     half = max(int(HALF_WIDTHS * (right - left) / 2), FEWEST_LINES_EACH_SIDE)
-    return float(f[max(centre - half, 0)]), float(f[min(centre + half + 1, f.size - 1)])
+    spacing = np.diff(f)
+    gaps = 1 + np.flatnonzero(spacing[1:-1] > GAP * np.maximum(spacing[:-2], spacing[2:]))
+    first = max((int(gap) + 1 for gap in gaps if gap < centre), default=0)
+    last = min((int(gap) for gap in gaps if gap >= centre), default=f.size - 1)
+    return float(f[max(centre - half, first)]), float(f[min(centre + half + 1, last)])
