@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,8 +78,8 @@ class ReplayDevice:
     def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
         """The realisations recorded, each with as many periods; see `AcquisitionDevice.plan`.
 
-        A measurement that was cut off ends where it was. What was begun without a single record is
-        passed over.
+        Bands are those asked for where the recording, a file or a run of an earlier version, names none. A
+        measurement that was cut off ends where it was. What was begun without a single record is passed over.
         """
         asked = excitations[0]
         if self._file is not None:
@@ -88,9 +89,10 @@ class ReplayDevice:
                 raise DeviceError(f"replay: the recording is over: {self._path} was played")
             self._next_after = 1
             self._measurement = self._file
-            named = {
+            named: dict[str, Any] = {
                 "measurement_id": asked.measurement_id,
                 "label": asked.label or self._path.name,
+                "bands": asked.bands,
             }
             return [replace(excitation, **named) for excitation in self._file.excitations]
         self._measurement = self._find(asked)
@@ -106,7 +108,12 @@ class ReplayDevice:
             excitation = recorded[realisation]
             is_last = realisation == last.realisation
             periods = last.block_index + 1 if is_last else excitation.periods
-            planned.append(replace(excitation, periods=periods, realisations=last.realisation + 1))
+            bands = excitation.bands or asked.bands
+            planned.append(
+                replace(
+                    excitation, periods=periods, realisations=last.realisation + 1, bands=bands
+                )
+            )
         return planned
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:

@@ -12,6 +12,7 @@ import pytest
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.drivers.replay import ReplayDevice
 from tactile_resonance.multisine import design_multisine
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import BetweenSamples, Contact, InputKind
 from tactile_resonance.recording.store import RecordStore
 
@@ -56,6 +57,24 @@ def test_a_store_comes_back_to_the_bit(tmp_path):
     assert info.anti_alias_filter == records[0].anti_alias_filter
     assert info.frame_id == "left/tip"
     assert info.simulated
+
+
+def test_poles_are_of_the_bands_recorded_or_else_of_those_asked_for(tmp_path):
+    wanted, recorded = (PoleBand(300.0, 400.0),), (PoleBand(200.0, 300.0), PoleBand(400.0, 450.0))
+    request = [design_multisine(bands=wanted)]
+    for key, bands in ((1, ()), (2, recorded)):
+        store = RecordStore(tmp_path / "store")
+        (excitation,) = stores.excitations(key, realisations=1, periods=1)
+        excitation = replace(excitation, bands=bands)
+        store.begin([excitation])
+        store.add_excitation(excitation)
+        store.add_record(stores.record(excitation, 0))
+    device = ReplayDevice(tmp_path / "store", speed=0)
+    assert [play(device, request)[0][0].bands for _ in range(2)] == [wanted, recorded]
+    multisine = design_multisine(sample_rate_hz=1000.0, samples_per_period=100, band_hz=(20.0, 200.0))
+    u = np.tile(multisine.period(), (2, 1))
+    np.savez(tmp_path / "m.npz", u=u, y=u, sample_rate_hz=1000.0)
+    assert play(ReplayDevice(tmp_path / "m.npz", speed=0), request)[0][0].bands == wanted
 
 
 def test_measurements_come_in_order_once_and_by_name(tmp_path):
