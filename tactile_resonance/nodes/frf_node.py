@@ -82,8 +82,13 @@ class FrfNode(ManagedNode):
             reason = self.health.failed(
                 f"record of excitation {record.origin.excitation_id}", error
             )
+            excitation = self._excitations.get(record.origin.excitation_id)
             nothing = FRF(
-                np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED, message=reason
+                np.empty(0),
+                np.empty(0, complex),
+                status=FrfStatus.FAILED,
+                message=reason,
+                bands=() if excitation is None else excitation.bands,
             )
             self._publisher.publish(frf_to_message(nothing, record.origin, float("nan"), False))
 

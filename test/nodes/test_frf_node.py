@@ -2,6 +2,7 @@
 """What the FRF node does with messages in the order in which a fast bench sends them."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tactile_resonance.nodes.messages import (
     record_to_message,
 )
 from tactile_resonance.nodes.running import initialised
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 
@@ -146,8 +148,9 @@ def test_an_estimate_that_raises_gets_a_failure_with_its_reason(node, monkeypatc
     def broken(*arguments):
         raise ZeroDivisionError("division by zero")
 
-    message, records = messages(10)
-    node._on_excitation(message)
+    _, records = messages(10)
+    bands = (PoleBand(60.0, 90.0), PoleBand(120.0, 160.0))
+    node._on_excitation(excitation_to_message(replace(excitation(10), bands=bands), 0, "tip"))
     with monkeypatch.context() as patched:
         patched.setattr("tactile_resonance.frf.measurement.MeasurementFrf.add", broken)
         node._on_record(records[0])
@@ -155,3 +158,5 @@ def test_an_estimate_that_raises_gets_a_failure_with_its_reason(node, monkeypatc
     node._on_record(messages(11)[1][0])
     assert [m.status for m in node.published] == [3, 1]
     assert node.published[0].message == "ZeroDivisionError: division by zero"
+    # so that each band has poles that say so
+    assert frf_from_message(node.published[0])[0].bands == bands
