@@ -77,7 +77,10 @@ def f0_damping_covariance(poles_rad_s: ComplexArray, covariance: FloatArray) -> 
 
 
 def pole_quantities(
-    model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
+    model: RationalModel,
+    band_hz: tuple[float, float],
+    parameters: FloatArray,
+    total: FloatArray | None = None,
 ) -> dict[str, npt.NDArray]:
     """Poles in the band and what follows from them, by the names that `PolesBatch` gives them.
 
@@ -88,13 +91,15 @@ def pole_quantities(
     band_hz : (low, high)
     parameters : (..., n, n) float
         Covariance of the free coefficients, those of the denominator first.
+    total : (..., n, n) float, optional
+        The total one: ``total_covariance`` follows from it.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         poles = modes_in_band(model.poles_rad_s(), band_hz)
         f0_hz, damping_ratio = natural_frequency_and_damping(poles)
         residues, sensitivity = model.residues_and_sensitivity(poles)
         covariance = real_covariance(sensitivity, parameters)
-        return {
+        quantities = {
             "poles_rad_s": poles,
             "f0_hz": f0_hz,
             "damping_ratio": damping_ratio,
@@ -102,3 +107,7 @@ def pole_quantities(
             "pole_covariance": covariance,
             "covariance": f0_damping_covariance(poles, covariance),
         }
+        if total is not None:
+            in_poles = real_covariance(sensitivity, total)
+            quantities["total_covariance"] = f0_damping_covariance(poles, in_poles)
+    return quantities

@@ -148,21 +148,13 @@ def assemble(
     if hopeless.any():
         covariance, total = covariance.copy(), total.copy()
         covariance[hopeless] = total[hopeless] = np.nan
-    quantities = pole_quantities(model, band_hz, covariance)
+    quantities = pole_quantities(model, band_hz, covariance, total)
+    quantities["total_covariance"] += judged.systematic
     if undetermined.any():
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
     significant = significant_modes(model, quantities, covariance, judged.lines)
-    total_f0_damping = np.full_like(quantities["covariance"], np.nan)
-    rows = np.flatnonzero(np.isfinite(total[:, 0, 0]))
-    if rows.size:
-        total_f0_damping[rows] = pole_quantities(
-            model if rows.size == total.shape[0] else model.at((rows,)),
-            band_hz,
-            total[rows],
-        )["covariance"]
-        total_f0_damping[rows] += judged.systematic[rows]
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
@@ -184,7 +176,6 @@ def assemble(
     delay = model.delay_s
     return PolesBatch(
         **{name: batch(values) for name, values in quantities.items()},
-        total_covariance=batch(total_f0_damping),
         coefficient_covariance=batch(covariance),
         cost=batch(judged.cost),
         expected_cost=batch(judged.expected),

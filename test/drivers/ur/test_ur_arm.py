@@ -251,6 +251,8 @@ def until(condition, otherwise="never"):
 def test_python_of_the_page(robot, module_arm, tmp_path, capsys, monkeypatch):
     """It moves as far as the page says; its sleeps and its arm are in simulated time."""
     module_arm.close()
+    # its program ends in the robot's time, which is this test's from here on
+    until(lambda: robot.order("state")["runtime_state"] == "STOPPED", "the program goes on")
     page = Path(__file__).resolve().parents[3] / "docs" / "robot.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     own = tmp_path / "mine.yaml"
