@@ -16,6 +16,7 @@ from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
 from tactile_resonance.nodes.messages import frf_from_message
 from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
+from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.recording.messages import (
     excitation_from_message,
@@ -157,6 +158,23 @@ def test_tissue_follows_the_tip_and_noise_repeats(session):
     assert second.f0_hz[0] - first.f0_hz[0] > 8
     assert second.damping_ratio[0] - first.damping_ratio[0] > 0.008
     np.testing.assert_array_equal(again.poles_rad_s, first.poles_rad_s)
+
+
+def test_poles_of_two_bands_in_one_measurement(session):
+    bands = [
+        msg.Band(low_hz=200.0, high_hz=300.0, order=2, residual_terms=6),
+        msg.Band(low_hz=600.0, high_hz=800.0, order=2, residual_terms=10),
+    ]
+    goal = Measure.Goal(periods=4, seed=6, bands=bands)
+    goal.excited_low_hz, goal.excited_high_hz = [180.0, 570.0], [320.0, 830.0]
+    result = session.measure(GEL_10, goal, quiet)
+    (further,) = result.poles.further
+    for poles, (low_hz, high_hz) in ((result.poles, (200, 300)), (further, (600, 800))):
+        (truth,) = (f for f in result.truth.f0_hz if low_hz < f < high_hz)
+        assert poles.band_hz == (low_hz, high_hz)
+        assert poles.status is PolesStatus.OK, poles.message
+        assert abs(poles.main.f0_hz - truth) < 5 * np.sqrt(poles.best_covariance[0, 0, 0])
+        assert np.sqrt(poles.best_covariance[0, 0, 0]) < 0.1
 
 
 def test_the_bench_tells_its_truth_on_request(session):
