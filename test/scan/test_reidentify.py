@@ -296,6 +296,8 @@ def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
         start_new_session=True,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        # what a shell starts in the background, and all that it starts, ignores it
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     os.close(write)
     deadline = time.monotonic() + 60
