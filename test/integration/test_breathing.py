@@ -22,7 +22,7 @@ MOTION = {"breath_m": 1.0e-3, "heart_m": 1.0e-4}
 """Peak to peak: motion that the controller is known to hold."""
 RATES = {"breath_hz": 0.25, "heart_hz": 1.2}
 GATE_N = 2.2e-4  # now and then the motion is more, now and then less
-NOISE_N = 1.2e-4  # of the rms of a force that is measured for 0.8 s and more
+NOISE_N = 1.2e-4  # of the rms of a force of GATE_N and more that is measured for 0.8 s and more
 SCENE = """
 name: breathing
 force_n: 0.01
@@ -71,7 +71,9 @@ def breathe(folder, motion, blocks, more=""):
     assert np.abs(off).max() < 4
     for result in found.done:
         truth = found.truths[result.index]
-        assert result.force_rms_n == pytest.approx(truth.force_rms_n, abs=NOISE_N)
+        # noise is taken off the mean square: what is left of a small one is off by more in its root
+        off_n2 = 2 * NOISE_N * max(truth.force_rms_n, GATE_N)
+        assert result.force_rms_n**2 == pytest.approx(truth.force_rms_n**2, abs=off_n2)
         assert result.force_min_n < truth.force_n < result.force_max_n
     return found
 
