@@ -20,7 +20,7 @@ SHORT_S = 0.02
 """Of the short means [s]."""
 
 LEAST_SHORT = 8
-"""Fewer of them tell nothing of a spread."""
+"""Fewer of them say nothing about a spread."""
 
 LEAST_KNOWN = 0.8
 """Of the blocks of a measurement, in time, whose spread must be known."""

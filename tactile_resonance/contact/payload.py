@@ -124,7 +124,7 @@ def identify_payload(
     Raises
     ------
     ValueError
-        If the orientations do not tell the unknowns apart, or the mass comes out negative.
+        If the orientations do not distinguish the unknowns, or the mass comes out negative.
     """
     rotations, wrenches = np.asarray(rotations, float), np.asarray(wrenches, float)
     n = len(rotations)

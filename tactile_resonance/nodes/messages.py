@@ -2,7 +2,7 @@
 """Between objects of the core and messages: the only place that converts them in nodes.
 
 Beside it `recording.messages`, which needs no ROS, has what is recorded, and `nodes.scan_messages` what only
-scan_node takes and tells: the others do not load scans.
+scan_node takes and sends: the others do not load scans.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class PolynomialBasis:
         """Basis up to `degree` on the points `x` (F,).
 
         Orthonormal in the mean of ``weight |p_k|^2``, with weights (F,) of mean 1 (all 1 when
-        absent). A degree that the points cannot tell from lower ones has values of no meaning but
+        absent). A degree that the points cannot distinguish from lower ones has values of no meaning but
         finite ones.
         """
         w = np.ones(x.size) if weight is None else weight

@@ -65,7 +65,7 @@ class Problem:
     def from_driven(self) -> bool:
         """Whether the driven bins hold equations enough for start values.
 
-        Of a record of many periods they are a small part of all bins, and the one that tells most.
+        Of a record of many periods they are a small part of all bins, and the most informative one.
         """
         return self.undriven > 0 and self.numerator.shape[0] >= sum(self.sizes)
 

@@ -64,7 +64,7 @@ def poles_of_frf(
 
 
 def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") -> Poles:
-    """Poles in several bands of one FRF, each fitted by itself; those of the second and so on as `further`.
+    """Poles in several bands of one FRF, each fitted alone; those of the second and so on as `further`.
 
     Parameters
     ----------

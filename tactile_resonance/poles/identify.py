@@ -57,7 +57,7 @@ def identify_frf(
     Lines are weighted with the largest variance known (total, else noise), pooled over the band
     where a test allows it. Where both are known, ``covariance`` propagates the noise through these
     weights and ``total_covariance`` the total; where only realisations are at hand, noise cannot be
-    told from distortion and both fields hold both. Where the cost exceeds what the variance
+    distinguished from distortion and both fields hold both. Where the cost exceeds what the variance
     explains, ``total_covariance`` holds the model error too; see `model_error.model_error_factor`.
     """
     if np.ndim(frf.g) != 1:

@@ -7,7 +7,7 @@ parameters a mode where removing the transient beforehand costs a quarter of the
 (Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
 sections 6.3.2 and 9.12). The bins between harmonics bring the level of the noise on both channels.
 
-Several realisations of the phases tell stochastic nonlinear distortion from noise, and from errors of
+Several realisations of the phases distinguish stochastic nonlinear distortion from noise, and from errors of
 the model: the best linear approximation is what they have in common (ibid., chapter 4). Estimated are
 one A and B and M numerators C of transients.
 """
@@ -141,7 +141,7 @@ class JointPlan:
                     f"{name}: shape {samples.shape}, expected (..., {expected[0]}, {expected[1]})"
                 )
         record = Spectrum.of(*np.broadcast_arrays(u, y))
-        with np.errstate(invalid="ignore", over="ignore"):  # the status tells of such samples
+        with np.errstate(invalid="ignore", over="ignore"):  # the status reports such samples
             here = record.bins[..., self.bins[0] : self.bins[-1] + 1]
         return here[..., 1, :], here[..., 0, :]
 
@@ -271,7 +271,7 @@ class JointPlan:
 
     @property
     def level_known(self) -> bool:
-        """Whether the noise of one record is told by more than the residuals."""
+        """Whether the noise of one record is known from more than the residuals."""
         return self.other_bins.size > 0 or self.input_noise_ratio is not None
 
     @cached_property
@@ -391,13 +391,13 @@ class JointPlan:
 class PoleEstimator(JointPlan):
     """Poles from several records of one kind each; parameters are those of `JointPlan`.
 
-    Of one period each there are no bins between harmonics: realisations then tell noise and
+    Of one period each there are no bins between harmonics: realisations then measure noise and
     distortion together, and `covariance` holds both. Input noise counts as none, or as
     `input_noise_ratio` of that of the output where given. `total_covariance` holds also what the
     poles of the realisations scatter by, see `realisations_spread`.
 
     Harmonics of the period that are not excited carry distortion and are not used. A single
-    realisation cannot tell any of this, and is left to `JointPlan`.
+    realisation cannot determine any of this, and is left to `JointPlan`.
 
     Examples
     --------

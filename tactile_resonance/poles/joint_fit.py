@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The joint estimator on the bins of a few points: weights, coefficients, levels, and what contradicts.
 
-Bins between harmonics tell the noise. What realisations differ by on excited lines tells noise and
+Bins between harmonics measure the noise. What realisations differ by on excited lines measures noise and
 stochastic nonlinear distortion together, and what they have in common whether the model holds; of one
-record the cost and the smoothness of the residuals tell that, and a search for what the model lacks.
+record the cost and the smoothness of the residuals show that, and a search for what the model lacks.
 """
 
 from __future__ import annotations
@@ -389,7 +389,7 @@ def _each_by_itself(fit: Judged, first: _Round) -> Judged:
     Where lines are distorted the resonator is not linear. Then its poles are the mean of those of all
     realisations, of the first round, weighted with the noise. Weighted with the distortion of each line
     a resonance that differs would count least, and the bins between harmonics most, where the ringing up
-    of a resonator that is not linear tells of another system.
+    of a resonator that is not linear points to another system.
     """
     theta, levels = first.solution.theta, first.levels
     # gradients as independent lines make them, each with the variance that it shows itself

@@ -50,7 +50,7 @@ class Judged:
         Whether cost, smoothness of the residuals or what the model lacks contradict the model.
     covariance : (batch, p, p) float
         Of the coefficients from noise, of several records of those they share; NaN where noise cannot be
-        told from all else.
+        distinguished from all else.
     total : same shape
         From noise and distortion; NaN where nothing but noise is known.
     kind : (batch,) int
@@ -65,7 +65,7 @@ class Judged:
     lacking : (batch, 3) float
         See `PolesBatch`.
     remark : (batch,) object
-        What else is to be told to people; empty: nothing.
+        A further note for people; empty: none.
     """
 
     theta: FloatArray

@@ -61,7 +61,7 @@ class Level:
         """Level of a fit.
 
         Without bins between harmonics it is from the residuals, and a model error hides in it unless they
-        are smooth. With such bins these tell the level, and the excited ones whether the model holds.
+        are smooth. With such bins these give the level, and the excited ones whether the model holds.
 
         Parameters
         ----------

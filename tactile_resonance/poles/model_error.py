@@ -79,7 +79,7 @@ def model_error_factor(
 ) -> FloatArray:
     """(batch,) factor from the covariance of noise to that of noise and model error.
 
-    The excess of the cost tells how large the errors are; their correlation from line to line, how
+    The excess of the cost shows how large the errors are; their correlation from line to line, how
     many of them act together: errors that keep their sign over L lines disturb a coefficient as L
     times fewer lines of independent errors would.
 
@@ -137,7 +137,7 @@ def difference_of_models(
     """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
 
     Two modes nearer to each other than their widths are fitted by one between them so well that
-    residuals tell little of how far it is from either.
+    residuals say little about how far it is from either.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ class VarianceModel:
     def contradicts(
         self, cost: FloatArray, parameters: int, probability: float
     ) -> npt.NDArray[np.bool_]:
-        """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be told."""
+        """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
         chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
         if self.dof > 2:

@@ -24,7 +24,7 @@ FALSE_ALARM = 1e-4
 MOST_TONES = 8
 """In a band; where there are more bins that stand out, something else is wrong."""
 WINDOW = 33
-"""Bins, or lines, around one that tell the level there."""
+"""Bins, or lines, around one that give the level there."""
 MEDIAN_LOSS = 2.5
 """Times the variance of a mean that a median of exponential powers counts as having: 2.1, and its tails."""
 CERTAIN_LEVERAGE = 0.99

@@ -31,7 +31,7 @@ IntArray = npt.NDArray[np.int64]
 # Scatter that chance makes more often says nothing; the rarer it is, the more it counts. A test that is
 # passed or not would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.
 CHANCE = 0.5
-# Fewer cannot tell whether one is off, or all differ.
+# Fewer cannot show whether one is off, or all differ.
 FEWEST_RECORDS = 4
 # Share of errors (f0, damping) within the ellipse.
 INSIDE = 0.95
@@ -105,9 +105,9 @@ class Spread:
 
     @property
     def information(self) -> FloatArray:
-        """(batch, M, places, 2) share of each realisation in what all tell."""
-        tells = 1 / self.expected
-        return np.asarray(tells / tells.sum(axis=1, keepdims=True))
+        """(batch, M, places, 2) share of each realisation in the information of all."""
+        information = 1 / self.expected
+        return np.asarray(information / information.sum(axis=1, keepdims=True))
 
     @property
     def ratio(self) -> FloatArray:
@@ -142,7 +142,7 @@ class Spread:
         Parameters
         ----------
         alike : (batch,) bool
-            Whether realisations count alike in the mean, not by what they tell.
+            Whether realisations count alike in the mean, not by their information.
         """
         share = np.where(alike[:, None, None, None], 1 / self.records, self.information)
         of_mean = np.sum((share * self._rest(share)) ** 2, axis=1)
@@ -158,7 +158,7 @@ class Spread:
         )
 
     def remarks(self) -> tuple[BoolArray, npt.NDArray[np.object_]]:
-        """(batch,) where one realisation contradicts the others, and what is to be told to people."""
+        """(batch,) where one realisation contradicts the others, and a note for people."""
         surely = self.chance < MODEL_ERROR_PROBABILITY
         if not surely.any():
             return surely, np.full(surely.size, "", object)

@@ -93,7 +93,7 @@ class Poles:
     covariance : (n, 2, 2) float or None
         Of (f0_hz, damping_ratio), from noise.
     total_covariance : (n, 2, 2) float or None
-        From noise, distortion and model error, where they can be told.
+        From noise, distortion and model error, where they can be estimated.
     pole_covariance : (n, 2, 2) float or None
         Of (Re, Im) of each pole [rad^2/s^2], from noise.
     residue_covariance : (n, 2, 2) float or None
@@ -241,7 +241,7 @@ class PolesBatch:
     variance_model : (...) str array
     method : str
     remark : (...) object array of str
-        What else is to be told to people of a point; empty: nothing.
+        A further note for people; empty: none.
     """
 
     poles_rad_s: ComplexArray

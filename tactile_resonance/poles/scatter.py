@@ -4,7 +4,7 @@
 An error of the model is an error of the response: turned by the phase of the input it is the same in
 every realisation. Noise and stochastic nonlinear distortion differ (Pintelon & Schoukens, *System
 Identification: A Frequency Domain Approach*, 2nd ed. (2012), section 4.3). So of M residuals on a
-line one combination may hold model error, and the M - 1 others tell the variance.
+line one combination may hold model error, and the M - 1 others give the variance.
 """
 
 from __future__ import annotations

@@ -118,12 +118,12 @@ def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
     """Why there is none."""
     if np.isfinite(batch.cost[index]):
         return (
-            "the variance of each line has too few degrees of freedom to tell the uncertainty: "
+            "the variance of each line has too few degrees of freedom to estimate the uncertainty: "
             "record more periods or realisations"
         )
     if not _has_total(batch, index):
         return (
-            "the fit leaves too few degrees of freedom to tell the noise: take a wider band, more "
+            "the fit leaves too few degrees of freedom to estimate the noise: take a wider band, more "
             "periods or a smaller order"
         )
     return (

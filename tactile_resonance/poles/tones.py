@@ -105,7 +105,7 @@ def poles_without_tones(
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:
     """Poles of one point, bins with a tone left out and what leaks out of them taken off.
 
-    A tone on the only line that tells a narrow mode cannot be distinguished from response.
+    A tone on the only line that shows a narrow mode cannot be distinguished from response.
 
     Parameters
     ----------

@@ -266,7 +266,7 @@ def _truth_columns(truths: Truths) -> Columns:
 
 
 def _bands_table(results: Sequence[PointResult]) -> str:
-    """Poles of the bands beyond the first; nothing where there are none."""
+    """Poles of the bands beyond the first; empty where there are none."""
     names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
     for result in results:
         for band in result.further:
@@ -282,7 +282,7 @@ def _bands_table(results: Sequence[PointResult]) -> str:
 
 
 def _distortion_table(results: Sequence[PointResult]) -> str:
-    """Levels at the lines left out, against those excited; in brackets the noise; nothing where unknown."""
+    """Levels at the lines left out, against those excited; in brackets the noise; empty where unknown."""
     sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
     names, rows = ("point", "band [Hz]", *sides), []
 
@@ -313,7 +313,7 @@ def _compared_with_plan(scene: ScanScene | None, run: RunContent) -> str:
 
 
 def _touches(surface: Mapping[str, Any] | None) -> str:
-    """What the surface rests on; nothing where it was not found by touch."""
+    """What the surface rests on; empty where it was not found by touch."""
     if surface is None:
         return ""
     names, rows = (

@@ -49,7 +49,7 @@ class Precise:
 
 @dataclass(frozen=True)
 class Separate:
-    """Tell two tissues apart: each kind of error happens with at most ``1 - probability``."""
+    """Distinguish two tissues: each kind of error happens with at most ``1 - probability``."""
 
     first: TissueClass
     second: TissueClass

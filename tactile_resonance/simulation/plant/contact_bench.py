@@ -191,7 +191,7 @@ class VirtualArm:
             self.halt(ArmFault.PROGRAM_STOPPED)
 
     def _heard(self) -> bool:
-        """Whether a command reaches the robot; the client cannot tell."""
+        """Whether a command reaches the robot; the client cannot know."""
         if self._bench.time_ns < self._frozen_until_ns:
             return False
         self._heard_ns = self._bench.time_ns

@@ -35,7 +35,7 @@ Stream = ResponseStream | NonlinearStream | VaryingStream
 
 @dataclass(frozen=True)
 class Effort:
-    """What is simulated for an excitation from rest, and what is left out because nobody could tell.
+    """What is simulated for an excitation from rest, and what is left out because no record would show it.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class BenchRun:
 
     @property
     def negligible_v(self) -> float:
-        """What a converter would not tell [V]: no free decay is computed below it; 0: all are."""
+        """What a converter would not resolve [V]: no free decay is computed below it; 0: all are."""
         return NEGLIGIBLE_COUNTS * self._acquisition.sensor_scale_v * self.effects.quantisation
 
     def truth(self, time_s: float = 0.0) -> CoupledBimorph:

@@ -2,7 +2,7 @@
 """A contact that changes while it is measured.
 
 `ContactHistory`: by creep under a held force, or as depths are given over time (`indent`: a whole test).
-`ContactSoFar`: part by part, as a plant tells.
+`ContactSoFar`: part by part, as a plant reports it.
 """
 
 from __future__ import annotations

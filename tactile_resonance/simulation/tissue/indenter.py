@@ -11,7 +11,7 @@ contact grows and that of Ting (1966) while it shrinks. Spring x has the displac
 from there it recovers free of load. The force is ``2 integral_0^a q dx``.
 
 All springs that touch see the same motion, so sums over them take a few operations per step; only
-the profile of E_j v_j, which tells where the edge goes, is kept, at nodes.
+the profile of E_j v_j, which determines where the edge goes, is kept, at nodes.
 """
 
 from __future__ import annotations
