@@ -40,6 +40,7 @@ def run(options: argparse.Namespace) -> int:
     )
     from tactile_resonance.scan.bench_truth import truths_of
     from tactile_resonance.scan.plan_text import map_names
+    from tactile_resonance.scan.run_content import NOT_CHECKED
 
     truths = truths_of(content)
     pole_maps, pictures = pole_maps_of(content), []
@@ -57,6 +58,8 @@ def run(options: argparse.Namespace) -> int:
         print(line)
     for problem in content.problems:
         print(f"damaged: {problem}")
+    if content.unchecked:
+        print(NOT_CHECKED.format(content.unchecked))
     drawn = ["report.html", *map_names(len(pole_maps))]
     if pole_maps:
         write_map_recording(content)  # last: the page and the table do not wait for it

@@ -207,6 +207,8 @@ class ScanNode(ManagedNode):
             check=controls.check_cancelled,
         )
         run, plan = started.run, started.plan
+        for problem in run.content.problems:
+            self.get_logger().warning(f"damaged, left out of the run: {problem}")
         if UNCHECKED in plan.skipped:
             self.get_logger().warning(UNCHECKED.why)
         result.run_directory, result.points = str(run.path), len(plan.points)

@@ -21,7 +21,7 @@ from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
-from tactile_resonance.scan.run_content import RECORDING, RunContent
+from tactile_resonance.scan.run_content import NOT_CHECKED, RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
@@ -114,7 +114,9 @@ def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
         "Further bands": _bands_table(measured),
         "Nonlinear distortion": _distortion_table(measured),
         "Left out": _bullets(skipped_lines(run)),
-        "Damaged files": _bullets(run.problems),
+        "Damaged files": _bullets(
+            [*run.problems, *([NOT_CHECKED.format(run.unchecked)] if run.unchecked else [])]
+        ),
         "Scene": f"<pre>{html.escape(run.scene)}</pre>",
         "Made with": f"<pre>{html.escape(yaml.safe_dump(facts, sort_keys=False))}</pre>",
     }

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,7 +55,7 @@ def offered_qos(depth: int, *, reliable: bool = True, latched: bool = False) -> 
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TopicContent:
     """One topic of a file; `type_hash` (REP-2011) is that of the definition in the file.
 
@@ -66,6 +67,10 @@ class TopicContent:
     type_hash: str
     qos: Qos | None
     count: int
+
+
+# one object for the same topic of all files: they differ little from file to file
+topic_content = cache(TopicContent)
 
 
 @dataclass(frozen=True)
@@ -161,8 +166,13 @@ class PointFileWriter:
             raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
         self._writer.write(connection, time_ns, cdr)
 
-    def finish(self) -> FileContent:
+    def finish(self, complete: Callable[[Path, FileContent], None] | None = None) -> FileContent:
         """Complete the file and give it its name, durably.
+
+        Parameters
+        ----------
+        complete : callable, optional
+            Called with the file, when all of it is on disk, and what it holds, before it gets its name.
 
         Raises
         ------
@@ -181,10 +191,13 @@ class PointFileWriter:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+        content = read_content(written)
+        if complete is not None:
+            complete(written, content)
         written.rename(self._target)
         sync_folder(self._target.parent)
         shutil.rmtree(self._folder, ignore_errors=True)
-        return read_content(self._target)
+        return content
 
     def abandon(self) -> None:
         """Leave nothing behind; does nothing after `finish`."""
@@ -209,7 +222,7 @@ def read_content(path: Path) -> FileContent:
                 extension = connection.ext
                 assert isinstance(extension, ConnectionExtRosbag2)
                 qos = next(iter(extension.offered_qos_profiles), None)
-                content = TopicContent(
+                content = topic_content(
                     connection.topic,
                     connection.msgtype,
                     hash_of(connection.msgtype, connection.msgdef),

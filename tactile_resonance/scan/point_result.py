@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum, IntEnum
 from typing import Any
@@ -61,7 +58,7 @@ class BandResult:
     poles_status: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # a run keeps one for each of its points
 class PointResult:
     """One attempt at one scan point; ``msg/PointResult.msg`` gives unit and meaning of each field.
 
@@ -137,7 +134,7 @@ class PointResult:
             return self
         nothing = BandResult(NAN, NAN)
         band = self.further[k - 1] if k <= len(self.further) else nothing
-        values: dict[str, Any] = {name: getattr(band, name) for name in _BAND_COLUMNS}
+        values: dict[str, Any] = {name: getattr(band, name) for name in BAND_COLUMNS}
         values |= dict.fromkeys(_OF_FIRST_BAND, NAN)
         return replace(self, **values, tissue_class="", tissue_probability=NAN, tissue_reason="")
 
@@ -176,8 +173,7 @@ class PointResult:
 _OF_BANDS = ("distortion", "further")
 # in the order of the message, the header's two last
 COLUMNS = tuple(field.name for field in fields(PointResult) if field.name not in _OF_BANDS)
-_BAND_COLUMNS = tuple(field.name for field in fields(BandResult))[2:]
-_DISTORTION_COLUMNS = tuple(field.name for field in fields(BandDistortion))[2:]
+BAND_COLUMNS = tuple(field.name for field in fields(BandResult))[2:]
 _OF_FIRST_BAND = tuple(
     name
     for name in COLUMNS
@@ -259,37 +255,3 @@ def band_results(poles: Poles) -> tuple[BandResult, ...]:
         )
         for band in poles.further
     )
-
-
-def as_csv(results: Iterable[PointResult]) -> str:
-    """One row each, numbers with all their digits, unknown numbers ``nan``.
-
-    Where a result has them, columns for the poles of further bands, numbered from ``f0_hz_2``, and for the
-    distortion in each band, ``distortion_even_db``, ``distortion_even_db_2``, ..., follow the others.
-    """
-    text, rows = io.StringIO(), list(results)
-    further = max((len(result.further) for result in rows), default=0)
-    distortion = max((len(result.distortion) for result in rows), default=0)
-    writer = csv.writer(text, lineterminator="\n")
-    numbers = [f"_{k + 1}" if k else "" for k in range(1 + max(further, distortion))]
-    head = [f"{name}{n}" for n in numbers[1 : 1 + further] for name in _BAND_COLUMNS]
-    head += [f"distortion_{name}{n}" for n in numbers[:distortion] for name in _DISTORTION_COLUMNS]
-    writer.writerow([*COLUMNS, *head])
-    for result in rows:
-        row = [getattr(result, name) for name in COLUMNS]
-        for bands, names, count in (
-            (result.further, _BAND_COLUMNS, further),
-            (result.distortion, _DISTORTION_COLUMNS, distortion),
-        ):
-            for k in range(count):
-                row += [getattr(bands[k], name) if k < len(bands) else NAN for name in names]
-        writer.writerow([_write(value) for value in row])
-    return text.getvalue()
-
-
-def _write(value: object) -> str:
-    if isinstance(value, PointOutcome):
-        return value.name.lower()
-    if isinstance(value, PointKind):
-        return value.value
-    return repr(float(value)) if isinstance(value, float) else str(value)

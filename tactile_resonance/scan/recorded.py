@@ -18,7 +18,8 @@ from tactile_resonance.scan.point_result import (
     from_message,
     serialised,
 )
-from tactile_resonance.scan.run_content import RunContent, read_run
+from tactile_resonance.scan.run_content import RECORDING, RunContent, read_run
+from tactile_resonance.scan.run_index import read_entries
 
 EXCITATION = "tactile_resonance/msg/Excitation"
 RECORD = "tactile_resonance/msg/Record"
@@ -39,10 +40,16 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     ValueError
         If it is not a run, or the measurement is not named or not there.
     """
-    entries = run_entries(run)
+    content = read_run(run)
+    entries = _entries(content)
     points = [entry for entry in entries if entry.path.name.startswith("point-")]
     among = points if measurement_id is None and len(points) == 1 else entries
-    return choose(among, measurement_id, run).read()
+    try:
+        return choose(among, measurement_id, run).read()
+    except ValueError as error:
+        if not content.problems:
+            raise
+        raise ValueError(f"{error}; left out: {'; '.join(content.problems)}") from error
 
 
 def run_entries(run: Path) -> list[StoredEntry]:
@@ -53,10 +60,12 @@ def run_entries(run: Path) -> list[StoredEntry]:
     ValueError
         If it is no run.
     """
+    return _entries(read_run(run))
+
+
+def _entries(run: RunContent) -> list[StoredEntry]:
     return [
-        StoredEntry(key, path, _read)
-        for path in read_run(run).paths_in_order
-        for key in _ids_of(path)
+        StoredEntry(key, path, _read) for path in run.paths_in_order for key in _ids_of(path)
     ]
 
 
@@ -74,7 +83,12 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
 
     In runs of earlier versions references have none, and poles are the last ones in the file of the point.
     """
+    entries = read_entries(run.path)
     for path in run.paths_in_order:
+        entry = entries.get(f"{RECORDING}/{path.name}")
+        if entry is not None and entry.result is not None:
+            yield entry.message
+            continue
         for _, _, message in read_messages_of_type(path, TYPE):
             poles = None
             for _, topic, poles_message in read_messages_of_type(path, POLES_TYPE):

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +15,12 @@ from typing import Any
 from tactile_resonance.fields import read_dataclass
 from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
 from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
+from tactile_resonance.scan.run_index import Entry, read_entries
 from tactile_resonance.scan.scan_point import ScanPoint
 
+NOT_CHECKED = "{} files are not checked for damage: an earlier version recorded them"
 FORMAT = "tactile_resonance run 1"
-RECORDING = "recording"
+RECORDING, SCENE = "recording", "scene.yaml"
 _POINT = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
 
 
@@ -39,7 +42,9 @@ class RunContent:
     results : tuple of PointResult
         Of every attempt, by point and attempt.
     problems : tuple of str
-        Damaged and foreign files, by name.
+        Damaged, missing and foreign files, by name.
+    unchecked : int
+        Files whose checksum is not known: an earlier version finished them.
     """
 
     path: Path
@@ -49,6 +54,7 @@ class RunContent:
     files: tuple[FileContent, ...] = ()
     results: tuple[PointResult, ...] = ()
     problems: tuple[str, ...] = ()
+    unchecked: int = 0
 
     @cached_property
     def latest(self) -> tuple[PointResult, ...]:
@@ -69,9 +75,8 @@ class RunContent:
 
     def with_file(self, file: FileContent, result: PointResult | None) -> RunContent:
         """The same with one finished file more."""
-        results = self.results if result is None else (*self.results, result)
-        ordered = sorted(results, key=lambda r: (r.index, r.attempt))
-        return replace(self, files=(*self.files, file), results=tuple(ordered))
+        results = self.results if result is None else _in_order((*self.results, result))
+        return replace(self, files=(*self.files, file), results=results)
 
 
 def file_of(run: Path, result: PointResult) -> Path:
@@ -82,21 +87,70 @@ def file_of(run: Path, result: PointResult) -> Path:
 def read_run(path: Path) -> RunContent:
     """Everything readable of a run, of one that is being recorded too.
 
+    Every byte is compared with the checksums of ``index.jsonl``; a damaged file counts as if it were not there,
+    and its point as not finished.
+
     Raises
     ------
     ValueError
         If it is no run.
     """
     run = read_plan(path)
-    problems = []
-    for file in sorted((run.path / RECORDING).iterdir()):
-        if file.suffix in (".yaml", ".part"):
-            continue
-        try:
-            run = run.with_file(*_read_file(file, len(run.points)))
-        except ValueError as error:
-            problems.append(str(error))
-    return replace(run, problems=tuple(problems))
+    folder = run.path / RECORDING
+    paths = [file for file in sorted(folder.iterdir()) if file.suffix not in (".yaml", ".part")]
+    names = {f"{RECORDING}/{file.name}": file for file in paths}
+    entries = read_entries(run.path)  # after the names: each has its line before
+    problems, files, results = _missing(run.path, entries), [], []
+    scene = entries.get(SCENE)
+    if scene is not None and (damage := scene.damage(run.path / SCENE)):
+        problems.append(f"{SCENE}: {damage}")
+    with ThreadPoolExecutor() as pool:  # a checksum holds no lock of the interpreter
+        read = pool.map(lambda name: _checked(names[name], entries.get(name), run), names)
+        for content, result, problem in read:
+            if content is not None:
+                files.append(content)
+            if result is not None:
+                results.append(result)
+            if problem:
+                problems.append(problem)
+    return replace(
+        run,
+        files=tuple(files),
+        results=_in_order(results),
+        problems=tuple(problems),
+        unchecked=sum(f"{RECORDING}/{file.name}" not in entries for file in files),
+    )
+
+
+def _missing(run: Path, entries: Mapping[str, Entry]) -> list[str]:
+    """Files that were finished and are no longer there.
+
+    The last one may never have been: its line is written before the file has its name.
+    """
+    return [
+        f"{Path(name).name}: finished, but no longer there"
+        for name in list(entries)[:-1]
+        if not (run / name).exists()
+    ]
+
+
+def _checked(
+    path: Path, entry: Entry | None, run: RunContent
+) -> tuple[FileContent | None, PointResult | None, str]:
+    """What a file holds, its result, and what is wrong with it."""
+    try:
+        damage = "" if entry is None else entry.damage(path)
+        if entry is None or not damage and entry.result is None:
+            return *_read_file(path, len(run.points)), ""
+    except (OSError, ValueError) as error:
+        return None, None, str(error)
+    if damage:
+        return None, None, f"{path.name}: {damage}"
+    return entry.content, entry.result if _POINT.fullmatch(path.name) else None, ""
+
+
+def _in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
+    return tuple(sorted(results, key=lambda result: (result.index, result.attempt)))
 
 
 def read_plan(path: Path) -> RunContent:
@@ -112,7 +166,7 @@ def read_plan(path: Path) -> RunContent:
         content = json.loads((path / "run.json").read_text(encoding="utf-8"))
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
-        scene = (path / "scene.yaml").read_text(encoding="utf-8")
+        scene = (path / SCENE).read_text(encoding="utf-8")
         points = tuple(
             read_dataclass(ScanPoint, point, f"points[{i}]")
             for i, point in enumerate(content["points"])

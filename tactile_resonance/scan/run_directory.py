@@ -8,10 +8,13 @@
     RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
     RUN/recording/reference-00-air.mcap references of the session
     RUN/recording/metadata.yaml         makes all of them one rosbag2 recording
+    RUN/index.jsonl                     checksum, content and result of each finished file: `scan.run_index`
     RUN/results.csv                     one row per finished point, its latest attempt
 
-A point is finished when its file is there. Files get their names when they are complete and on disk;
-``metadata.yaml`` and ``results.csv`` follow from the files and are rebuilt when a run is opened.
+A point is finished when its file is there. Files get their names when they are complete, on disk and in
+``index.jsonl``; ``metadata.yaml`` and ``results.csv`` follow from the files and are rebuilt when a run is
+opened. While it is recorded ``metadata.yaml`` may lag behind by a twentieth of the files: written after each,
+it would cost more than the files of a long run.
 """
 
 from __future__ import annotations
@@ -43,10 +46,17 @@ from tactile_resonance.scan.point_result import (
     TOPIC,
     TYPE,
     PointResult,
-    as_csv,
     serialised,
 )
-from tactile_resonance.scan.run_content import FORMAT, RECORDING, RunContent, read_run
+from tactile_resonance.scan.results_file import ResultsFile
+from tactile_resonance.scan.run_content import FORMAT, RECORDING, SCENE, RunContent, read_run
+from tactile_resonance.scan.run_index import (
+    INDEX,
+    append_entry,
+    entry_of,
+    read_entries,
+    write_entries,
+)
 from tactile_resonance.scan.scan_point import ScanPoint
 
 if TYPE_CHECKING:
@@ -72,6 +82,8 @@ class RunDirectory:
         self.path = path
         self.content = content
         self._lock = lock
+        self._results = ResultsFile(path, content.latest)
+        self._write_metadata()
 
     @classmethod
     def create(
@@ -119,9 +131,8 @@ class RunDirectory:
         (path / RECORDING).mkdir(parents=True)
         lock = _lock(path)
         try:
-            write_whole(path / "scene.yaml", scene.encode())
-            write_bag_metadata(path / RECORDING, [])
-            write_whole(path / "results.csv", as_csv([]).encode())
+            write_whole(path / SCENE, scene.encode())
+            write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text.encode())  # last: with it the run exists
             sync_folder(path)
             sync_folder(path.parent)
@@ -161,9 +172,8 @@ class RunDirectory:
         path = Path(path)
         lock = _lock(path)
         try:
-            run = cls(path, lock, read_run(path))
-            other = _other_definitions(run.content)
-            if other:
+            content = read_run(path)
+            if other := _other_definitions(content):
                 raise ValueError(
                     f"run: {path} was recorded by a version with other definitions of {', '.join(other)}; "
                     "accepted is that version (report and analyze take the run as it is)"
@@ -171,8 +181,8 @@ class RunDirectory:
             shutil.rmtree(path / HIDDEN, ignore_errors=True)
             for part in [*path.glob("*.part"), *(path / RECORDING).glob("*.part")]:
                 part.unlink()
-            run._write_summaries()
-            return run
+            _mend_index(path)
+            return cls(path, lock, content)
         except BaseException:
             os.close(lock)
             raise
@@ -184,8 +194,10 @@ class RunDirectory:
         self.close()
 
     def close(self) -> None:
-        """Give the folder free."""
+        """Complete the summaries and give the folder free."""
         if self._lock >= 0:
+            if self._listed < len(self.content.files):
+                self._write_metadata()
             os.close(self._lock)
             self._lock = -1
 
@@ -208,12 +220,14 @@ class RunDirectory:
 
     def _add(self, file: FileContent, result: PointResult | None) -> None:
         self.content = self.content.with_file(file, result)
-        self._write_summaries()
+        if result is not None:
+            self._results.add(result, self.content.latest)
+        if len(self.content.files) > 1.05 * self._listed:
+            self._write_metadata()
 
-    def _write_summaries(self) -> None:
-        """What follows from the finished files; lost or old, it is made again by `open`."""
+    def _write_metadata(self) -> None:
         write_bag_metadata(self.path / RECORDING, self.content.files)
-        write_whole(self.path / "results.csv", as_csv(self.content.latest).encode())
+        self._listed = len(self.content.files)
 
 
 class PointRecording:
@@ -281,7 +295,13 @@ class PointRecording:
             raise ValueError(f"result: got point and attempt {got}; accepted is {own}")
         cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
         self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
-        self._run._add(self._writer.finish(), None if self.index is None else result)
+        of_point, run = None if self.index is None else result, self._run
+
+        def enter(path: Path, content: FileContent) -> None:
+            entry = entry_of(path, f"{RECORDING}/{content.name}", content, cdr)
+            append_entry(run.path, entry)
+
+        run._add(self._writer.finish(enter), of_point)
         return cdr
 
 
@@ -299,6 +319,19 @@ def _other_definitions(content: RunContent) -> list[str]:
     """Types of a run whose messages are defined in another way today."""
     hashes = {(topic.type_name, topic.type_hash) for file in content.files for topic in file.topics}
     return sorted(name for name, of_run in hashes if definition_and_hash(name)[1] != of_run)
+
+
+def _mend_index(path: Path) -> None:
+    """Remove what an interruption left at the end: part of a line, or one whose file never got its name."""
+    entries, index = read_entries(path), path / INDEX
+    if not entries:
+        return
+    last = next(reversed(entries))
+    if not (path / last).exists():
+        del entries[last]
+    elif index.read_bytes().endswith(b"\n"):
+        return
+    write_entries(path, entries.values())
 
 
 def _lock(path: Path) -> int:

@@ -359,9 +359,12 @@ class ScanRunner:
         count = {o: sum(result.outcome is o for result in latest) for o in PointOutcome}
         complete = self._run.content.next_point is None
         health, sentence = sensor_health(self._run.content, self._scene.drift_limits)
+        message = message or ("complete" if complete else "ended early")
+        if problems := self._run.content.problems:
+            message += f"; {len(problems)} damaged files left out, the first: {problems[0]}"
         return Summary(
             complete=complete,
-            message=message or ("complete" if complete else "ended early"),
+            message=message,
             done=count[PointOutcome.DONE],
             failed=count[PointOutcome.FAILED],
             skipped=count[PointOutcome.SKIPPED],

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``index.jsonl`` of a run: what each file was when it was finished.
+
+One line is appended per finished file, before the file gets its name: the checksum of the line, then JSON with
+size and checksum of the file, what it holds and its ``PointResult`` message. A run is read from these lines,
+and a file that no longer agrees with its line is damaged. Checksums are CRC-32 (`zlib.crc32`): they detect
+damage, not forgery. Runs of earlier versions have no index; their files are read and cannot be checked.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+
+from tactile_resonance.files import write_whole
+from tactile_resonance.scan.messages import definition_and_hash, message_types
+from tactile_resonance.scan.point_file import FileContent, TopicContent, topic_content
+from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
+
+INDEX = "index.jsonl"
+_PART_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One finished file.
+
+    Attributes
+    ----------
+    name : str
+        Relative to the run's folder.
+    size : int
+        [bytes]
+    crc32 : int
+        Of all its bytes.
+    content : FileContent or None
+        None: it is no recording.
+    message : bytes
+        Its ``msg/PointResult`` (CDR); empty: it has none.
+    """
+
+    name: str
+    size: int
+    crc32: int
+    content: FileContent | None = None
+    message: bytes = b""
+
+    @property
+    def result(self) -> PointResult | None:
+        """Of the message; None where there is none, or its definition is not that of today."""
+        topics = self.content.topics if self.content else ()
+        today = definition_and_hash(TYPE)[1]
+        if not any((topic.type_name, topic.type_hash) == (TYPE, today) for topic in topics):
+            return None
+        return from_message(message_types().deserialize_cdr(self.message, TYPE))
+
+    def damage(self, path: Path) -> str:
+        """What of a file is not as it was when it was finished; empty: nothing."""
+        size = path.stat().st_size
+        if size != self.size:
+            return f"has {size} bytes, {self.size} when it was finished"
+        return "" if crc32_of(path) == self.crc32 else "differs from what was finished (checksum)"
+
+
+def entry_of(
+    path: Path,
+    name: str,
+    content: FileContent | None = None,
+    message: bytes = b"",
+) -> Entry:
+    """Entry of a file that is complete; arguments as the fields of `Entry`."""
+    return Entry(name, path.stat().st_size, crc32_of(path), content, message)
+
+
+def crc32_of(path: Path) -> int:
+    """CRC-32 of a file's bytes."""
+    found = 0
+    with path.open("rb") as file:
+        while part := file.read(_PART_BYTES):
+            found = zlib.crc32(part, found)
+    return found
+
+
+def append_entry(run: Path, entry: Entry) -> None:
+    """Add a line, durably."""
+    with (run / INDEX).open("ab") as file:
+        file.write(_line(entry))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_entries(run: Path, entries: Iterable[Entry]) -> None:
+    """Replace all lines."""
+    write_whole(run / INDEX, b"".join(map(_line, entries)))
+
+
+def read_entries(run: Path) -> dict[str, Entry]:
+    """The last valid line of each file, by its name and in the order of the lines.
+
+    A line that is damaged or of another format is left out: its file is then read, and not checked.
+    """
+    entries: dict[str, Entry] = {}
+    try:
+        lines = (run / INDEX).read_bytes().splitlines()
+    except FileNotFoundError:
+        return entries
+    for line in lines:
+        checksum, _, text = line.partition(b" ")
+        if checksum != b"%08x" % zlib.crc32(text):
+            continue
+        try:
+            entry = _entry(json.loads(text))
+        except (ValueError, TypeError, KeyError):  # fields of another version
+            continue
+        entries.pop(entry.name, None)
+        entries[entry.name] = entry
+    return entries
+
+
+def _line(entry: Entry) -> bytes:
+    fields: dict[str, Any] = {"name": entry.name, "size": entry.size, "crc32": entry.crc32}
+    if (content := entry.content) is not None:
+        topics = [
+            [t.name, t.type_name, t.type_hash, _qos_text(t.qos), t.count] for t in content.topics
+        ]
+        fields["content"] = [content.name, content.start_ns, content.end_ns, topics]
+    if entry.message:
+        fields["point_result"] = base64.b64encode(entry.message).decode()
+    text = json.dumps(fields, separators=(",", ":")).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _entry(fields: Mapping[str, Any]) -> Entry:
+    content = None
+    if "content" in fields:
+        name, start_ns, end_ns, topics = fields["content"]
+        content = FileContent(name, start_ns, end_ns, tuple(_topic(*topic) for topic in topics))
+    message = base64.b64decode(fields.get("point_result", ""))
+    return Entry(fields["name"], fields["size"], fields["crc32"], content, message)
+
+
+def _qos_text(qos: Qos | None) -> str:
+    return json.dumps([] if qos is None else dump_qos_v9([qos]), separators=(",", ":"))
+
+
+@cache
+def _topic(name: str, type_name: str, type_hash: str, qos: str, count: int) -> TopicContent:
+    offered = next(iter(parse_qos(json.loads(qos))), None)
+    return topic_content(name, type_name, type_hash, offered, count)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run knows when one of its files is damaged, and its index never stands in the way."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.scan.point_result import PointKind
+from tactile_resonance.scan.recorded import recorded_results
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.run_index import INDEX, crc32_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from run_tables import RECORD, START_NS, assert_same, plan, record_cdr, record_point, result
+
+FLIPS = 300
+
+
+def recorded(path, count=3):
+    """A run of some points and a reference."""
+    with RunDirectory.create(path, "name: test\nforce_n: 0.01\n", plan(count), {}) as run:
+        with run.begin_reference("air-before") as reference:
+            reference.write("/excitation", RECORD, START_NS - 10**9, record_cdr(9))
+            reference.finish(result(count, kind=PointKind.AIR, time_ns=START_NS - 10**9))
+        for index in range(count):
+            record_point(run, index)
+    return path
+
+
+def assert_all_same(a, b):
+    assert len(a) == len(b)
+    for one, other in zip(a, b, strict=True):
+        assert_same(one, other)
+
+
+def flipped(path, random):
+    """Content with one bit of it flipped."""
+    content = bytearray(path.read_bytes())
+    content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+    return bytes(content)
+
+
+def test_no_flipped_bit_of_a_recording_is_silent(tmp_path):
+    run, random = recorded(tmp_path / "run"), np.random.default_rng(21)
+    whole = read_run(run)
+    files = sorted((run / "recording").glob("*.mcap"))
+    assert (len(files), whole.problems, whole.unchecked) == (4, (), 0)
+    for path in [files[k] for k in random.integers(len(files), size=FLIPS)]:
+        before = path.read_bytes()
+        path.write_bytes(flipped(path, random))
+        found = read_run(run)
+        path.write_bytes(before)
+        (problem,) = found.problems
+        assert problem == f"{path.name}: differs from what was finished (checksum)"
+        assert {file.name for file in found.files} == {p.name for p in files} - {path.name}
+        left = [r for r in whole.results if f"point-{r.index:05d}" not in path.name]
+        assert_all_same(found.results, left)
+
+
+def test_no_flipped_bit_of_the_index_changes_a_result(tmp_path):
+    """Its line is left out, and the file read in its place; where the run was interrupted it goes on."""
+    run, random = recorded(tmp_path / "run"), np.random.default_rng(22)
+    whole, index = read_run(run), run / INDEX
+    before = index.read_bytes()
+    for _ in range(FLIPS // 10):
+        index.write_bytes(flipped(index, random))
+        found = read_run(run)
+        assert_all_same(found.results, whole.results)
+        assert found.files == whole.files
+        assert found.problems == ()
+        assert found.unchecked <= 2  # a flipped end of line takes the next one with it
+        index.write_bytes(before)
+
+
+def test_a_changed_scene_and_a_missing_file_are_named(tmp_path):
+    run = recorded(tmp_path / "run")
+    (run / "scene.yaml").write_text("name: tist\nforce_n: 0.01\n")
+    (run / "recording" / "point-00001-00.mcap").unlink()
+    found = read_run(run)
+    assert found.problems == (
+        "point-00001-00.mcap: finished, but no longer there",
+        "scene.yaml: differs from what was finished (checksum)",
+    )
+    assert found.next_point.index == 1
+
+
+def test_results_and_messages_from_the_index_are_those_of_the_files(tmp_path):
+    run = recorded(tmp_path / "run")
+    with_index = read_run(run)
+    messages = list(recorded_results(with_index))
+    (run / INDEX).unlink()  # as of an earlier version
+    without = read_run(run)
+    assert (with_index.unchecked, without.unchecked) == (0, 4)
+    assert_all_same(with_index.results, without.results)
+    assert with_index.files == without.files
+    assert list(recorded_results(without)) == messages
+
+
+def test_what_an_interruption_left_in_the_index_is_mended(tmp_path):
+    run = recorded(tmp_path / "run", 2)
+    index, last = run / INDEX, run / "recording" / "point-00001-00.mcap"
+    whole = index.read_bytes()
+    last.rename(tmp_path / "never had its name")
+    assert read_run(run).problems == ()
+    with RunDirectory.open(run) as again:
+        assert again.content.next_point.index == 1
+        record_point(again, 1)
+    assert len(index.read_bytes().splitlines()) == len(whole.splitlines())
+    index.write_bytes(index.read_bytes() + b"12345678 {half a l")
+    with RunDirectory.open(run) as again:
+        record_point(again, 0)  # a second attempt, whose line begins where the torn one stood
+    found = read_run(run)
+    assert (found.problems, found.unchecked) == ((), 0)
+    assert [(r.index, r.attempt) for r in found.results] == [(0, 0), (0, 1), (1, 0)]
+
+
+def test_checksum_is_that_of_other_tools(tmp_path):
+    """The check value of CRC-32/ISO-HDLC (Williams, A painless guide to CRC error detection, 1993)."""
+    (tmp_path / "file").write_bytes(b"123456789")
+    assert crc32_of(tmp_path / "file") == 0xCBF43926
