@@ -139,7 +139,7 @@ BAD = {
     "missing sensor": (
         damaged(y=None),
         (),
-        "y (--y): got 'y'; accepted is a field of bad.npz, which holds",
+        "y (--y): got 'y'; accepted is an array of numbers in bad.npz, which holds",
     ),
     "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y (--y): 12000 samples are NaN or infinite"),
     "constant": (damaged(u=np.ones(6 * N)), (), "u (--u): constant (1 V)"),

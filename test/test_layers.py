@@ -10,7 +10,7 @@ from tactile_resonance import cli
 PACKAGE = Path(cli.__file__).parent
 TOOLS = {
     *("clock", "configuration", "fields", "files", "processes"),
-    *("rows_file", "strict_yaml"),
+    *("array_files", "rows_file", "strict_yaml"),
 }
 CORE = {
     *("contact", "frf", "poles", "tissue"),

@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
-from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
+from tactile_resonance.array_files import read_arrays
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import (
     FileName,
@@ -250,9 +249,9 @@ class _HeightFile:
     def surface(self, folder: Path) -> Surface:
         path = folder / self.file
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                axes = [np.asarray(archive[name], float) for name in ("x_m", "y_m", "z_m")]
-        except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile, zlib.error) as error:
+            arrays, _ = read_arrays(path, names := ("x_m", "y_m", "z_m"))
+            axes = [np.asarray(arrays[name], float) for name in names]
+        except (OSError, KeyError, TypeError, ValueError) as error:
             accepted = f"an .npz with x_m, y_m, z_m ({error})"
             raise ValueError(f"file: got {str(path)!r}; accepted is {accepted}") from error
         return HeightField(*axes)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Named arrays of .npz, .mat and .csv files of any origin: what is wanted of them, within bounds, or one line.
+
+SciPy's reader of .mat files ends its process at some damaged files (SIGSEGV, SIGBUS): it has one of its own.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from tactile_resonance.fields import cut
+
+Arrays = Mapping[str, np.ndarray]
+ACCEPTED = ".npz, .mat and .csv"
+MOST_BYTES = 1 << 32
+"""Of a file, and of the arrays that are wanted of it."""
+_LONGEST_LINE = 1 << 16
+_NUMBERS = "biufc"  # kinds of numpy's types
+_MAT_WITHIN_S = 300.0
+# the arguments: file, target and the wanted names; numbers alone are taken over
+_MAT_READER = """
+import sys
+import numpy as np, scipy.io
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (1 << 34, 1 << 34))
+except ImportError:  # not on Windows
+    pass
+path, target, *wanted = sys.argv[1:]
+names = [name for name, *_ in scipy.io.whosmat(path)]
+held = [name for name in names if name in wanted]
+content = scipy.io.loadmat(path, variable_names=held) if held else {}
+arrays = {f"a{names.index(n)}": content[n] for n in held if content[n].dtype.kind in "biufc"}
+np.savez(target, names=np.array(names or [""]), **arrays)
+"""
+
+
+def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
+    """Arrays of a file.
+
+    Parameters
+    ----------
+    path : Path
+    wanted : collection of str
+        Names; others are not read.
+
+    Returns
+    -------
+    arrays : mapping
+        Those of the wanted names that the file holds as arrays of numbers.
+    names : list of str
+        All that it holds.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is none of `ACCEPTED`, or the file is damaged, too large or no regular file.
+    OSError
+        If it cannot be opened.
+    """
+    readers = {".npz": read_npz, ".mat": _read_mat, ".csv": _read_csv}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(f"{path.name}: no record, accepted are {ACCEPTED}")
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):  # a device has no end, a pipe would wait
+        raise ValueError(f"{path.name}: a folder or device, accepted are files {ACCEPTED}")
+    if not 0 < found.st_size <= MOST_BYTES:
+        size = "empty file" if not found.st_size else f"{found.st_size / 1e9:.1f} GB"
+        raise ValueError(f"{path.name}: {size}, accepted are {ACCEPTED} up to 4 GiB")
+    return reader(path, wanted)
+
+
+def read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
+    """`read_arrays` of an .npz file, whatever its suffix."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            names = list(archive.files)
+            held = [name for name in names if name in wanted]
+            sizes = {info.filename: info.file_size for info in archive.zip.infolist()}
+            most = max((sizes[_member(name, sizes)] for name in held), default=0)
+            if most > MOST_BYTES:
+                raise ValueError(f"an array of {most / 1e9:.1f} GB, accepted are 4 GiB")
+            arrays = {name: _array(archive.zip, _member(name, sizes)) for name in held}
+        return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, names
+    except Exception as error:  # whatever zipfile and numpy meet in a damaged file
+        raise ValueError(f"{path.name}: no .npz record ({_reason(error)})") from error
+
+
+def _member(name: str, sizes: Mapping[str, int]) -> str:
+    """Name in the archive of what numpy calls `name`."""
+    return f"{name}.npy" if f"{name}.npy" in sizes else name
+
+
+def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    """One array; what its header promises is compared with what is there before memory is taken."""
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
+        if version not in header:
+            raise ValueError(f"array format {version}")
+        shape, _, dtype = header[version](file)
+        promised, there = int(np.prod(shape, dtype=float)) * dtype.itemsize, archive.getinfo(member)
+        if promised > there.file_size:
+            raise ValueError(f"{member} promises {promised} bytes and holds {there.file_size}")
+    with archive.open(member) as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def _read_mat(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "arrays.npz"
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _MAT_READER, path, target, *wanted],
+                capture_output=True,
+                text=True,
+                timeout=_MAT_WITHIN_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ValueError(f"{path.name}: no .mat record (no end in sight)") from error
+        if done.returncode < 0:
+            reason = f"damaged: its reader ended by signal {-done.returncode}"
+            raise ValueError(f"{path.name}: no .mat record ({reason})")
+        last = (done.stderr.strip().splitlines() or [""])[-1]
+        if "NotImplementedError" in last:
+            raise ValueError(
+                f"{path.name}: MATLAB 7.3 file, accepted are versions up to 7 (save with '-v7')"
+            )
+        if done.returncode:
+            raise ValueError(f"{path.name}: no .mat record ({cut(last)[:120]})")
+        with np.load(target) as archive:
+            names = [str(name) for name in archive["names"] if name]
+            arrays = {
+                name: archive[f"a{k}"] for k, name in enumerate(names) if f"a{k}" in archive.files
+            }
+    return arrays, names
+
+
+def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = _lines(file)
+            head = next(lines, "")
+            dialect = csv.Sniffer().sniff(head, delimiters=",;\t")
+            names = [name.strip() for name in next(csv.reader([head], dialect))]
+            names[0] = names[0].removeprefix("#").strip()  # as numpy.savetxt marks a header
+            if len(set(names)) < len(names):
+                raise ValueError(f"columns named alike: {', '.join(names)}")
+            columns = np.loadtxt(lines, delimiter=dialect.delimiter, ndmin=2)
+        if not columns.size:
+            raise ValueError("no numbers under the header")
+    except (csv.Error, ValueError, StopIteration) as error:
+        raise ValueError(
+            f"{path.name}: no .csv record ({_reason(error)}); expected a header line with the names "
+            "of the columns, then numbers"
+        ) from error
+    if columns.shape[1] != len(names):
+        raise ValueError(
+            f"{path.name}: {columns.shape[1]} columns under {len(names)} names, expected as many"
+        )
+    of_names = zip(names, columns.T, strict=True)
+    return {name: column for name, column in of_names if name in wanted}, names
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """Lines that are not blank."""
+    while line := file.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise ValueError(f"a line of {_LONGEST_LINE} characters or more")
+        if line.strip():
+            yield line
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0][:120] or type(error).__name__

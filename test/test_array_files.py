@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of arrays from anywhere: read what is wanted, or refuse in one line; this process stays alive."""
+
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tactile_resonance.array_files import read_arrays
+
+NAMES = ("u", "y")
+# two fields of numbers, damaged: SciPy 1.17 ends with SIGSEGV or SIGABRT at it
+DAMAGED = Path(__file__).with_name("damaged.mat")
+
+
+def test_a_damaged_mat_file_does_not_end_this_process():
+    with pytest.raises(ValueError, match=r"^damaged.mat: no .mat record \(\S[^\n]*\)$"):
+        read_arrays(DAMAGED, NAMES)
+
+
+def test_what_is_not_wanted_is_neither_read_nor_in_the_way(tmp_path):
+    np.savez(tmp_path / "a.npz", u=np.arange(3), text=np.array("x"), o=np.array([{}], object))
+    scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3), "text": "x", "o": {"a": 1}})
+    for name in ("a.npz", "a.mat"):
+        arrays, names = read_arrays(tmp_path / name, NAMES)
+        assert set(names) == {"u", "text", "o"}
+        np.testing.assert_array_equal(np.ravel(arrays["u"]), np.arange(3))
+        assert read_arrays(tmp_path / name, ("text",))[0] == {}  # no numbers
+
+
+def test_an_array_that_promises_more_than_it_holds_takes_no_memory(tmp_path):
+    header = io.BytesIO()
+    head = {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)}
+    np.lib.format.write_array_header_1_0(header, head)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("u.npy", header.getvalue() + b"\0" * 800)
+    with pytest.raises(ValueError, match="u.npy promises 8796093022208 bytes and holds 928"):
+        read_arrays(tmp_path / "a.npz", NAMES)
+
+
+def test_lines_without_end_and_devices_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("u,y\n" + "1" * 70_000)
+    with pytest.raises(ValueError, match="a line of 65536 characters or more"):
+        read_arrays(tmp_path / "a.csv", NAMES)
+    (tmp_path / "zero.csv").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe.npz")
+    for name in ("zero.csv", "pipe.npz"):
+        with pytest.raises(ValueError, match=f"{name}: a folder or device"):
+            read_arrays(tmp_path / name, NAMES)
+    with (tmp_path / "huge.npz").open("wb") as file:
+        file.truncate(5 << 30)
+    with pytest.raises(ValueError, match=r"huge.npz: 5.4 GB, accepted are .* up to 4 GiB"):
+        read_arrays(tmp_path / "huge.npz", NAMES)
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), suffix=st.sampled_from([".npz", ".csv"]))
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path, data, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".npz":
+        np.savez_compressed(path, u=np.arange(40.0), y=np.arange(40.0))
+    else:
+        table = np.column_stack([np.arange(40.0)] * 2)
+        np.savetxt(path, table, delimiter=",", header="u,y")
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 5))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    refused = ""
+    try:
+        arrays, _ = read_arrays(path, NAMES)
+    except ValueError as error:
+        arrays, refused = {}, str(error)
+    assert refused == "" or (refused.startswith(path.name) and len(refused.splitlines()) == 1)
+    assert all(array.dtype.kind in "biufc" for array in arrays.values())
