@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,8 @@ PARAMETERS = (
 
 # Poles may come faster than anybody looks.
 PUBLISH_PERIOD_S = 0.2
+BUSY_SHARE = 0.1
+"""Of its time that the node draws at most: messages of 10 000 points take seconds."""
 # rviz drops a cloud whose frame it does not know yet, and the markers of what is switched off.
 REPEAT_PERIOD_S = 1.5
 
@@ -143,6 +146,7 @@ class PoleMapNode(ManagedNode):
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
         self._shown: dict[str, Any] = {}  # messages of rosbags
+        self._repeat_from_s = 0.0
         self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
         self._pause.cancel()
         self.resources.callback(self.destroy_timer, self._pause)
@@ -251,7 +255,10 @@ class PoleMapNode(ManagedNode):
             name for name in self._old if self._publishers_of[name].get_subscription_count() > 0
         }
         if wanted:
+            begun_s = time.monotonic()
             self._publish(wanted)
+            pause_s = max(PUBLISH_PERIOD_S, (time.monotonic() - begun_s) / BUSY_SHARE)
+            self._pause.timer_period_ns = round(1e9 * pause_s)
             self._pause.reset()
 
     def _on_pause_over(self) -> None:
@@ -276,11 +283,16 @@ class PoleMapNode(ManagedNode):
 
     def _repeat(self) -> None:
         """Publish what is shown once more, dated now: the frame may be known from now on only."""
+        begun_s = time.monotonic()
+        if begun_s < self._repeat_from_s:
+            return
         now_ns = self.get_clock().now().nanoseconds
         for name, message in self._shown.items():
             if name not in self._old and self._publishers_of[name].get_subscription_count() > 0:
                 restamp(message, now_ns)
                 self._publishers_of[name].publish(to_cdr(message))
+        ended_s = time.monotonic()
+        self._repeat_from_s = ended_s + (ended_s - begun_s) / BUSY_SHARE
 
     def _scale(self, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
