@@ -19,6 +19,7 @@ it would cost more than the files of a long run.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -194,10 +195,11 @@ class RunDirectory:
         self.close()
 
     def close(self) -> None:
-        """Complete the summaries and give the folder free."""
+        """Complete the summaries, where the disk takes them, and give the folder free."""
         if self._lock >= 0:
             if self._listed < len(self.content.files):
-                self._write_metadata()
+                with contextlib.suppress(OSError):  # `open` makes them anew
+                    self._write_metadata()
             os.close(self._lock)
             self._lock = -1
 

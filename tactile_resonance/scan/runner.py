@@ -109,6 +109,10 @@ class ScanRunner:
             message = str(error)
         except Interrupted:
             message = "cancelled"
+        except OSError as error:  # the disk is full, or gone
+            safe = len(self._run.content.latest)
+            reason = error.strerror or error
+            message = f"{self._run.path}: {reason}; {safe} points are safe in it, resume goes on"
         finally:
             self._hands.retract()
         return self._summary(message)

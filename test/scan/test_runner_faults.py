@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points that fail or are disturbed, nodes that go away: what is repeated, what goes on, what ends."""
 
+import errno
+import os
 import sys
 import threading
 from dataclasses import dataclass
@@ -252,4 +254,18 @@ def test_what_cannot_go_on_ends_with_its_reason_and_the_tip_free(tmp_path):
     assert "no node takes the goal" in summary.message
     assert not summary.complete
     assert run.latest == ()
+    assert not bench.holding
+
+
+def test_a_full_disk_ends_the_scan_with_its_path_and_what_is_safe(tmp_path):
+    def full(bench, blocks):
+        if bench.log[-1] == ("touch", 2):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    bench = Bench(on_measure=full)
+    summary, run, _ = scan(tmp_path / "run", scene(), bench)
+    text = "No space left on device; 2 points are safe in it, resume goes on"
+    assert summary.message == f"{tmp_path / 'run'}: {text}"
+    assert (summary.complete, summary.done) == (False, 2)
+    assert run.next_point.index == 2
     assert not bench.holding
