@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from tactile_resonance.processes import ENDING
+
 
 class OneLineParser(argparse.ArgumentParser):
     """Reports wrong arguments in one line, as all other errors are reported."""
@@ -36,7 +38,8 @@ class Version(argparse.Action):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
     with contextlib.suppress(ValueError):  # of another thread than the main one
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for number in ENDING[1:]:
+            signal.signal(number, signal.default_int_handler)
     try:
         parsed = _parser().parse_args(arguments)
         return parsed.run(parsed)
@@ -57,7 +60,7 @@ def command() -> NoReturn:
     status = 130
     with contextlib.suppress(KeyboardInterrupt):  # one that came as the command ended
         status = main()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             signal.signal(number, signal.SIG_IGN)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):  # its reader has gone

@@ -17,6 +17,13 @@ from pathlib import Path
 
 GRACE_S = 5.0
 ORPHAN_POLL_S = 0.05
+ENDING = tuple(
+    number
+    for name in ("SIGINT", "SIGTERM", "SIGHUP")  # there is no SIGHUP on Windows; nohup ignores it
+    if (number := getattr(signal, name, None)) is not None
+    and (name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN)
+)
+"""Signals that ask a process to end: Ctrl-C, kill, and a terminal that is closed."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 

@@ -8,15 +8,15 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
-from tactile_resonance.processes import NodeProcesses, free_domain_id, may_take_priority
-from tactile_resonance.simulation.plant.defaults import HOST, PRIORITY
+from tactile_resonance.processes import ENDING, NodeProcesses, free_domain_id, may_take_priority
+from tactile_resonance.simulation.plant.defaults import PRIORITY
 
 if TYPE_CHECKING:
     from tactile_resonance.action import Scan
@@ -60,17 +60,30 @@ class Job:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of all three commands."""
-    parser.add_argument(
-        "--robot-host",
-        default=HOST,
-        help=f"127.x.y.z of the simulated robot (default: {HOST})",
-    )
+    add_robot_host(parser)
     parser.add_argument(
         "--real-time",
         action="store_true",
         help="on the wall clock, as with hardware: what this machine is too slow for is late, and repeated "
         "(default: simulated time, in which a slow machine takes longer and nothing else)",
     )
+
+
+def add_robot_host(parser: argparse.ArgumentParser) -> None:
+    """The option ``--robot-host``; empty where it is not given."""
+    parser.add_argument(
+        "--robot-host",
+        default="",
+        help="127.x.y.z of the simulated robot (default: one of its own for each ROS domain)",
+    )
+
+
+def take_domain(host: str) -> str:
+    """Take a ROS domain of this machine alone; return the address of the simulated robot, given or its own."""
+    domain = free_domain_id()
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    return host or f"127.0.2.{domain + 1}"
 
 
 def add_scene_options(parser: argparse.ArgumentParser, scene: str, output: str) -> None:
@@ -129,8 +142,7 @@ def run_job(job: Job) -> int:
     content = read_scan_scene(job.scene)
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    job = replace(job, host=take_domain(job.host))
     ended = _Ended()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
@@ -172,14 +184,14 @@ def require_packages(*packages: str) -> None:
 
 
 class _Ended:
-    """Notes SIGINT and SIGTERM, so that they take effect only where they may: see `check` and `at_once`.
+    """Notes `ENDING` signals, so that they take effect only where they may: see `check` and `at_once`.
 
-    Both end the nodes in order, even where a shell made this process ignore Ctrl-C.
+    They end the nodes in order, even where a shell made this process ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
         self._asked = self._at_once = False
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             signal.signal(number, self._note)
 
     def check(self) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,10 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_resonance.commands.bench_scan import Job, node_parameters, require_packages
+from tactile_resonance.commands.bench_scan import (
+    Job,
+    add_robot_host,
+    node_parameters,
+    require_packages,
+    take_domain,
+)
 from tactile_resonance.fields import read
-from tactile_resonance.processes import NodeProcesses, free_domain_id
-from tactile_resonance.simulation.plant.defaults import HOST, TABLE_IN_BASE
+from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
 
 if TYPE_CHECKING:
@@ -74,9 +79,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         action="store_true",
         help="on a simulated bench of its own, whose table is 3 mm and 1 deg off; compares with that truth",
     )
-    parser.add_argument(
-        "--robot-host", default=HOST, help=f"127.x.y.z of the simulated robot (default: {HOST})"
-    )
+    add_robot_host(parser)
     parser.set_defaults(run=run)
 
 
@@ -154,9 +157,7 @@ def _simulated(
     from tactile_resonance.configuration import share_path
 
     require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can")
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    job = Job(share_path("config/scenes/inclusion_scan.yaml"), work / "run", host)
+    job = Job(share_path("config/scenes/inclusion_scan.yaml"), work / "run", take_domain(host))
     parameters = node_parameters(job, False, work)
     parameters["fake_hardware_node"]["table_in_base"] = true_table()
     if wanted["file"]:

@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
+from tactile_resonance.processes import ENDING
 
 RCLError = rclpy_implementation.RCLError
 
@@ -106,6 +107,8 @@ def run_node(make: Callable[[], Node]) -> None:
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, end_in_time)
+    for hangup in ENDING[2:]:  # the terminal was closed
+        signal.signal(hangup, interrupt)
     try:
         with initialised():
             node = make()

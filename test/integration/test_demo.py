@@ -57,9 +57,14 @@ def test_two_dishes_are_told_apart_and_nothing_is_left_running(demonstration):
         assert text in page
 
 
-def test_interrupted_while_nodes_come_up_it_leaves_no_process(domain, tmp_path):
-    demo = start(tmp_path, domain)
-    interrupt(demo, signal.SIGTERM, domain)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_interrupted_while_nodes_come_up_it_leaves_no_process(domain, tmp_path, number):
+    handler = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # a terminal's, also under nohup
+    try:
+        demo = start(tmp_path, domain)
+    finally:
+        signal.signal(signal.SIGHUP, handler)
+    interrupt(demo, number, domain)
 
 
 def interrupt(demo, number, domain):
