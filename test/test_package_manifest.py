@@ -51,3 +51,17 @@ def test_what_is_launched_is_named(manifest):
     for path in (ROOT / "launch").glob("*.launch.py"):
         launched |= set(re.findall(r'\bpackage="(\w+)"', path.read_text(encoding="utf-8")))
     assert launched <= set(re.findall(r"<exec_depend>(.*?)<", manifest))
+
+
+def test_the_licence_of_each_library_that_is_installed_is_on_its_page():
+    page = (ROOT / "docs" / "quality.md").read_text(encoding="utf-8")
+    table = page.partition("## Licences")[2].partition("## Threat")[0]
+    rows = " ".join(re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)).lower()
+    for path in ("requirements.in", "requirements-ros.in"):
+        wanted = (ROOT / path).read_text(encoding="utf-8").splitlines()
+        of_tests = {"pytest", "pytest-cov", "hypothesis", "mpmath", "mypy", "ruff"}
+        tools = {"cmake", "colcon-common-extensions", "catkin_pkg", "empy"}
+        for line in wanted:
+            name = re.match(r"[\w.-]*", line).group()
+            if name and not name.startswith("ros-") and name not in of_tests | tools:
+                assert name in rows, name
