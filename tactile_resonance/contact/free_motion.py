@@ -11,8 +11,9 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import TipPath, TurningWay
+from tactile_resonance.contact.tip_path import ARRIVED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import Vector, added, scaled, vector
+from tactile_resonance.contact.zero import Zero
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
@@ -34,11 +35,15 @@ class FreeMotion:
         At which the tissue may be met, at most.
     under_sample : bool
         Whether the cell is under the sample: then its force counts on all of the way.
+    zero : Zero or None
+        Of the force, where it is known for a tip that is turned as the goal is.
 
     Attributes
     ----------
     begun : bool
         Whether its way is known.
+    rest_m : float
+        Height to which it is drawn back [m]: the standoff.
     told_m : float or None
         Height at which another sensor detected the touch [m].
     """
@@ -52,11 +57,13 @@ class FreeMotion:
         touch_speed_m_s: float = math.inf,
         *,
         under_sample: bool = False,
+        zero: Zero | None = None,
     ) -> None:
-        self._under_sample = under_sample
+        self._under_sample, self._zero = under_sample, zero
         self._path, self._observer, self._touch_speed_m_s = path, observer, touch_speed_m_s
         self._parameters, self._limits = parameters, limits
         self.begun = False
+        self.rest_m = parameters.standoff_m
         self._turning: TurningWay | None = None
         self._travel_force_n: Vector | None = None
         self._still_ns = -1
@@ -72,8 +79,8 @@ class FreeMotion:
     @property
     def clear_m(self) -> float:
         """Height above `path` at which the tip is free of what it may have stood on."""
-        standoff_m = self._parameters.standoff_m
-        return standoff_m if self.path is self._path else standoff_m + self._limits.depth_m
+        away = self.path is not self._path
+        return self.rest_m + self._limits.depth_m if away else self.rest_m
 
     def begin(self, arm: ArmSample) -> None:
         """Find the way from where the tip is; ``ValueError`` where there is none."""
@@ -113,8 +120,18 @@ class FreeMotion:
                 return touched
         if self._path.arrived(arm, p.standoff_m):
             self._still_ns = -1
+            looked = self._observer.taring
+            if looked and self._observer.end_tare(now_ns, self._zero) is None:
+                return Move(None, State.APPROACH)
             return Move(None, State.TARE)
-        return Move(self._path.travel(arm, p))
+        if self._zero is not None and self._path.off_rad(arm) < ARRIVED_RAD:
+            if (
+                not self._observer.taring
+            ):  # in air, and a cell under the sample does not feel the arm
+                self._observer.begin_tare()
+        elif self._observer.taring:
+            self._zero, self._observer.taring = None, False
+        return Move(self._path.travel(arm, p, self._limits.near_m))
 
     def tare(self, now_ns: int, arm: ArmSample) -> Move:
         """At rest for the zero of the force."""
@@ -135,7 +152,7 @@ class FreeMotion:
                 self._travel_force_n = None
                 self._tare_ns = now_ns
         elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
-            breach = observer.end_tare()
+            breach = observer.end_tare(now_ns)
             if breach is None:
                 return Move(None, State.APPROACH)
             return Move(None, State.FAULT, breach)

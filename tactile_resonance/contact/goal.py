@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -48,10 +49,14 @@ class ContactGoal:
         Of the frame `tip` in the base where the ball just touches the expected surface, +z out of
         the tissue (see `geometry.touch_pose`).
     aim : Aim
+    standoff_m : float
+        Height above the touch where the approach begins and to which the tip is drawn back [m]; infinite: that
+        of the parameters, which is never raised.
     """
 
     touch: Pose
     aim: Aim
+    standoff_m: float = math.inf
 
 
 class Command(NamedTuple):

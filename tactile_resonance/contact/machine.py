@@ -30,6 +30,7 @@ from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import Vector, dot, vector
 from tactile_resonance.contact.withdrawal import Withdrawal
+from tactile_resonance.contact.zero import Zero
 
 RELIEVING = (*TOUCHING, State.RETRACT)
 """States in which force is taken off as fast as it may be."""
@@ -46,9 +47,15 @@ ARM_CAUSES = frozenset({Cause.ARM_LINK, Cause.ARM_STALE, Cause.ARM_STOPPED, Caus
 STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
 """After these the tip stays where it is until it is asked to retract."""
 
+LINGER_NS = 1_000_000_000
+"""So long a tip waits at a goal's own standoff for the next goal before it rises to the usual one [ns]."""
+
 SUCCEEDED, KNOWN_SHARE = 10_000, 1.25
 """Places of successful contacts that are kept, at most. Near one the tissue counts as known for forces up to
 its own times the second."""
+
+SAME_RAD = 1e-4
+"""Goals turned by less against each other are turned alike: the weight of a dish turns with the tip."""
 
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
@@ -94,10 +101,12 @@ class ContactController:
         self._outcome = Outcome(self._observer, 0)
         # where contacts were, and with how much force
         self._succeeded: deque[tuple[Vector, float]] = deque(maxlen=SUCCEEDED)
+        # zero of the contact before, where it stayed, and how the tip was turned
+        self._zero: tuple[Zero, Vector] | None = None
         self._pressed_n = 0.0
         self._height_m = 0.0
         self._state_ns = 0
-        self._wish_retract = False
+        self._wish_retract = self._rising = False
         self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 
     @property
@@ -122,8 +131,8 @@ class ContactController:
     @property
     def settled(self) -> bool:
         """Whether nothing more happens without a request: idle, or in a fault after which the tip stays."""
-        stays = self.state is State.FAULT and self._stays and not self._wish_retract
-        return stays or self.state is State.IDLE
+        stays = self.state is State.IDLE or (self.state is State.FAULT and self._stays)
+        return stays and not self._wish_retract
 
     @property
     def bias_n(self) -> Vector:
@@ -146,7 +155,7 @@ class ContactController:
             If a contact is under way, or parameters ask for more than the limits allow; nothing is
             changed then.
         """
-        if self.state is not State.IDLE:
+        if not self._free_for_goals:
             raise ValueError(f"parameters: refused in state {self.state.value}; accepted in idle")
         limits.check(parameters)
         if parameters.beam_stiffness_n_per_m != self.parameters.beam_stiffness_n_per_m:
@@ -162,14 +171,17 @@ class ContactController:
         ValueError
             If another is under way, or the goal lies beyond the limits.
         """
-        if self.state is not State.IDLE:
+        if not self._free_for_goals:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
-        p, limits = self.parameters, self.limits
+        p, limits = self.parameters.with_standoff(goal.standoff_m), self.limits
         check_goal(goal, p, limits, self._tip)
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
         speed = math.inf if self._is_known(goal) else p.first_speed_m_s(limits.abort_force_n)
-        free = FreeMotion(path, observer, p, limits, speed, under_sample=self._under_sample)
+        zero = self._zero_for(goal)
+        free = FreeMotion(
+            path, observer, p, limits, speed, under_sample=self._under_sample, zero=zero
+        )
         if arm is not None and is_finite(arm):
             free.begin(arm)
         self.goal, self._observer, self._free = goal, observer, free
@@ -177,13 +189,13 @@ class ContactController:
         self._pressing = Pressing(goal, path, observer, p, limits, speed)
         self._withdrawal = Withdrawal(free, observer, p, limits)
         self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
-        self._stays = self._pressed_too_hard = False
-        self._pressed_n = 0.0
+        self._stays = self._pressed_too_hard = self._rising = False
+        self._pressed_n, self._zero = 0.0, None
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
         """Draw the tip back along the normal, at the next cycle; also out of a fault."""
-        if self.state is not State.IDLE:
+        if self.state is not State.IDLE or self._is_low:
             self._wish_retract, self._wish_ns = True, None
 
     def tell_touch(self) -> bool:
@@ -219,6 +231,8 @@ class ContactController:
             What a device raised in this cycle.
         """
         goal = self.goal
+        if self.state is State.IDLE and self._is_low:
+            self._rise(now_ns, arm, fault)
         if self.state is State.IDLE or goal is None:
             return None
         place = None
@@ -255,6 +269,25 @@ class ContactController:
         limit = self.limits.stop_deceleration_m_s2
         self._observer.arm_model.step(0.0, limit)
         return Command(None, limit)
+
+    @property
+    def _free_for_goals(self) -> bool:
+        return self.state is State.IDLE or (self.state is State.RETRACT and self._rising)
+
+    @property
+    def _is_low(self) -> bool:
+        """Whether the tip was drawn back to a goal's own standoff, below the usual one."""
+        return self.goal is not None and self._free.rest_m < self.parameters.standoff_m
+
+    def _rise(
+        self, now_ns: int, arm: ArmSample | None, fault: ArmError | ForceError | None
+    ) -> None:
+        """Go on to the usual standoff where that is asked for, or no goal came for a while."""
+        wished, self._wish_retract = self._wish_retract, False
+        waited = now_ns - self._state_ns > LINGER_NS
+        if fault is None and (wished or waited) and self._envelope.judge_arm(now_ns, arm) is None:
+            self._free.rest_m, self._rising = self.parameters.standoff_m, True
+            self._enter(State.RETRACT, now_ns)
 
     def _begin_way(self, now_ns: int, arm: ArmSample) -> None:
         """Find the way to the standoff of a contact that was begun while no arm was seen."""
@@ -305,7 +338,7 @@ class ContactController:
             if move.estimate is not None:
                 told_m = self._free.told_m
                 self._outcome.reached(now_ns, self._pressing.touched_ns, move.estimate, told_m)
-            if move.to is State.IDLE:
+            if move.to is State.IDLE and not self._rising:
                 observer = self._observer
                 # the second zero is a mean over as long as a lost contact is
                 count = self.limits.lost_s / self.parameters.period_s
@@ -313,6 +346,14 @@ class ContactController:
                 self._outcome.drawn_back(self._withdrawal.zero_n, std_n)
                 self._remember(goal)
             self._enter(move.to, now_ns)
+            self._rising = self._rising and move.to is not State.IDLE
+
+    def _zero_for(self, goal: ContactGoal) -> Zero | None:
+        """The zero as the contact before left it, where a moving tip may show it and it is turned alike."""
+        if self._zero is None or not self._under_sample or self.parameters.zero_std_n == 0.0:
+            return None
+        zero, rotation_rad = self._zero
+        return zero if math.dist(rotation_rad, goal.touch.rotation_rad) < SAME_RAD else None
 
     def _is_known(self, goal: ContactGoal) -> bool:
         """Whether a contact near a goal has succeeded."""
@@ -333,6 +374,8 @@ class ContactController:
             and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED)
         ):
             self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
+            if result.zero_change_n == 0.0 and self._observer.zero is not None:
+                self._zero = self._observer.zero, vector(goal.touch.rotation_rad)
 
     def _forget(self, goal: ContactGoal) -> None:
         """Near a contact that pressed too hard nothing is known, whatever becomes of it."""
@@ -360,13 +403,15 @@ class ContactController:
             result = self.result
             cause = Cause.NONE if result is None else result.cause
             self._withdrawal.begin(cause, self._pressed_n)
+            if self.state is not State.HOLD:
+                self._free.rest_m = self.parameters.standoff_m
         self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None
 
     def _fail(self, breach: Breach, now_ns: int) -> None:
         """Note why, and stop."""
-        self._stays = breach.cause in STAYING_CAUSES
+        self._stays, self._rising = breach.cause in STAYING_CAUSES, False
         self._pressed_too_hard = breach.cause in PRESSING_CAUSES
         if self._pressed_too_hard and self.goal is not None:
             self._forget(self.goal)

@@ -14,6 +14,7 @@ from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.tare import TareError, tare
 from tactile_resonance.contact.vectors import vector
+from tactile_resonance.contact.zero import Zero
 
 
 class ArmModel:
@@ -82,6 +83,8 @@ class Observer:
         Whether no force of this contact was bad.
     touched_m : float or None
         Height of the surface as the first touch showed it.
+    zero : Zero or None
+        The bias, once there is one.
     noise_n, bias_std_n : float
         Of one force and of the bias, from the last tare [N].
     """
@@ -97,6 +100,7 @@ class Observer:
         self.tared, self.sound = False, True
         self.touched_m: float | None = None
         self._unloaded: list[WrenchSample] = []
+        self.zero: Zero | None = None
         self.noise_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
         self._accelerations: deque[tuple[int, float]] = deque(maxlen=50)  # middle of period, m/s2
@@ -114,24 +118,41 @@ class Observer:
         self.taring = True
         self._unloaded.clear()
 
-    def end_tare(self) -> Breach | None:
-        """Take the bias and look for the touch from now on; what is wrong with it is returned."""
+    def end_tare(self, now_ns: int, before: Zero | None = None) -> Breach | None:
+        """Take the bias and look for the touch from now on; what is wrong with it is returned.
+
+        Parameters
+        ----------
+        now_ns : int
+        before : Zero, optional
+            What is known from the contact before: the forces are one more look at it. Then what does not
+            agree with it, or leaves it too uncertain, is wrong too.
+        """
         self.taring = False
         p = self._parameters
         try:
-            zero = tare(self._unloaded, p)
+            look = tare(self._unloaded, p)
         except TareError as error:
             return Breach(Cause.TARE, str(error))
-        noise = float(zero.noise_rms_n[2])
+        noise = float(look.noise_rms_n[2])
         if noise < QUIETEST_SHARE * p.cell_noise_n:
             text = f"tare: noise of {1e3 * noise:.2g} mN rms, the source states"
             return Breach(Cause.TARE, f"{text} {1e3 * p.cell_noise_n:g} mN: does it still measure?")
+        zero: Zero | None = Zero(look.force_n, look.force_std_n, now_ns)
+        if before is not None:
+            zero = before.with_look(look, now_ns, p.zero_walk_n_per_sqrt_s)
+            if zero is not None and zero.std_n.max() > p.zero_std_n:
+                zero = None
+        if zero is None:
+            return Breach(Cause.TARE, "tare: the zero is not known from the contact before")
+        self.zero = zero
         self.watch.set_bias(vector(zero.force_n))
         self.tared = True
         self.noise_n = max(LEAST_NOISE_N, noise)
-        self.bias_std_n = float(zero.force_std_n[2])
+        self.bias_std_n = float(zero.std_n[2])
         # neighbouring forces that are alike make means less certain than white noise would
-        self._inflation = max(1.0, self.bias_std_n * math.sqrt(len(self._unloaded)) / noise)
+        inflation = float(look.force_std_n[2]) * math.sqrt(len(self._unloaded)) / noise
+        self._inflation = max(1.0, inflation)
         self.seek_touch()
         return None
 

@@ -39,6 +39,9 @@ def check_ranges(owner: Any) -> None:
         require(good, name, value, f"{accepted.low:g} to {accepted.high:g}")
 
 
+EARLY_SHARE = 0.8
+"""Of a standoff that a goal lowers, how far above its place the surface may be at most."""
+
 REACTION_S = 0.03
 """From a touch until the arm stands: means of forces, cycles, dead time, lag and braking [s]."""
 
@@ -92,6 +95,14 @@ class ContactParameters:
         "Largest zero of each axis [N]: bias of the cell, and weight on one under the sample; "
         "on the tool what is left once the payload is taken off. More is refused.",
     )
+    zero_std_n: float = within(
+        *(1e-4, 0.0, 1.0),
+        "With a cell under the sample: a zero that contacts before and the way to the standoff leave no "
+        "more uncertain than this is used without a rest for the tare [N]; 0: the tip always rests.",
+    )
+    zero_walk_n_per_sqrt_s: float = within(
+        *(5e-5, 0.0, 1.0), "By which the zero walks at random from contact to contact [N/sqrt(s)]."
+    )
     cell_noise_n: float = within(
         *(1e-3, 1e-5, 1.0),
         "Of one force as the source states it, the shaking of a tool on it included [N rms]; "
@@ -137,6 +148,18 @@ class ContactParameters:
         check_ranges(self)
         low = self.early_m
         require(self.standoff_m > low, "standoff_m", self.standoff_m, f"above early_m = {low}")
+
+    def with_standoff(self, standoff_m: float) -> ContactParameters:
+        """Return these with a standoff that is no higher; the surface may be found as much less early.
+
+        Raises
+        ------
+        ValueError
+            If it is out of its range.
+        """
+        standoff_m = min(self.standoff_m, standoff_m)
+        early_m = min(self.early_m, EARLY_SHARE * standoff_m)
+        return replace(self, standoff_m=standoff_m, early_m=early_m)
 
     @property
     def beam_n_per_m(self) -> float:

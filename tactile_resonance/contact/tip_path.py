@@ -42,6 +42,9 @@ from tactile_resonance.contact.vectors import (
 RIGHTING_S = 0.1
 """Time constant in which place along the surface and orientation are put right [s]."""
 
+ARRIVING_S = 0.04
+"""Time constant of the last of a way in air [s]: some three times what an arm is late."""
+
 ARRIVED_M, ARRIVED_RAD = 5e-5, 2e-3
 """Distance and angle from the standoff at which it is reached."""
 
@@ -133,12 +136,19 @@ class TipPath:
         to_m = parameters.standoff_m if height_m is None else height_m
         left = max(0.0, to_m - self.height_m(arm))
         p = parameters
-        speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / RIGHTING_S)
+        speed = min(p.retract_speed_m_s, math.sqrt(p.acceleration_m_s2 * left), left / ARRIVING_S)
         return *scaled(max(min(most_m_s, speed), 1e-4), self.normal), *ZERO
 
-    def travel(self, arm: ArmSample, parameters: ContactParameters) -> Six:
-        """Straight to the standoff; what little is left is turned meanwhile."""
+    def travel(self, arm: ArmSample, parameters: ContactParameters, near_m: float = 0.0) -> Six:
+        """Straight to the standoff; what little is left is turned meanwhile.
+
+        Lower than `near_m` it first goes along the surface, then down: near it what goes down goes slowly.
+        """
         way = difference(self.place_at(parameters.standoff_m), arm.position_m)
+        up = dot(self.normal, way)
+        if up < 0 and self.height_m(arm) < near_m:
+            along = difference(way, scaled(up, self.normal))
+            way = along if math.hypot(*along) > ARRIVED_M / 2 else way
         return towards(way, self.turn_rad(arm), parameters.travel_speed_m_s, parameters)
 
     def along_normal(self, arm: ArmSample, speed_m_s: float) -> Six:
@@ -161,7 +171,7 @@ def towards(
     """Twist along the rest of a way and of a turn, at up to a speed, which falls off before the end."""
     distance = math.hypot(*way_m)
     braking = math.sqrt(parameters.acceleration_m_s2 * distance)  # half the limit: the arm lags
-    speed = min(speed_m_s, braking, distance / RIGHTING_S)
+    speed = min(speed_m_s, braking, distance / ARRIVING_S)
     return *scaled(speed / max(distance, 1e-9), way_m), *scaled(1 / RIGHTING_S, turn_rad)
 
 

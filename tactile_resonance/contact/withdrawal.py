@@ -17,7 +17,7 @@ from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.goal import Move, State, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M
@@ -31,6 +31,9 @@ SMOOTH_S = 0.008
 LEAVE_M_S, LEAVE_M, LEAVE_M_S2, PRESSED = 3.5e-3, 2e-4, 0.08, 1.5
 """Speed with which the surface is left until so far above it, and its growth from there on [m/s2]; faster
 only while more than this multiple of the force is pressed with."""
+
+EASE_M_S, EASE_S = 1.2e-2, 2 * REACTION_S
+"""While the tip still presses it goes faster, up to the first: in the second what presses would be gone."""
 
 CLINGS, SLOW_M_S, SLOW_N = 0.3, 6e-3, 3e-3
 """A pull beyond this share of the last limits the speed, from the second at no pull to none at the last."""
@@ -73,6 +76,7 @@ class Withdrawal:
         self._least_n: float | None = None  # force along the normal that is accepted
         self._surface_m = -math.inf  # where the tissue was touched
         self._smooth_n = self._pressed_n = math.nan
+        self._n_per_m = math.inf  # of what is pressed on
         self._believed = self._must_leave = False
         self._speed_m_s = LEAVE_M_S
         self._felt_s = 0.0  # with the slowest speed
@@ -94,6 +98,8 @@ class Withdrawal:
             # asked for again: the tip stands, and its force is steady
             self._smooth_n, self._felt_s = watch.mean_n, FEEL_NOT_S
         model, touched_m = self._observer.model, self._observer.touched_m
+        if model is not None and touched_n > 0:
+            self._n_per_m, _ = model.slope_at(model.depth_for(touched_n))
         if self._least_n is None and self._observer.tared:
             if model is not None and touched_m is not None:
                 self._surface_m = max(model.surface_m, touched_m)
@@ -132,7 +138,8 @@ class Withdrawal:
         if self._smooth_n > self._pressed_n:
             self._speed_m_s = fastest
         elif height_m < self._surface_m + leave_m:
-            self._speed_m_s = LEAVE_M_S
+            eased_m_s = min(EASE_M_S, self._smooth_n / (self._n_per_m * EASE_S))
+            self._speed_m_s = max(LEAVE_M_S, eased_m_s)
         else:
             self._speed_m_s += LEAVE_M_S2 * p.period_s
         if pulled > CLINGS:  # it may pull the harder the faster the tip goes

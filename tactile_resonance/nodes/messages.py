@@ -226,7 +226,8 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     given = np.array([request.normal.x, request.normal.y, request.normal.z])
     normal = given if given.any() else axes[:, 2]
     touch = touch_pose([point.x, point.y, point.z], normal, axes[:, 0], ball_radius_m)
-    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]))
+    standoff_m = request.standoff_m or math.inf
+    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]), standoff_m)
 
 
 def contact_result(result: ContactResult) -> MakeContact.Result:

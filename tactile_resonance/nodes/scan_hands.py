@@ -32,12 +32,15 @@ from tactile_resonance.scan.hands import (
     PointFailed,
     ScanEnded,
     Stopped,
+    SurfaceEarly,
     Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.standoff import Standoffs
+from tactile_resonance.scan.surface import Plane
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 
 STREAM_TOPICS = ("record", "frf", "poles")
@@ -70,6 +73,8 @@ class NodeHands:
         Whether the tip can be lifted off the tissue: not without a robot.
     frame_in_base : Pose
         Frame of the scan's points in the robot's base, to be set before a scan.
+    standoffs : Standoffs
+        Of the scan's surface, to be set before a scan.
     """
 
     def __init__(
@@ -82,6 +87,7 @@ class NodeHands:
     ) -> None:
         self._node = node
         self.frame_in_base = Pose.at_origin()
+        self.standoffs = Standoffs(Plane())
         self._base_frame = base_frame
         self._time = scan_time
         self.free_air = with_robot
@@ -147,8 +153,17 @@ class NodeHands:
         if self._tip is None:
             self._place(pose, check)
             return
+        poll = self._poll_of([STATE_TOPIC])
+        lowest_m = self.standoffs.lowest_m(point)
         with self._nodes.doubted_after(NodeAway):
-            self._tip.hold(pose, force_n, hold, check, self._poll_of([STATE_TOPIC]))
+            try:
+                made = self._tip.hold(pose, force_n, hold, check, poll, lowest_m)
+            except SurfaceEarly:
+                if math.isinf(lowest_m):
+                    raise
+                self.standoffs.forget()
+                made = self._tip.hold(pose, force_n, hold, check, poll)
+        self.standoffs.add(point, made.surface_m, made.surface_std_m)
 
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
         """Touch a point of the surface as it is expected and draw back; return where the ball met it."""
@@ -199,7 +214,11 @@ class NodeHands:
 
     def retract(self) -> float:
         """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N]."""
-        return 0.0 if self._tip is None else self._tip.retract()
+        if self._tip is None:
+            return 0.0
+        if self._tip.tissue_moves:
+            self.standoffs.forget()
+        return self._tip.retract()
 
     # helpers
 

@@ -27,6 +27,7 @@ from tactile_resonance.scan.hands import (
     PointFailed,
     ScanEnded,
     Stopped,
+    SurfaceEarly,
     SurfaceMissing,
 )
 from tactile_resonance.scan.scene import Hold
@@ -90,9 +91,24 @@ class TipContact:
         # always: a scan that the node's deactivation ends still draws the tip back
         self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST, always=True)
 
-    def hold(self, pose: PoseStamped, force_n: float, hold: Hold, check: Check, poll: Poll) -> None:
-        """Press there until the force is held."""
+    @property
+    def tissue_moves(self) -> bool:
+        """Whether the tip was seen to follow tissue that moves while it held its force."""
+        state = self._state
+        return state is not None and state.state == state.STATE_HOLD and bool(state.message)
+
+    def hold(
+        self,
+        pose: PoseStamped,
+        force_n: float,
+        hold: Hold,
+        check: Check,
+        poll: Poll,
+        standoff_m: float = math.inf,
+    ) -> MakeContact.Result:
+        """Press there until the force is held, from a standoff that is no higher than the usual one."""
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
+        goal.standoff_m = standoff_m if math.isfinite(standoff_m) else 0.0
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         result = self._make(goal, check, poll)
         while (state := self._state) is None or state.state != state.STATE_HOLD:
@@ -102,6 +118,7 @@ class TipContact:
                 raise self._failure(state)
             time.sleep(POLL_S)
         self.touched_ns = self._held_ns - round(result.contact_s * 1e9)
+        return result
 
     def touch(
         self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
@@ -136,7 +153,11 @@ class TipContact:
                 moved_n = math.nan if self._state is None else self._state.zero_moved_n
                 return 0.0 if math.isnan(moved_n) else moved_n
             state = self._state
-            if state is not None and state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:
+            if (
+                state is not None
+                and state.cause == Cause.HELD.value
+                and state.state == state.STATE_FAULT
+            ):
                 raise ScanEnded(f"the tip is held: {state.message}")
         raise ScanEnded(
             f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
@@ -216,4 +237,6 @@ def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:
         return PointDisturbed(text, ended.cause)
     if ended.cause == Cause.SURFACE_MISSING.value:
         return SurfaceMissing(text)
+    if ended.cause == Cause.SURFACE_EARLY.value:
+        return SurfaceEarly(text)
     return PointFailed(text)

@@ -17,6 +17,7 @@ from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.standoff import Standoffs
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
 # A point that lost its node is repeated when the node is back, so often at most: it may be what ends the node.
@@ -31,6 +32,10 @@ class PointFailed(Exception):
 
 class SurfaceMissing(PointFailed):
     """Nothing was touched, as far down as the tip may search."""
+
+
+class SurfaceEarly(PointFailed):
+    """Something was touched above where the surface may be."""
 
 
 class PointDisturbed(PointFailed):
@@ -139,10 +144,13 @@ class Hands(Protocol):
         and forces are measured.
     frame_in_base : Pose
         Frame of the scan's points in the robot's base, to be set before a scan.
+    standoffs : Standoffs
+        Of the scan's surface, to be set before a scan.
     """
 
     free_air: bool
     frame_in_base: Pose
+    standoffs: Standoffs
 
     def now_s(self) -> float:
         """Time by which limits and durations of a scan count [s]: simulated, where the bench's is."""

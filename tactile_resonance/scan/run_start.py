@@ -31,6 +31,7 @@ from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
+from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.sensor import sensor_named
 
 _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
@@ -161,9 +162,10 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
 
 
 def _placed(scene: ScanScene, frames: Frames, hands: Hands) -> ScanScene:
-    """Tell the hands where the scene's frame stands, and return it with that frame's name."""
+    """Tell the hands of the scene's frame and surface, and return the scene with that frame's name."""
     frame_id = frames.of_scene(scene.frame_id)
     hands.frame_in_base = frames.in_base(frame_id, "frame_id")
+    hands.standoffs = Standoffs(scene.surface)
     return replace(scene, frame_id=frame_id)
 
 

@@ -12,7 +12,7 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import ARRIVED_M, RIGHTING_S, TipPath
+from tactile_resonance.contact.tip_path import ARRIVED_M, ARRIVING_S, RIGHTING_S, TipPath
 from tactile_resonance.contact.vectors import vector
 
 GOAL = ContactGoal(touch_pose([0.1, -0.2, 0.3], [0.2, -0.1, 1.0], [1, 1, 0], 2.5e-3), Aim(0.01))
@@ -58,7 +58,7 @@ def test_lift_is_straight_up_and_ends_at_the_standoff(way):
     np.testing.assert_allclose(twist, [*(speed * NORMAL), 0, 0, 0], atol=1e-15)
     left = max(0.0, P.standoff_m - NORMAL @ way)
     assert speed == pytest.approx(
-        max(1e-4, min(P.retract_speed_m_s, np.sqrt(P.acceleration_m_s2 * left), left / RIGHTING_S))
+        max(1e-4, min(P.retract_speed_m_s, np.sqrt(P.acceleration_m_s2 * left), left / ARRIVING_S))
     )
 
 

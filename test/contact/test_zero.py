@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The zero from one contact to the next: its stated deviation against Monte Carlo, and what is no walk."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.tare import Tare
+from tactile_resonance.contact.zero import Zero
+
+WALK, STD_N, EVERY_S = 5e-5, 9e-5, 2.5
+
+
+def look(force_n, std_n=STD_N):
+    nothing = np.zeros(3)
+    return Tare(np.asarray(force_n, float), np.full(3, std_n), np.full(3, 1e-3), nothing, nothing)
+
+
+def test_deviation_of_a_zero_that_walks_is_honest_and_below_that_of_one_look():
+    rng = np.random.default_rng(1)
+    z, stds = [], []
+    for _ in range(300):
+        true = np.zeros(3)
+        zero = Zero(true + STD_N * rng.standard_normal(3), np.full(3, STD_N), 0)
+        for k in range(1, 9):
+            true = true + WALK * np.sqrt(EVERY_S) * rng.standard_normal(3)
+            seen = look(true + STD_N * rng.standard_normal(3))
+            zero = zero.with_look(seen, round(k * EVERY_S * 1e9), WALK) or Zero(
+                seen.force_n, seen.force_std_n, round(k * EVERY_S * 1e9)
+            )
+        z.append((zero.force_n - true) / zero.std_n)
+        stds.append(zero.std_n)
+    # chi square over 900 values, five standard errors
+    assert np.mean(np.square(z)) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 900))
+    # the stationary variance P solves (P + q) r / (P + q + r) = P
+    q, r = WALK**2 * EVERY_S, STD_N**2
+    steady = np.sqrt((-q + np.sqrt(q * q + 4 * q * r)) / 2)
+    assert np.mean(stds) == pytest.approx(steady, rel=0.02)
+    assert steady < 0.8 * STD_N
+
+
+def test_long_after_it_was_known_a_zero_is_that_of_the_look():
+    zero = Zero(np.zeros(3), np.full(3, 1e-6), 0).with_look(look([2e-4, 0, 0]), 10**13, WALK)
+    np.testing.assert_allclose(zero.force_n, [2e-4, 0, 0], rtol=1e-3)
+    np.testing.assert_allclose(zero.std_n, STD_N, rtol=1e-3)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_zero_that_stepped_is_not_known(axis):
+    before = Zero(np.zeros(3), np.full(3, STD_N), 0)
+    spread = np.sqrt(2 * STD_N**2 + WALK**2)
+    for share, known in ((3.9, True), (4.1, False)):
+        force_n = np.zeros(3)
+        force_n[axis] = share * spread
+        assert (before.with_look(look(force_n), 10**9, WALK) is not None) == known
+
+
+def test_looks_never_make_it_less_certain():
+    zero = Zero(np.zeros(3), np.full(3, 1e-3), 0)
+    for k in range(1, 20):
+        before, zero = zero, zero.with_look(look(np.zeros(3)), k, 0.0)
+        assert np.all(zero.std_n < before.std_n)
+    # without a walk it is the weighted mean of all
+    assert zero.std_n[0] == pytest.approx((1e6 + 19 / STD_N**2) ** -0.5)
