@@ -220,6 +220,10 @@ class NodeHands:
             self.standoffs.forget()
         return self._tip.retract()
 
+    def spent_s(self) -> dict[str, float]:
+        """Where the time of the newest contact went, as fields of `PointResult`; empty: unknown."""
+        return {} if self._tip is None else self._tip.spent_s
+
     # helpers
 
     def _is_stopped(self) -> bool:

@@ -30,6 +30,7 @@ from tactile_resonance.scan.hands import (
     SurfaceEarly,
     SurfaceMissing,
 )
+from tactile_resonance.scan.point_times import StateTimes
 from tactile_resonance.scan.scene import Hold
 
 STATE_TOPIC = "contact_state"
@@ -87,9 +88,15 @@ class TipContact:
         self._held_ns = 0  # when the contact was first seen to be held
         self._stop_asked_s = 0.0
         self._state: msg.ContactState | None = None
+        self._times = StateTimes()
         # the newest only: the recorder's may have to wait behind what else is recorded
         # always: a scan that the node's deactivation ends still draws the tip back
         self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST, always=True)
+
+    @property
+    def spent_s(self) -> dict[str, float]:
+        """Time of the newest contact in each of its states, as fields of `PointResult`; empty: unknown."""
+        return self._times.fields
 
     @property
     def tissue_moves(self) -> bool:
@@ -177,6 +184,7 @@ class TipContact:
         self.retract()
         self.touching = True
         self._state = None
+        self._times.begin()
         self._time.go()
         result = self._goals.follow(self._goals.send(goal, check, poll), check, poll)
         if not result.reached:
@@ -211,11 +219,12 @@ class TipContact:
         return False
 
     def _on_state(self, message: msg.ContactState) -> None:
-        before = self._state
+        before, stamp_ns = self._state, time_from_message(message.header.stamp)
+        self._times.take(message.state, stamp_ns)
         if message.state == message.STATE_HOLD and (
             before is None or before.state != message.state
         ):
-            self._held_ns = time_from_message(message.header.stamp)
+            self._held_ns = stamp_ns
         self._state = message  # last: whoever sees that it is held reads since when
         if not self.stopped or message.stopped or message.instance == self._instance:
             self.stopped, self._instance = message.stopped, message.instance

@@ -18,6 +18,7 @@ from tactile_resonance.report.point_table import table_notes, tissue_of
 from tactile_resonance.scan.bench_truth import PointTruth, deviation
 from tactile_resonance.scan.plan_text import plan_against_outcome
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_times import budget_sentence, time_budget
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
@@ -107,6 +108,7 @@ def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
         "Silent record": _bullets(silent_lines(run)),
         "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),
         "Surface, found by touch": _touches(run.facts.get("surface")),
+        "Time": _time_table(measured),
         "Points": _results(_COLUMNS, run.latest) + _paragraphs(table_notes(run.latest, truths)),
         f"Against free air{' and the truth of the simulation' if truths else ''}": _results(
             (*_AIR_COLUMNS, *_truth_columns(truths)), measured
@@ -153,6 +155,8 @@ def summary(run: RunContent) -> list[str]:
         lines.append(
             f"{blocks} blocks measured; {saved} more were allowed and not needed, {seconds:.1f} s saved."
         )
+    if time := budget_sentence(run.latest):
+        lines.append(time)
     classes = Counter(r.tissue_class for r in run.latest if r.tissue_class)
     if classes:
         named = ", ".join(f"{name} {count}" for name, count in sorted(classes.items()))
@@ -304,6 +308,20 @@ def _distortion_table(results: Sequence[PointResult]) -> str:
             )
             rows.append(_row("td", names, texts))
     return _table(names, rows) if rows else ""
+
+
+def _time_table(results: Sequence[PointResult]) -> str:
+    """Where the time of the points went; nothing where it is unknown, as in runs of earlier versions."""
+    budget = time_budget(results)
+    whole_s = float(sum(each.sum() for each in budget.values()))
+    if not whole_s:
+        return ""
+    names, rows = ("what", "median [s]", "largest [s]", "all points [s]", "share [%]"), []
+    for name, each in {**budget, "all": np.sum(list(budget.values()), axis=0)}.items():
+        figures = (np.median(each), each.max(), each.sum())
+        texts = (f"{figure:.2f}" for figure in figures)
+        rows.append(_row("td", names, (name, *texts, f"{100 * each.sum() / whole_s:.0f}")))
+    return _table(names, rows)
 
 
 def _compared_with_plan(scene: ScanScene | None, run: RunContent) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.result import BandDistortion
@@ -197,6 +197,10 @@ class Hands(Protocol):
         Returns by how much the zero of the force moved in the contact [N]: 0 where it did not, or where nobody
         knows.
         """
+        ...
+
+    def spent_s(self) -> Mapping[str, Any]:
+        """Where the time of the newest contact went, as fields of `PointResult`; empty: unknown."""
         ...
 
 

@@ -117,6 +117,14 @@ class PointResult:
     gate: str = ""
     saved_s: float = NAN
     duration_s: float = NAN
+    travel_s: float = NAN
+    tare_s: float = NAN
+    approach_s: float = NAN
+    press_s: float = NAN
+    hold_s: float = NAN
+    vibration_s: float = NAN
+    retract_s: float = NAN
+    between_s: float = NAN
     measurement_id: int = 0
     simulated: bool = False
     repeats: int = 0

@@ -88,6 +88,7 @@ class ScanRunner:
         self._durations_s: list[float] = []
         self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
         self._air: AirReference | None = None
+        self._left_s = NAN  # when the tip was free after the newest point
 
     def run(self) -> Summary:
         """Finish every point that is not; references, of free air and silent, are taken before and after."""
@@ -221,7 +222,11 @@ class ScanRunner:
                 repeats=disturbed.total,
                 disturbances=str(disturbed),
                 gate="" if measured is None else str(keeper),
+                vibration_s=len(decisions) * self._plan.measurement.block_s,
+                between_s=begun_s - self._left_s,
+                **self._hands.spent_s(),
             )
+            self._left_s = begun_s + duration_s
             self._publish(recording.finish(result))
         self._durations_s.append(duration_s)
         if result.outcome is PointOutcome.FAILED and scene.on_failure is OnFailure.STOP:

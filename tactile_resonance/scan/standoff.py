@@ -37,8 +37,7 @@ class Standoffs:
     """
 
     def __init__(self, surface: Surface | TouchRequest) -> None:
-        touched = isinstance(surface, TouchRequest) and surface.form == "plane"
-        self._plane = touched or isinstance(surface, Plane)
+        self._plane = is_plane(surface)
         self._found: list[tuple[ScanPoint, float, float]] = []
 
     def add(self, point: ScanPoint, off_m: float, std_m: float) -> None:
@@ -52,7 +51,7 @@ class Standoffs:
 
     def lowest_m(self, point: ScanPoint) -> float:
         """Height above a point from which its approach may begin [m]; infinite where that is not known."""
-        if not (self._plane and self._found and _along(self._found[-1][0], point)):
+        if not (self._plane and self._found and is_along(self._found[-1][0], point)):
             return math.inf
         ways = np.array(
             [np.subtract(found.position_m, point.position_m) for found, *_ in self._found]
@@ -73,7 +72,13 @@ class Standoffs:
         return max(LEAST_M, LEAST_M + float(mean[0]) + STDS * std)
 
 
-def _along(last: ScanPoint, point: ScanPoint) -> bool:
+def is_plane(surface: Surface | TouchRequest) -> bool:
+    """Whether a surface is plane, as it is given or will be found."""
+    touched = isinstance(surface, TouchRequest) and surface.form == "plane"
+    return touched or isinstance(surface, Plane)
+
+
+def is_along(last: ScanPoint, point: ScanPoint) -> bool:
     """Whether the tip goes to a point along the plane of the last one, no further than what is near."""
     way = np.subtract(point.position_m, last.position_m)
     alike = np.dot(last.normal, point.normal) > 1.0 - ALIKE

@@ -15,9 +15,17 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import TipContact, _failure
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
+from tactile_resonance.scan.point_times import StateTimes
 from tactile_resonance.scan.scene import Hold
 
-NOT_OF_THE_POINT = ("force_stale", "force_source", "force_invalid", "arm_stale", "arm_link", "cancelled")
+NOT_OF_THE_POINT = (
+    "force_stale",
+    "force_source",
+    "force_invalid",
+    "arm_stale",
+    "arm_link",
+    "cancelled",
+)
 OF_THE_POINT = ("force_hard", "force_abort", "force_overload", "surface_missing", "tilt")
 
 
@@ -36,6 +44,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     """It took 0.3 s until the force was reached, at 5 s; that it is still held is said again and again."""
     tip = TipContact.__new__(TipContact)
     tip._state, tip._held_ns, tip.stopped, tip._instance = None, 0, False, 0
+    tip._times = StateTimes()
 
     def make(goal, check, poll):
         for state, seconds in (("settle", 4.9), ("hold", 5.0), ("hold", 5.04), ("hold", 5.08)):
@@ -47,6 +56,8 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     monkeypatch.setattr(tip, "_make", make)
     tip.hold(PoseStamped(), 0.01, Hold.FORCE, lambda: None, lambda: None)
     assert tip.touched_ns == 4_700_000_000
+    assert tip.spent_s["press_s"] == pytest.approx(0.1)
+    assert tip.spent_s["hold_s"] == pytest.approx(0.08)
 
 
 def drawn_back(monkeypatch, **state):

@@ -37,6 +37,7 @@ class Bench:
     holding: bool = False
     free_air: bool = True
     zero_moved_n: float = 0.0
+    spent: dict | None = None
     time_s: float = 1000.0
     seeds: list = field(default_factory=list)
     silent: list = field(default_factory=list)
@@ -105,6 +106,9 @@ class Bench:
     def retract(self):
         self.holding = False
         return self.zero_moved_n
+
+    def spent_s(self):
+        return {} if self.spent is None else dict(self.spent)
 
 
 def joined(first, second):

@@ -14,7 +14,13 @@ from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.patterns import grid, inside_polygon, read_positions, spiral
-from tactile_resonance.scan.plan import CONTACT_S, TRAVEL_M_S, make_plan, tip_orientation
+from tactile_resonance.scan.plan import (
+    CONTACT_S,
+    NEAR_CONTACT_S,
+    TRAVEL_M_S,
+    make_plan,
+    tip_orientation,
+)
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
@@ -144,6 +150,9 @@ def test_time_adds_up():
     assert plan.duration_s(5) == pytest.approx(0.05 / TRAVEL_M_S + 2 * (CONTACT_S + 5 * 0.4))
     assert (plan.shortest_s, plan.longest_s) == (plan.duration_s(3), plan.duration_s(8))
     assert plan.shortest_s < plan.longest_s
+    near = make_plan(scene([[0, 0], [0.005, 0], [0.01, 0]]))
+    contacts_s = CONTACT_S + 2 * NEAR_CONTACT_S
+    assert near.duration_s(5) == pytest.approx(0.01 / TRAVEL_M_S + contacts_s + 3 * 5 * 0.4)
 
 
 def test_what_nobody_reads_is_not_excited():

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the time of points went: parts that add up to what was measured, from states, results and old runs."""
+
+import csv
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.contact.goal import State
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_times import (
+    BETWEEN,
+    StateTimes,
+    budget_sentence,
+    time_budget,
+)
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import Bench, scan, scene
+
+SPENT = {
+    "travel_s": 0.3,
+    "tare_s": 0.0,
+    "approach_s": 0.4,
+    "press_s": 0.2,
+    "hold_s": 0.9,
+    "retract_s": 0.4,
+}
+POINT = PointResult(0, duration_s=2.3, vibration_s=0.8, between_s=0.1, **SPENT)
+
+
+def test_times_of_states_are_those_between_their_beginnings():
+    times = StateTimes()
+    assert times.fields == {}
+    course = [
+        (0.0, "travel"),
+        (0.3, "tare"),
+        (0.7, "approach"),
+        (0.7, "approach"),
+        (1.5, "contact"),
+    ]
+    course += [(1.6, "settle"), (1.75, "hold"), (2.0, "hold"), (2.75, "retract"), (3.2, "idle")]
+    for seconds, state in course:
+        assert state in [each.value for each in State]
+        times.take(state, round(1e9 * seconds))
+    expected = SPENT | {"tare_s": 0.4, "approach_s": 0.8, "press_s": 0.25, "hold_s": 1.0}
+    expected["retract_s"] = 0.45
+    assert times.fields == pytest.approx(expected)
+    times.take("idle", round(9e9))
+    assert sum(times.fields.values()) == pytest.approx(3.2)
+    times.begin()
+    times.take("travel", round(10e9))
+    assert times.fields == {}
+
+
+def test_parts_of_the_time_add_up_to_the_points_and_the_time_between_them():
+    results = [POINT, replace(POINT, index=1, duration_s=2.5, between_s=0.2)]
+    budget = time_budget(results)
+    np.testing.assert_allclose(np.sum(list(budget.values()), axis=0), [2.4, 2.7])
+    np.testing.assert_allclose(budget["waiting in contact"], 0.1)
+    np.testing.assert_allclose(budget["requests and answers"], [0.1, 0.3])
+    np.testing.assert_allclose(budget[BETWEEN], [0.1, 0.2])
+    sentence = budget_sentence(results)
+    assert sentence.startswith("A point took 2.55 s (mean): vibration 0.80, approach 0.40,")
+    assert "tare" not in sentence
+
+
+def test_points_whose_times_are_unknown_do_not_count():
+    old = PointResult(1, duration_s=4.0)
+    failed = replace(POINT, index=2, outcome=PointOutcome.FAILED)
+    assert len(time_budget([POINT, old, failed])["travel"]) == 1
+    assert budget_sentence([old, failed]) == ""
+
+
+@pytest.mark.parametrize("spent", [None, SPENT])
+def test_a_scan_keeps_the_times_of_each_point(tmp_path, spent):
+    bench = Bench(spent=spent)
+    _, run, _ = scan(tmp_path / "run", scene(3), bench)
+    for result in run.latest:
+        assert result.vibration_s == pytest.approx(0.4 * result.blocks)
+        assert (result.between_s >= 0) == (result.index > 0)
+        for name, seconds in SPENT.items():
+            kept = getattr(result, name)
+            assert kept == seconds if spent else np.isnan(kept)
+    with (run.path / "results.csv").open() as file:
+        told = next(csv.DictReader(file))
+    assert told["approach_s"] == ("0.4" if spent else "nan")
