@@ -2,6 +2,7 @@
 """From the bench to the map, all nodes as processes, and readers who come late."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from robot_at_hand import own_time
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import PointCloud2
 from tactile_resonance.action import Measure
+from visualization_msgs.msg import MarkerArray
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
@@ -85,7 +87,10 @@ class Client(ScanClient):
 
 @pytest.fixture(scope="module")
 def scanned(module_domain, tmp_path_factory):
-    """The run of a scan with references, a retry and a failed point, and what late readers got of it."""
+    """The run of a scan with references, a retry and a failed point, and what readers got of it.
+
+    One of them comes when a point is on the map already, and stays.
+    """
     folder = tmp_path_factory.mktemp("scanned")
     scene, run = folder / "scene.yaml", folder / "run"
     scene.write_text(SCENE)
@@ -99,19 +104,53 @@ def scanned(module_domain, tmp_path_factory):
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up((*NODES, "scan_node"), parameters)
         client.wait_until_up(HANGS_S)
+        joined = InMidScan(client.tactile)
+
+        def on_feedback(feedback):
+            client.repeat_once(feedback)
+            joined.follow(feedback)
+
         result = client.scan(
-            5 * HANGS_S, scene=scene, run_directory=run, on_feedback=client.repeat_once
+            5 * HANGS_S, scene=scene, run_directory=run, on_feedback=on_feedback
         )
         assert (result.done, result.failed, result.skipped) == (3, 1, 0), result.message
         cloud = late_map(len(ACCEPTED))
         told = late_reader(msg.PointResult, "point_result", POINT_RESULTS, lambda m: len(m) == 7)
         final = [message.poles[0] for message in told if message.poles]
         poles = late_reader(msg.Poles, "poles", POLES, lambda m: all(p in m for p in final))
-    return run, cloud, told, poles
+        seen = joined.result()
+    return run, cloud, told, poles, seen
+
+
+class InMidScan:
+    """Readers of map and legend who come while the scan is paused after its second point.
+
+    They have threads and contexts of their own; the scan goes on when both have something.
+    """
+
+    def __init__(self, tactile):
+        self._tactile, self._pool = tactile, ThreadPoolExecutor(2)
+        self._seen, self._heard, self._resumed = [], ([], []), False
+
+    def follow(self, feedback):
+        if not self._seen and feedback.finished == 2:
+            self._tactile.pause()
+            enough = (lambda heard: heard and heard[-1].width == len(ACCEPTED), bool)
+            for kind, name, whole, heard in zip(
+                (PointCloud2, MarkerArray), ("", "/legend"), enough, self._heard, strict=True
+            ):
+                read = (kind, f"pole_map{name}", LATCHED, whole, heard)
+                self._seen.append(self._pool.submit(late_reader, *read))
+        elif not self._resumed and all(self._heard):
+            self._resumed = True
+            self._tactile.resume()
+
+    def result(self):
+        return [future.result(2 * HANGS_S) for future in self._seen]
 
 
 def test_the_map_of_a_scan_holds_the_accepted_points_of_tissue(scanned):
-    run, cloud, _, poles = scanned
+    run, cloud, _, poles, _ = scanned
     rows, results = rows_of(cloud), read_run(run).latest
     expected = np.array([(results[k].x_m, results[k].y_m, results[k].f0_hz) for k in ACCEPTED])
     found = np.stack([rows["x"], rows["y"], rows["f0_hz"]], axis=1)
@@ -121,8 +160,17 @@ def test_the_map_of_a_scan_holds_the_accepted_points_of_tissue(scanned):
     assert min(message.f0_hz[0] for message in poles) < 250 < rows["f0_hz"].min()
 
 
+def test_a_map_that_is_looked_at_in_mid_scan_is_there_and_goes_on(scanned):
+    _, cloud, *_, (clouds, legends) = scanned
+    # nobody listened before: what it holds was made for this reader
+    assert clouds[0].width == 2
+    assert clouds[-1].width == len(ACCEPTED)
+    assert legends[0].markers
+    assert clouds[-1].data == cloud.data
+
+
 def test_a_late_reader_of_results_knows_what_counts(scanned):
-    run, _, told, poles = scanned
+    run, _, told, poles, _ = scanned
     assert [(m.kind, m.index, m.outcome) for m in told] == [
         (PointKind.AIR.value, 4, PointOutcome.DONE),
         (PointKind.TISSUE.value, 0, PointOutcome.DONE),
@@ -150,7 +198,7 @@ def test_a_late_reader_of_results_knows_what_counts(scanned):
 
 
 def test_a_replay_of_the_run_draws_the_same_map(scanned, domain, tmp_path):
-    run, cloud, told, _ = scanned
+    run, cloud, told, *_ = scanned
     replay = {"device": "replay", "device_config": run, "replay_speed": 0.0}
     with NodeProcesses(tmp_path / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up(STREAM, {"excitation_node": replay})
@@ -167,7 +215,7 @@ def test_a_replay_of_the_run_draws_the_same_map(scanned, domain, tmp_path):
 
 def test_a_recording_that_is_played_draws_the_same_map(scanned, domain, tmp_path):
     """As `ros2 bag play` does: publishers with the recorded quality of service, ten messages of history."""
-    run, cloud, _, _ = scanned
+    run, cloud, *_ = scanned
     context = rclpy.Context()
     with NodeProcesses(tmp_path / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up(["pole_map_node"], {})
@@ -204,9 +252,9 @@ def qos_of(connection):
     )
 
 
-def late_reader(kind, topic, qos, enough):
+def late_reader(kind, topic, qos, enough, heard=None):
     """What a reader gets who comes now, until it is enough and some time for more has passed."""
-    context, heard = rclpy.Context(), []
+    context, heard = rclpy.Context(), [] if heard is None else heard
     rclpy.init(context=context)
     node = rclpy.create_node("late_reader", context=context)
     executor = SingleThreadedExecutor(context=context)
