@@ -21,8 +21,13 @@ from lifecycle_msgs.msg import Transition
 
 PARAMETERS, LIMITS = read_contact()
 STANDOFF_M = PARAMETERS.standoff_m
-SLOW = {"contact__tare_s": 1.0, "contact__time_constant_s": 0.3, "contact__settle_s": 1.0}
-"""Each state lasts long enough to be met."""
+SLOW = {
+    "contact__tare_s": 1.0,
+    "contact__zero_std_n": 0.0,
+    "contact__time_constant_s": 0.3,
+    "contact__settle_s": 1.0,
+}
+"""Each state lasts long enough to be met, that of the tare too."""
 
 
 def drawn_back(bench, client):

@@ -23,10 +23,12 @@ from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed
+from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceEarly
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold, ScanScene
+from tactile_resonance.scan.standoff import Standoffs
+from tactile_resonance.scan.surface import Plane
 from test.spinning import spin_until
 
 PLACE_M = (0.004, -0.003, 0.0)
@@ -108,4 +110,59 @@ def test_a_measurement_at_an_unknown_place_is_disturbed_one_without_poles_has_fa
         pressing = replace(pressing, contact=replace(there.contact, force_n=0.01, force_std_n=0.0))
         came.append(poles_to_message(Poles(), pressing))
         assert measure().contact_age_s == pytest.approx(1.5)
+        hands._tip = None
+
+
+class Tip:
+    """In place of contact_node: the surface is where its `off_m` says, or too early."""
+
+    def __init__(self):
+        self.off_m, self.early_below_m, self.tissue_moves, self.stopped = 1e-4, 0.0, False, False
+        self.asked_m = []
+
+    def hold(self, pose, force_n, hold, check, poll, standoff_m=math.inf):
+        self.asked_m.append(standoff_m)
+        if standoff_m <= self.early_below_m:
+            raise SurfaceEarly("contact: surface_early")
+        return SimpleNamespace(surface_m=self.off_m, surface_std_m=2e-5)
+
+    def retract(self):
+        return 0.0
+
+
+def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_early(
+    alone, monkeypatch
+):
+    hands = alone.start(Scanning).hands
+    monkeypatch.setattr(hands, "_poll_of", lambda topics: lambda: None)
+    with hands.listening():
+        tip = hands._tip = Tip()
+        hands.standoffs = Standoffs(Plane())
+
+        def touch(x_m):
+            point = ScanPoint(0, (x_m, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
+            hands.touch(point, 0.01, Hold.FORCE, lambda: None)
+            hands.retract()
+
+        for x_m in (0.0, 5e-3, 10e-3):
+            touch(x_m)
+        assert tip.asked_m[0] == math.inf
+        assert 7e-4 < tip.asked_m[2] < tip.asked_m[1] < 2e-3
+        touch(40e-3)
+        assert tip.asked_m[3] == math.inf
+        tip.early_below_m = 1.0
+        touch(45e-3)  # refused low, made from the usual standoff
+        assert tip.asked_m[4] < 2e-3
+        assert tip.asked_m[5:] == [math.inf]
+        touch(50e-3)
+        assert tip.asked_m[6:] == [math.inf]
+        tip.early_below_m = math.inf
+        with pytest.raises(PointFailed, match="surface_early"):
+            touch(55e-3)
+        tip.early_below_m = 0.0
+        hands.standoffs = Standoffs(Plane())
+        tip.tissue_moves = True
+        for x_m in (0.0, 5e-3):
+            touch(x_m)
+        assert tip.asked_m[-2:] == [math.inf] * 2
         hands._tip = None
