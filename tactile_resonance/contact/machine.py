@@ -190,7 +190,7 @@ class ContactController:
         self._withdrawal = Withdrawal(free, observer, p, limits)
         self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
         self._stays = self._pressed_too_hard = self._rising = False
-        self._pressed_n, self._zero = 0.0, None
+        self._pressed_n, self._zero, self._usual_m = 0.0, None, self.parameters.standoff_m
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
@@ -277,7 +277,7 @@ class ContactController:
     @property
     def _is_low(self) -> bool:
         """Whether the tip was drawn back to a goal's own standoff, below the usual one."""
-        return self.goal is not None and self._free.rest_m < self.parameters.standoff_m
+        return self.goal is not None and self._free.rest_m < self._usual_m
 
     def _rise(
         self, now_ns: int, arm: ArmSample | None, fault: ArmError | ForceError | None
@@ -286,7 +286,7 @@ class ContactController:
         wished, self._wish_retract = self._wish_retract, False
         waited = now_ns - self._state_ns > LINGER_NS
         if fault is None and (wished or waited) and self._envelope.judge_arm(now_ns, arm) is None:
-            self._free.rest_m, self._rising = self.parameters.standoff_m, True
+            self._free.rest_m, self._rising = self._usual_m, True
             self._enter(State.RETRACT, now_ns)
 
     def _begin_way(self, now_ns: int, arm: ArmSample) -> None:
@@ -404,7 +404,7 @@ class ContactController:
             cause = Cause.NONE if result is None else result.cause
             self._withdrawal.begin(cause, self._pressed_n)
             if self.state is not State.HOLD:
-                self._free.rest_m = self.parameters.standoff_m
+                self._free.rest_m = self._usual_m
         self.state, self._state_ns = state, now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None

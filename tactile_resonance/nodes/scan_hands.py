@@ -186,6 +186,8 @@ class NodeHands:
     ) -> Measured:
         """Measure until it is enough or the design's end; all messages go into the recording."""
         touching = self._tip is not None and self._tip.touching
+        if self._tip is not None and not touching:
+            self._tip.rise()  # a reference is taken at rest
 
         def enough_of(message: msg.Poles, blocks: int) -> bool:
             return enough(self._measured(message), blocks)

@@ -88,7 +88,7 @@ class TipContact:
         self._held_ns = 0  # when the contact was first seen to be held
         self._stop_asked_s = 0.0
         self._state: msg.ContactState | None = None
-        self._times = StateTimes()
+        self._times, self._low = StateTimes(), False
         # the newest only: the recorder's may have to wait behind what else is recorded
         # always: a scan that the node's deactivation ends still draws the tip back
         self._node.listen(msg.ContactState, STATE_TOPIC, self._on_state, NEWEST, always=True)
@@ -115,7 +115,8 @@ class TipContact:
     ) -> MakeContact.Result:
         """Press there until the force is held, from a standoff that is no higher than the usual one."""
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
-        goal.standoff_m = standoff_m if math.isfinite(standoff_m) else 0.0
+        self._low = math.isfinite(standoff_m)
+        goal.standoff_m = standoff_m if self._low else 0.0
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         result = self._make(goal, check, poll)
         while (state := self._state) is None or state.state != state.STATE_HOLD:
@@ -155,7 +156,7 @@ class TipContact:
         while time.monotonic() < deadline:
             self._end_if_hung()
             self._time.go()
-            if self._ask_to_retract() and self._idle_within(ASK_AGAIN_S):
+            if self._ask_to_retract() and self._seen_within(msg.ContactState.STATE_IDLE, ASK_AGAIN_S):
                 self.touching, self.touched_ns = False, None
                 moved_n = math.nan if self._state is None else self._state.zero_moved_n
                 return 0.0 if math.isnan(moved_n) else moved_n
@@ -169,6 +170,15 @@ class TipContact:
         raise ScanEnded(
             f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
         )
+
+    def rise(self) -> None:
+        """Wait until a tip that was drawn back to a low standoff is at the usual one and stands."""
+        if not self._low:
+            return
+        self._low = False
+        self._time.go()
+        if self._ask_to_retract() and self._seen_within(msg.ContactState.STATE_RETRACT, ASK_AGAIN_S):
+            self._seen_within(msg.ContactState.STATE_IDLE, TOUCH_RETRACT_WITHIN_S)
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
@@ -208,12 +218,12 @@ class TipContact:
             time.sleep(0.05)
         return bool(answer.result().success)
 
-    def _idle_within(self, seconds: float) -> bool:
-        """Whether contact_node reports within a time that the tip is free."""
+    def _seen_within(self, wanted: str, seconds: float) -> bool:
+        """Whether contact_node reports a state within a time; idle: that the tip is free."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             state = self._state
-            if state is not None and state.state == state.STATE_IDLE:
+            if state is not None and state.state == wanted:
                 return True
             time.sleep(POLL_S)
         return False

@@ -142,6 +142,18 @@ def test_tip_that_waits_low_rises_at_once_where_it_is_asked_to():
     assert height_m(rig) == pytest.approx(P.standoff_m, abs=1e-4)
 
 
+def test_a_change_of_parameters_moves_no_tip():
+    rig = made()
+    states(rig, goal(rig))
+    rig.run(0.2)  # the arm comes to rest
+    before_m = height_m(rig)
+    rig.controller.configure(replace(P, standoff_m=6e-3), rig.controller.limits)
+    rig.run(2.0)
+    rig.controller.retract()
+    rig.run(0.5)
+    assert height_m(rig) == pytest.approx(before_m, abs=2e-5)
+
+
 def test_contact_that_fails_is_drawn_back_to_the_usual_standoff():
     rig = made()
     states(rig, goal(rig))

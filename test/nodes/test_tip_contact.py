@@ -44,7 +44,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     """It took 0.3 s until the force was reached, at 5 s; that it is still held is said again and again."""
     tip = TipContact.__new__(TipContact)
     tip._state, tip._held_ns, tip.stopped, tip._instance = None, 0, False, 0
-    tip._times = StateTimes()
+    tip._times, tip._low = StateTimes(), False
 
     def make(goal, check, poll):
         for state, seconds in (("settle", 4.9), ("hold", 5.0), ("hold", 5.04), ("hold", 5.08)):
