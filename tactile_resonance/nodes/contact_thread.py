@@ -24,8 +24,8 @@ POLL_S = 0.01
 HUNG_S = 1.0
 # A loop that has not ended so long after it should is given up.
 END_WITHIN_S = 3.0
-# Between two attempts to start a force source that has failed.
-SOURCE_AGAIN_S = 0.25
+# Between two attempts to start a force source that has failed, by the loop's clock.
+SOURCE_AGAIN_NS = 250_000_000
 
 
 class _EndedError(Exception):
@@ -75,7 +75,7 @@ class ContactThread:
         self._running = True
         self._connecting = False  # meanwhile the arm is another thread's, and the loop stands
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
-        self._source_tried_s = 0.0
+        self._source_tried_ns: int | None = None
         self._alive_s = time.monotonic()
         self._led = arm.led_clock(force.cell, self._stay)
         self.clock: Clock = self._led or arm.clock
@@ -167,9 +167,10 @@ class ContactThread:
 
     def _start_source_again(self) -> None:
         """Start a force source that has failed; only while no contact is under way, since it takes a while."""
-        now_s = time.monotonic()
-        if self.controller.state is State.IDLE and now_s - self._source_tried_s > SOURCE_AGAIN_S:
-            self._source_tried_s = now_s
+        now_ns, tried_ns = self.clock.now_ns(), self._source_tried_ns
+        waited = tried_ns is None or now_ns - tried_ns > SOURCE_AGAIN_NS
+        if self.controller.state is State.IDLE and waited:
+            self._source_tried_ns = now_ns
             with contextlib.suppress(ForceError):  # its next `read` reports it
                 self._force.start()
 
