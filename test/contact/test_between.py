@@ -183,3 +183,41 @@ def test_standoff_is_never_raised_and_not_below_its_range():
     assert low.early_m < low.standoff_m
     with pytest.raises(ValueError, match="standoff_m"):
         P.with_standoff(1e-4)
+
+
+FAULTS = {
+    "silent": True,
+    "stuck": True,
+    "invalid": True,
+    "saturated": True,
+    "flipped": True,
+    "bias_step_n": 0.03,
+}
+
+
+@pytest.mark.parametrize("state", [State.TRAVEL, State.APPROACH])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_of_the_cell_on_a_way_without_a_rest_is_named_and_presses_no_harder(fault, state):
+    rig = made(seed=5)
+    states(rig, goal(rig))
+    rig.loop.start(goal(rig, 5e-3, LOW_M))
+    assert rig.run_until(state)
+    rig.run(0.1)
+    assert rig.controller.state is state
+    setattr(rig.bench.cell.faults, fault, FAULTS[fault])
+    begun = len(rig.force_n)
+    rig.loop.run_while(lambda: rig.controller.result is None, 5.0)
+    rig.run(0.5)
+    result = rig.controller.result
+    assert not result.reached
+    assert result.cause is not Cause.NONE
+    assert max(rig.force_n[begun:]) < 0.03
+    # the next contact knows no zero from before
+    for name in FAULTS:
+        setattr(rig.bench.cell.faults, name, type(FAULTS[name])(0))
+    rig.loop.retract()
+    rig.run(1.0)
+    rig.bench.force.start()
+    order, result, _ = states(rig, goal(rig, 0.0))
+    assert State.TARE in order
+    assert result.reached

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import State
+from tactile_resonance.report.run_report import as_page, summary
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.point_times import (
     BETWEEN,
@@ -88,3 +89,14 @@ def test_a_scan_keeps_the_times_of_each_point(tmp_path, spent):
     with (run.path / "results.csv").open() as file:
         told = next(csv.DictReader(file))
     assert told["approach_s"] == ("0.4" if spent else "nan")
+
+
+@pytest.mark.parametrize("spent", [None, SPENT])
+def test_report_shows_where_the_time_went_where_that_is_known(tmp_path, spent):
+    _, run, _ = scan(tmp_path / "run", scene(3), Bench(spent=spent))
+    page = as_page(run, [], {})
+    assert ("<h2>Time</h2>" in page) == (spent is not None)
+    assert any(line.startswith("A point took") for line in summary(run)) == (spent is not None)
+    if spent:
+        # three points, 0.4 s of approach each
+        assert '<td class="text">approach</td><td>0.40</td><td>0.40</td><td>1.20</td>' in page
