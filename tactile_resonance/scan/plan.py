@@ -49,8 +49,19 @@ class Plan:
     def skipped(self) -> tuple[Skipped, ...]:
         """Points and work left out, with the time saved."""
         count = len(self.points)
-        each = (replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped)
+        each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
+        if near := self.near:
+            what = f"rest for the tare, and height that the surface does not ask for, at {near} points"
+            why = "zero and plane are known from the point before"
+            each.append(Skipped(what, why, near * (CONTACT_S - NEAR_CONTACT_S)))
         return (*self.left_out, *each)
+
+    @property
+    def near(self) -> int:
+        """How many points follow one near by on a plane surface."""
+        if not is_plane(self.scene.surface):
+            return 0
+        return sum(map(is_along, self.points, self.points[1:]))
 
     @property
     def shortest_s(self) -> float:
@@ -66,10 +77,7 @@ class Plan:
         """Time that all points take with so many blocks each [s]."""
         position = np.array([point.position_m for point in self.points])
         travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
-        near = (
-            sum(map(is_along, self.points, self.points[1:])) if is_plane(self.scene.surface) else 0
-        )
-        contact_s = near * NEAR_CONTACT_S + (len(self.points) - near) * CONTACT_S
+        contact_s = len(self.points) * CONTACT_S - self.near * (CONTACT_S - NEAR_CONTACT_S)
         blocks_s = len(self.points) * blocks * self.measurement.block_s
         return travel_m / TRAVEL_M_S + contact_s + blocks_s
 
