@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shutil
 import signal
@@ -135,6 +136,7 @@ def run_job(job: Job) -> int:
     require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags")
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
+    from tactile_resonance.scan.adaptive import WantedBoundary
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
 
@@ -155,6 +157,10 @@ def run_job(job: Job) -> int:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
     parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
+    if content.adaptive is not None and isinstance(content.adaptive.wanted, WantedBoundary):
+        ends = content.adaptive.wanted.level_set
+        finite = [end if math.isfinite(end) else 0.0 for end in (ends.low, ends.high)]
+        parameters["pole_map_node"]["boundary_f0_hz"] = finite
     computing = () if priority or not job.real_time else COMPUTING
     with NodeProcesses(work / "log") as nodes:
         nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))

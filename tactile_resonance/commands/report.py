@@ -14,8 +14,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "report",
         help="page and picture of a scan's run",
-        description="Write report.html, which needs nothing else, pole_map.png, and map.mcap, the map as it "
-        "grew for Foxglove and rviz, into the folder of a run; of a run that is going on, too.",
+        description="Write report.html, which needs nothing else, pole_map.png, map.mcap, the map as it "
+        "grew for Foxglove and rviz, and boundary.json, where the scene wants a boundary, into the folder of a "
+        "run; of a run that is going on, too.",
     )
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
     parser.set_defaults(run=run)
@@ -27,6 +28,7 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.front import read_run
 
     content = read_run(options.run_folder)
+    from tactile_resonance.report.boundary import FILE, boundary_of_run
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_table import point_table, table_notes
@@ -42,18 +44,24 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.plan_text import map_names
     from tactile_resonance.scan.run_content import NOT_CHECKED
 
-    truths = truths_of(content)
+    truths, boundary = truths_of(content), boundary_of_run(content)
     pole_maps, pictures = pole_maps_of(content), []
     name = options.run_folder.resolve().name
     for band, pole_map in enumerate(pole_maps):
         title = f"Pole map, {name}" + (f", band {band + 1}" if len(pole_maps) > 1 else "")
-        pictures.append(figure_bytes(draw_pole_map(pole_map, title), ".png"))
+        pictures.append(
+            figure_bytes(draw_pole_map(pole_map, title, None if band else boundary), ".png")
+        )
         write_whole(options.run_folder / map_names(band + 1)[-1], pictures[-1])
-    write_whole(options.run_folder / "report.html", as_page(content, pictures, truths).encode())
+    told = [] if boundary is None else boundary.sentences()
+    page = as_page(content, pictures, truths, told)
+    write_whole(options.run_folder / "report.html", page.encode())
+    if boundary is not None:
+        write_whole(options.run_folder / FILE, boundary.as_json().encode())
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
-    told = [*summary(content), *(f"silent record: {line}" for line in silent_lines(content))]
+    told = [*summary(content), *told, *(f"silent record: {line}" for line in silent_lines(content))]
     for line in (*told, *(f"left out: {line}" for line in skipped_lines(content))):
         print(line)
     for problem in content.problems:
@@ -61,6 +69,7 @@ def run(options: argparse.Namespace) -> int:
     if content.unchecked:
         print(NOT_CHECKED.format(content.unchecked))
     drawn = ["report.html", *map_names(len(pole_maps))]
+    drawn += [] if boundary is None else [FILE]
     if pole_maps:
         write_map_recording(content)  # last: the page and the table do not wait for it
         drawn.append("map.mcap")

@@ -14,11 +14,13 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
+from tactile_resonance.fields import build, numbers
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
 from tactile_resonance.recording.messages import poles_from_message
+from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.map_messages import (
     cloud_message,
     legend_message,
@@ -104,6 +106,13 @@ PARAMETERS = (
         100,
         read_only=True,
     ),
+    Parameter(
+        "boundary_f0_hz",
+        [0.0, 0.0],
+        "The boundary of what lies between two frequencies [Hz] is drawn, with the band that holds it (95 %); "
+        "0: none on that side, both: no boundary.",
+        read_only=True,
+    ),
     Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
 )
 
@@ -118,7 +127,7 @@ REPEAT_PERIOD_S = 1.5
 class PoleMapNode(ManagedNode):
     """Keeps the latest result or poles of every place, and shows them to whoever looks.
 
-    `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses and failures), `pole_map/legend` and
+    `pole_map` (PointCloud2), `pole_map/markers` (95 % ellipses, failures, a boundary), `pole_map/legend` and
     `pole_map/surface` are latched; each is made when there is something new and somebody subscribed, at the
     latest when somebody does, and repeated while somebody is.
     """
@@ -141,6 +150,9 @@ class PoleMapNode(ManagedNode):
         self._nominal: NominalContact | None = None
         if classes_file:
             self._classes, self._nominal = read_classes(Path(classes_file))
+        low, high = numbers(values(self, "boundary_f0_hz")[0].tolist(), "boundary_f0_hz", 2)
+        ends = low or -math.inf, high or math.inf
+        self._wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
         self._map = PoleMap()
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
@@ -272,7 +284,7 @@ class PoleMapNode(ManagedNode):
         names = tuple(tissue.name for tissue in self._classes)
         makers: dict[str, Callable[[], Any]] = {
             "": lambda: cloud_message(self._map, names, header),
-            "/markers": lambda: marker_message(self._map, scale, probability, header),
+            "/markers": lambda: marker_message(self._map, scale, probability, header, self._wanted),
             "/legend": lambda: legend_message(self._map, scale, probability, names, header),
             "/surface": lambda: surface_message(self._map, cells, header),
         }

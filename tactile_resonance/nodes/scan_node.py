@@ -211,7 +211,7 @@ class ScanNode(ManagedNode):
             self.get_logger().warning(f"damaged, left out of the run: {problem}")
         if UNCHECKED in plan.skipped:
             self.get_logger().warning(UNCHECKED.why)
-        result.run_directory, result.points = str(run.path), len(plan.points)
+        result.run_directory, result.points = str(run.path), plan.most_points
         self._run_directory = result.run_directory
         result.outcome = Scan.Result.ENDED
         self.get_logger().info(f"run goes to {run.path}")

@@ -15,6 +15,9 @@ from typing import Any
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
+from tactile_resonance.report.run_report import scene_of
+from tactile_resonance.scan.adaptive import WantedBoundary
+from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.map_messages import (
     cloud_message,
     legend_message,
@@ -65,8 +68,9 @@ def write_map_recording(run: RunContent) -> Path | None:
         step = -(-len(states) // MOST_STATES)
         last = states[-1][1]
         names = tuple(name for name in last.classes() if name != UNKNOWN)
+        wanted = _wanted(run)
         for time_ns, pole_map in states[::-1][::step][::-1]:  # the last one is among them
-            _write_map(writer, time_ns, pole_map, frame_id, names)
+            _write_map(writer, time_ns, pole_map, frame_id, names, wanted)
         surface = surface_message(last, _CELLS, header_message(frame_id, time_ns))
         _write(writer, "/pole_map/surface", time_ns, surface, _LATCHED)
         writer.finish()
@@ -84,14 +88,26 @@ def _states(run: RunContent) -> Iterator[tuple[int, PoleMap]]:
                 yield time_ns, pole_map
 
 
+def _wanted(run: RunContent) -> LevelSet | None:
+    """What the boundary is of that an adaptive scan was to find."""
+    scene = scene_of(run)
+    asked = None if scene is None or scene.adaptive is None else scene.adaptive.wanted
+    return asked.level_set if isinstance(asked, WantedBoundary) else None
+
+
 def _write_map(
-    writer: PointFileWriter, time_ns: int, pole_map: PoleMap, frame_id: str, names: tuple[str, ...]
+    writer: PointFileWriter,
+    time_ns: int,
+    pole_map: PoleMap,
+    frame_id: str,
+    names: tuple[str, ...],
+    wanted: LevelSet | None,
 ) -> None:
     header = header_message(frame_id, time_ns)
     scale = pole_map.ellipse_scale(_PROBABILITY)
     for name, message in {
         "": cloud_message(pole_map, names, header),
-        "/markers": marker_message(pole_map, scale, _PROBABILITY, header),
+        "/markers": marker_message(pole_map, scale, _PROBABILITY, header, wanted),
         "/legend": legend_message(pole_map, scale, _PROBABILITY, names, header),
     }.items():
         _write(writer, f"/pole_map{name}", time_ns, message, _LATCHED)

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
+from tactile_resonance.report.boundary import RunBoundary
 from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, draw_ellipse, new_figure
+from tactile_resonance.scan.level_set import PROBABILITY as LINE_PROBABILITY
+from tactile_resonance.scan.level_set import Lines
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface, PoleMap
 
 COLOURS = LinearSegmentedColormap.from_list(
@@ -19,13 +24,16 @@ MM = 1e3
 _MARKS = "osD^vP*X"
 
 
-def draw_pole_map(pole_map: PoleMap, title: str) -> Figure:
+def draw_pole_map(pole_map: PoleMap, title: str, boundary: RunBoundary | None = None) -> Figure:
     """Map of f0 with ellipses and failures, its uncertainty between the points, and the poles.
 
     Parameters
     ----------
     pole_map : PoleMap
         With one point or more.
+    title : str
+    boundary : RunBoundary, optional
+        Drawn with its band, and its truth where that is known.
     """
     if not pole_map.points:
         raise ValueError("pole_map: got no points; accepted is one or more")
@@ -60,6 +68,8 @@ def draw_pole_map(pole_map: PoleMap, title: str) -> Figure:
     above.add_collection(
         LineCollection(list(lines.reshape(-1, 2, 2)), colors="black", linewidths=0.9, zorder=4)
     )
+    if boundary is not None:
+        _draw_boundary(above, boundary)
     _draw_failures(above, pole_map)
     _label(
         above,
@@ -93,6 +103,22 @@ def _draw_failures(axes: Axes, pole_map: PoleMap) -> None:
         where = np.array([point.position_m for point in pole_map.failures]) * MM
         axes.plot(*where.T[:2], "x", color="red", ms=9, mew=2, label="failed", zorder=5)
         axes.legend(loc="upper right")
+
+
+def _draw_boundary(axes: Axes, found: RunBoundary) -> None:
+    """Outline, the band that holds it, and its truth."""
+    band = f"{100 * LINE_PROBABILITY:g} % band"
+    styles: tuple[tuple[Lines, dict[str, Any], str], ...] = (
+        (found.boundary.outline_m, {"color": "black", "lw": 2}, "boundary"),
+        (found.boundary.inner_m, {"color": "black", "ls": "--", "lw": 1}, band),
+        (found.boundary.outer_m, {"color": "black", "ls": "--", "lw": 1}, band),
+        (found.true_outline_m, {"color": "red", "lw": 1.2}, "truth of the simulation"),
+    )
+    for lines, style, label in styles:
+        for line in lines:
+            named = label in axes.get_legend_handles_labels()[1]
+            axes.plot(*(line.T * MM), **style, zorder=5, label=None if named else label)
+    axes.legend(loc="upper right", fontsize="small")
 
 
 def _draw_plane(axes: Axes, pole_map: PoleMap) -> None:

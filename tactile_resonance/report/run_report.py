@@ -85,7 +85,9 @@ def pole_maps_of(run: RunContent) -> list[PoleMap]:
     return [pole_map for pole_map in maps if pole_map.points]
 
 
-def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
+def as_page(
+    run: RunContent, pictures: Sequence[bytes], truths: Truths, boundary: Sequence[str] = ()
+) -> str:
     """HTML with the pictures (PNG) in it; nothing is fetched from elsewhere.
 
     Parameters
@@ -95,6 +97,8 @@ def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
         Maps of the bands, in their order.
     truths : mapping of int to PointTruth
         What the simulated bench knew, by point; empty for hardware.
+    boundary : sequence of str
+        What is known of the boundary that was wanted.
     """
     name, scene = _scene_name(run), scene_of(run)
     simulated = any(result.simulated for result in run.latest)
@@ -104,6 +108,7 @@ def as_page(run: RunContent, pictures: Sequence[bytes], truths: Truths) -> str:
     facts = {key: value for key, value in run.facts.items() if key not in _SHOWN}
     sections = {
         "Plan and outcome": _compared_with_plan(scene, run),
+        "Boundary": _paragraphs(boundary),
         "Sensor in free air": _paragraphs([sentence], mark=health is not SensorHealth.STEADY),
         "Silent record": _bullets(silent_lines(run)),
         "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),

@@ -58,18 +58,34 @@ class KrigedSurface:
         includes that of the mean, but not that of length and size.
         """
         at = np.asarray(xy_m, float)
-        distances = cdist(self.xy_m, at.reshape(-1, 2))  # (n, q)
-        cross = self.process_std**2 * _matern(distances / self.length_m)
-        weights = cho_solve(self.factor, cross)
+        cross, weights, of_mean = self._weights(at.reshape(-1, 2))
         value = self.mean + (self.values - self.mean) @ weights
-        # what the mean's own uncertainty adds
-        of_mean = (1 - np.sum(weights, axis=0)) ** 2 / _mean(self.factor, self.values)[1]
-        variance = self.process_std**2 - np.sum(cross * weights, axis=0) + of_mean
+        variance = self.process_std**2 - np.sum(cross * weights, axis=0) + of_mean**2
         std = np.sqrt(np.maximum(variance, 0))
         return value.reshape(at.shape[:-1]), std.reshape(at.shape[:-1])
 
+    def covariance(self, a_m: npt.ArrayLike, b_m: npt.ArrayLike) -> FloatArray:
+        """(p, q) covariance of the quantity between (p, 2) and (q, 2) positions, as `predict` knows it."""
+        a, b = np.asarray(a_m, float), np.asarray(b_m, float)
+        (cross, _, of_a), (_, weights, of_b) = self._weights(a), self._weights(b)
+        before = self.process_std**2 * _matern(cdist(a, b) / self.length_m)
+        return np.asarray(before - cross.T @ weights + np.outer(of_a, of_b))
 
-def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) -> KrigedSurface:
+    def _weights(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n, q) covariance with the points and their weights; (q,) what the mean's uncertainty adds."""
+        cross = self.process_std**2 * _matern(cdist(self.xy_m, at_m) / self.length_m)
+        weights = cho_solve(self.factor, cross)
+        known = _mean(self.factor, self.values)[1]
+        return cross, weights, (1 - np.sum(weights, axis=0)) / np.sqrt(known)
+
+
+def krige(
+    xy_m: npt.ArrayLike,
+    values: npt.ArrayLike,
+    noise_std: npt.ArrayLike,
+    most_length_m: float = np.inf,
+    least_std: float = 0.0,
+) -> KrigedSurface:
     """Fit length, size and mean.
 
     Parameters
@@ -79,6 +95,8 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
     values : (n,) float
     noise_std : (n,) float
         Of each value; 0 means exact.
+    most_length_m, least_std : float
+        What is known beforehand of length and size, which few points do not determine.
 
     Raises
     ------
@@ -102,17 +120,20 @@ def krige(xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike) 
     # starts over the lengths that the points resolve: a likelihood may have several maxima
     picked = np.unique(np.linspace(0, len(y) - 1, min(len(y), FIT_POINTS)).astype(int))
     nearest = float(np.median(apart.min(axis=1)))
-    lowest, highest = np.log(0.3 * nearest), np.log(10 * extent)
+    longest = min(10 * extent, most_length_m)
+    lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
+    least, most = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
+    first = min(max(np.log(scale), least), most)
     best = min(
         (
             minimize(
                 _cost,
-                np.array([start, np.log(scale)]),
+                np.array([start, first]),
                 args=(distances[np.ix_(picked, picked)], y[picked], noise[picked]),
                 method="L-BFGS-B",
-                bounds=[(lowest, highest), (np.log(1e-4 * scale), np.log(100 * scale))],
+                bounds=[(lowest, highest), (least, most)],
             )
-            for start in np.linspace(lowest, np.log(extent), 4)
+            for start in np.linspace(lowest, min(np.log(extent), highest), 4)
         ),
         key=lambda found: found.fun,
     )

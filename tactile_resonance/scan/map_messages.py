@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.recording.messages import POLES_STATUS, write_header
+from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
@@ -73,9 +74,13 @@ def surface_message(pole_map: PoleMap, cells: int, header: Message) -> Message:
 
 
 def marker_message(
-    pole_map: PoleMap, scale: EllipseScale, probability: float, header: Message
+    pole_map: PoleMap,
+    scale: EllipseScale,
+    probability: float,
+    header: Message,
+    wanted: LevelSet | None = None,
 ) -> Message:
-    """Two markers: the ellipses of all points, crosses where a point failed."""
+    """Markers: ellipses of all points, crosses where one failed, the boundary that is wanted, its band."""
     ellipses = _marker(header, "ellipses", 0, "LINE_LIST")
     crosses = _marker(header, "failures", 0, "LINE_LIST")
     if pole_map.estimated:
@@ -91,7 +96,28 @@ def marker_message(
         ends = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
         crosses.points = _points(np.array(ends).reshape(-1, 3))
         crosses.color = _colour(_FAILED)
-    return make_message(MARKERS, markers=[m if m.points else _deleted(m) for m in (ellipses, crosses)])
+    markers = [ellipses, crosses, *_boundary_markers(pole_map, wanted, header)]
+    return make_message(MARKERS, markers=[m if m.points else _deleted(m) for m in markers])
+
+
+def _boundary_markers(pole_map: PoleMap, wanted: LevelSet | None, header: Message) -> list[Message]:
+    """Outline and band; both empty where too few points have a pole."""
+    if wanted is None:
+        return []
+    outline, band = (_marker(header, "boundary", k, "LINE_LIST") for k in range(2))
+    band.color = _colour(_WHITE, 0.5)
+    boundary = pole_map.boundary(wanted)
+    if boundary is not None:
+        z = float(np.median(pole_map.positions_m[:, 2]))
+        for marker, lines, width in (
+            (outline, boundary.outline_m, 3 * _LINE),
+            (band, (*boundary.inner_m, *boundary.outer_m), _LINE),
+        ):
+            marker.scale.x = width * pole_map.size_m
+            for line in lines:
+                ends = np.column_stack([line, np.full(len(line), z)])
+                marker.points += _points(np.stack([ends[:-1], ends[1:]], axis=1).reshape(-1, 3))
+    return [outline, band]
 
 
 def legend_message(

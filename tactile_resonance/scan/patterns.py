@@ -82,12 +82,14 @@ def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> npt.NDArray
 def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     """(n, 3) positions of a scene's section [m]; z is NaN where the surface decides it.
 
+    Those of ``adaptive`` are of `scan.adaptive`.
+
     Raises
     ------
     ValueError
         If it is none of the known patterns, or a field of it is wrong.
     """
-    form, pattern = one_of(_FORMS, fields, where)
+    form, pattern = one_of(_FORMS, fields, where, frozenset({"adaptive"}))
     positions = pattern if form == "list" else build(pattern.positions, f"{where}.{form}")
     require_near(positions, where)
     return positions
@@ -122,7 +124,8 @@ def _read_spacing(value: object, where: str) -> Pair:
     return x, y
 
 
-def _flat(xy_m: FloatArray) -> FloatArray:
+def flat(xy_m: FloatArray) -> FloatArray:
+    """(n, 3) positions whose z the surface decides."""
     return np.concatenate([xy_m, np.full((len(xy_m), 1), np.nan)], axis=1)
 
 
@@ -143,7 +146,7 @@ class _Grid:
 
     def positions(self) -> FloatArray:
         require(min(self.size_m) >= 0, "size_m", self.size_m, "numbers of 0 or above")
-        return _flat(grid(self.center_m, self.size_m, self.spacing_m, self.order))
+        return flat(grid(self.center_m, self.size_m, self.spacing_m, self.order))
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class _Spiral:
 
     def positions(self) -> FloatArray:
         check_above_zero(self, "radius_m")
-        return _flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
+        return flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +183,7 @@ class _Region:
         whole = grid((low + high) / 2, high - low, self.spacing_m, self.order)
         kept = whole[inside_polygon(whole, polygon)]
         require(len(kept) > 0, "spacing_m", self.spacing_m, "fine enough for a point")
-        return _flat(kept)
+        return flat(kept)
 
 
 _FORMS = {"grid": _Grid, "spiral": _Spiral, "list": Places, "around": _Around, "region": _Region}

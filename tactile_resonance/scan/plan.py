@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
+from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.standoff import is_along, is_plane
@@ -34,6 +37,7 @@ class Plan:
     scene : ScanScene
         That it carries out.
     points : tuple of ScanPoint
+        Of an adaptive scan the places among which it chooses.
     measurement : MeasurementDesign
         At each of them.
     left_out : tuple of Skipped
@@ -48,7 +52,7 @@ class Plan:
     @property
     def skipped(self) -> tuple[Skipped, ...]:
         """Points and work left out, with the time saved."""
-        count = len(self.points)
+        count = self.most_points
         each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
         if near := self.near:
             what = f"rest for the tare, and height that the surface does not ask for, at {near} points"
@@ -56,30 +60,83 @@ class Plan:
             each.append(Skipped(what, why, near * (CONTACT_S - NEAR_CONTACT_S)))
         return (*self.left_out, *each)
 
+    @cached_property
+    def first_points(self) -> tuple[ScanPoint, ...]:
+        """Those that are known before the first is touched: all, or the first touches of an adaptive scan."""
+        adaptive = self.scene.adaptive
+        if adaptive is None:
+            return self.points
+        first = enumerate(adaptive.first(self._places_m))
+        return tuple(self._numbered(self.points[place], index) for index, place in first)
+
+    @property
+    def most_points(self) -> int:
+        """That are touched."""
+        adaptive = self.scene.adaptive
+        return len(self.points) if adaptive is None else min(adaptive.most, len(self.points))
+
     @property
     def near(self) -> int:
-        """How many points follow one near by on a plane surface."""
+        """How many points, of those known beforehand, follow one near by on a plane surface."""
         if not is_plane(self.scene.surface):
             return 0
-        return sum(map(is_along, self.points, self.points[1:]))
+        return sum(map(is_along, self.first_points, self.first_points[1:]))
 
     @property
     def shortest_s(self) -> float:
-        """With the fewest blocks at every point [s]."""
-        return self.duration_s(self.scene.blocks.least)
+        """With the fewest points and blocks [s]."""
+        return self.duration_s(self.scene.blocks.least, len(self.first_points))
 
     @property
     def longest_s(self) -> float:
         """With the most [s]."""
         return self.duration_s(self.scene.blocks.most)
 
-    def duration_s(self, blocks: int) -> float:
-        """Time that all points take with so many blocks each [s]."""
-        position = np.array([point.position_m for point in self.points])
+    def duration_s(self, blocks: int, points: int | None = None) -> float:
+        """Time of so many points, by default the most, with so many blocks each [s].
+
+        Ways that are not known yet count as the mean of those that are.
+        """
+        position = np.array([point.position_m for point in self.first_points])
         travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
-        contact_s = len(self.points) * CONTACT_S - self.near * (CONTACT_S - NEAR_CONTACT_S)
-        blocks_s = len(self.points) * blocks * self.measurement.block_s
-        return travel_m / TRAVEL_M_S + contact_s + blocks_s
+        contact_s = len(position) * CONTACT_S - self.near * (CONTACT_S - NEAR_CONTACT_S)
+        each_s = (travel_m / TRAVEL_M_S + contact_s) / len(position)
+        count = self.most_points if points is None else points
+        return count * (each_s + blocks * self.measurement.block_s)
+
+    def next_point(
+        self, touched: Sequence[ScanPoint], results: Iterable[PointResult]
+    ) -> ScanPoint | None:
+        """The touch that an adaptive scan appends to those before; None where it is enough, or not adaptive.
+
+        Parameters
+        ----------
+        touched : sequence of ScanPoint
+            In order, all finished.
+        results : iterable of PointResult
+            Latest of each.
+        """
+        adaptive = self.scene.adaptive
+        if adaptive is None:
+            return None
+        place_of = {point.position_m: place for place, point in enumerate(self.points)}
+        before = [place_of[point.position_m] for point in touched]
+        last = self.points[before[-1]]
+        way_m = np.linalg.norm(self._places_m - self._places_m[before[-1]], axis=1)
+        near = [is_along(last, point) for point in self.points]
+        contact_s = np.where(near, NEAR_CONTACT_S, CONTACT_S)
+        seconds = way_m / TRAVEL_M_S + contact_s
+        seconds += self.scene.blocks.least * self.measurement.block_s
+        place = adaptive.next(self._places_m, before, known_points(results), seconds)
+        return None if place is None else self._numbered(self.points[place], len(touched))
+
+    @cached_property
+    def _places_m(self) -> FloatArray:
+        """(p, 2) of all points, seen from above."""
+        return np.array([point.position_m[:2] for point in self.points])
+
+    def _numbered(self, point: ScanPoint, index: int) -> ScanPoint:
+        return replace(point, index=index, label=f"{self.scene.name}, point {index + 1}")
 
     def with_points(self, points: Sequence[ScanPoint], left: Sequence[LeftOut]) -> Plan:
         """The same with these points, renumbered, and what is left out of it noted.
@@ -92,11 +149,7 @@ class Plan:
         if not points:
             raise ValueError(f"positions: all {len(left)} are left out; the first: {left[0].why}")
         each_s = self.longest_s / len(self.points)
-        name = self.scene.name
-        numbered = tuple(
-            replace(point, index=index, label=f"{name}, point {index + 1}")
-            for index, point in enumerate(points)
-        )
+        numbered = tuple(self._numbered(point, index) for index, point in enumerate(points))
         entries = [Skipped(f"the point at {_in_mm(out.point)}", out.why, each_s) for out in left]
         return replace(self, points=numbered, left_out=(*self.left_out, *entries))
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
@@ -27,14 +28,28 @@ def touches(scene: ScanScene, points: int) -> tuple[int, int]:
 
 def plan_rows(plan: Plan) -> Rows:
     """What a scan will excite, compute, publish and draw, with names for people."""
-    scene, design, count = plan.scene, plan.measurement, len(plan.points)
+    scene, design, count = plan.scene, plan.measurement, plan.most_points
     before, in_all = touches(scene, count)
     stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
+    at_most = "at most " if scene.adaptive else ""
     rows = [
         (
             "touches",
-            f"{in_all}: {count} points" + (f", {before} for surface and normals" if before else ""),
+            f"{at_most}{in_all}: {count} points"
+            + (f", {before} for surface and normals" if before else ""),
         ),
+    ]
+    if scene.adaptive is not None:
+        rows += [
+            (
+                "adaptive",
+                f"{len(plan.first_points)} points first, so that every disc of "
+                f"{1e3 * scene.adaptive.smallest_m:g} mm is touched; each of the others where it is "
+                f"expected to show most, among {len(plan.points)} places",
+            ),
+            ("chosen until", f"{adaptive_wanted(scene.adaptive)}, or the most points"),
+        ]
+    rows += [
         (
             "excited",
             f"{design.grid.value} grid of {design.lines} lines, {stretches} Hz, at "
@@ -70,6 +85,28 @@ def plan_rows(plan: Plan) -> Rows:
     return rows
 
 
+def adaptive_wanted(asked: Adaptive) -> str:
+    """When the touches of a scan are enough."""
+    wanted = asked.wanted
+    if isinstance(wanted, WantedMap):
+        return f"f0 +- {wanted.f0_std_hz:g} Hz everywhere"
+    levels = " and ".join(f"{level:.2f}" for level in wanted.level_set.levels)
+    return f"the boundary at {levels} Hz with {1e6 * wanted.most_loss:.3g} mm2 expected on its wrong side"
+
+
+def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
+    """How well what is wanted is known."""
+    surface = asked.krige(known_points(results))
+    if surface is None:
+        return "too few points have a pole"
+    loss = asked.loss(surface)
+    met = "enough" if loss <= asked.wanted.most_loss else "not enough"
+    if isinstance(asked.wanted, WantedMap):
+        _, std_hz = surface.predict(asked.raster.xy_m[asked.raster.within])
+        return f"{met}: +- {std_hz.max():.2g} Hz at most, {len(results)} touches"
+    return f"{met}: {1e6 * loss:.2g} mm2, {len(results)} touches"
+
+
 def map_names(bands: int) -> list[str]:
     """Names of the figures of the map, one for each band."""
     return [f"pole_map{f'_{k + 1}' if k else ''}.png" for k in range(bands)]
@@ -87,17 +124,22 @@ def plan_against_outcome(scene: ScanScene, run: RunContent) -> list[tuple[str, s
     """
     results, count = run.latest, len(run.points)
     done = [result for result in results if result.outcome is PointOutcome.DONE]
-    blocks = [scene.blocks.least * count, scene.blocks.most * count]
+    blocks = f"{scene.blocks.least * count} to {scene.blocks.most * count}"
+    points, chosen = f"{count}", scene.adaptive
+    if chosen is not None:
+        points, blocks = (f"at most {n}" for n in (chosen.most, scene.blocks.most * chosen.most))
     taken_s = float(np.nansum([result.duration_s for result in results]))
     planned_s = [run.facts.get(name) for name in ("shortest_s", "longest_s")]
     rows = [
-        ("points", f"{count}", f"{len(results)} finished, {len(done)} with poles"),
-        ("blocks", f"{blocks[0]} to {blocks[1]}", f"{sum(result.blocks for result in results)}"),
+        ("points", points, f"{len(results)} finished, {len(done)} with poles"),
+        ("blocks", blocks, f"{sum(result.blocks for result in results)}"),
     ]
     if all(isinstance(seconds, (int, float)) for seconds in planned_s):
         rows.append(
             ("time", f"{planned_s[0]:.0f} to {planned_s[1]:.0f} s", f"{taken_s:.0f} s at points")
         )
+    if chosen is not None:
+        rows.append(("touches chosen", adaptive_wanted(chosen), _found(chosen, results)))
     for k, band in enumerate(scene.sensor.bands):
         of_band = [result.of_band(k) for result in done]
         found = [result for result in of_band if not result.failed]

@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.record import Origin
+from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
+from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN
 
@@ -43,6 +45,7 @@ SAME_PLACE_M = 1e-4
 LONE_SPACING_M = 0.005
 """What a single point is taken to be apart from others where it is drawn [m]."""
 _SEGMENTS = 36  # of an ellipse
+_CELLS = 80  # of the raster of a boundary, along its longer side
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +231,25 @@ class PoleMap:
         if len(points) < LEAST_POINTS:
             return None
         xy = np.array([p.position_m[:2] for p in points])
-        if np.linalg.matrix_rank(xy - xy.mean(axis=0), tol=SAME_PLACE_M) < 2:
-            return None  # on one line: nothing is known beside it
+        if _on_a_line(xy):
+            return None
         return krige(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
+
+    def boundary(self, level_set: LevelSet) -> Boundary | None:
+        """Boundary of what lies between two natural frequencies about the points; None as of `krige`.
+
+        Frequencies are those at the nominal contact where these are known.
+        """
+        xy, f0_hz, std_hz = known_points(
+            replace(p.result, x_m=float(p.position_m[0]), y_m=float(p.position_m[1]))
+            for p in self.estimated
+        )
+        if len(xy) < LEAST_POINTS or _on_a_line(xy):
+            return None
+        low, high = xy.min(axis=0) - self.spacing_m / 2, xy.max(axis=0) + self.spacing_m / 2
+        box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        raster = Raster.over(box, float(np.max(high - low)) / _CELLS)
+        return boundary_of(krige(xy, f0_hz, std_hz), level_set, raster)
 
     def surface(self, cells: int = 40) -> MapSurface | None:
         """Kriged natural frequency on a grid over the points, `cells` along its longer side."""
@@ -246,6 +265,11 @@ class PoleMap:
         z = griddata(kriged.xy_m, heights, xy, method="linear")
         z = np.where(np.isnan(z), griddata(kriged.xy_m, heights, xy, method="nearest"), z)
         return MapSurface(np.concatenate([xy, z[..., None]], axis=-1), value, std)
+
+
+def _on_a_line(xy_m: FloatArray) -> bool:
+    """Whether (n, 2) positions are on one line: nothing is known beside it."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=SAME_PLACE_M) < 2)
 
 
 def tangent_axes(normal: FloatArray) -> FloatArray:

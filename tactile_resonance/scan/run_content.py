@@ -36,7 +36,7 @@ class RunContent:
     facts : mapping
         Versions, seeds, what the plan skips.
     points : tuple of ScanPoint
-        The plan.
+        The plan; of an adaptive scan what it chose so far.
     files : tuple of FileContent
         Finished files of the recording.
     results : tuple of PointResult
@@ -45,6 +45,8 @@ class RunContent:
         Damaged, missing and foreign files, by name.
     unchecked : int
         Files whose checksum is not known: an earlier version finished them.
+    places : tuple of ScanPoint
+        Among which an adaptive scan chooses its points; empty: all points are known beforehand.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class RunContent:
     results: tuple[PointResult, ...] = ()
     problems: tuple[str, ...] = ()
     unchecked: int = 0
+    places: tuple[ScanPoint, ...] = ()
 
     @cached_property
     def latest(self) -> tuple[PointResult, ...]:
@@ -63,7 +66,7 @@ class RunContent:
 
     @property
     def next_point(self) -> ScanPoint | None:
-        """First point of the plan that is not finished; None where all are."""
+        """First point known that is not finished; None where all are."""
         finished = {result.index for result in self.results}
         return next((point for point in self.points if point.index not in finished), None)
 
@@ -167,14 +170,19 @@ def read_plan(path: Path) -> RunContent:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
         scene = (path / SCENE).read_text(encoding="utf-8")
-        points = tuple(
-            read_dataclass(ScanPoint, point, f"points[{i}]")
-            for i, point in enumerate(content["points"])
+        points, places = (
+            tuple(
+                read_dataclass(ScanPoint, point, f"{name}[{i}]") for i, point in enumerate(listed)
+            )
+            for name, listed in (
+                ("points", content["points"]),
+                ("places", content.get("places", ())),
+            )
         )
         facts = content["facts"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
-    return RunContent(path, scene, facts, points)
+    return RunContent(path, scene, facts, points, places=places)
 
 
 def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:

@@ -4,7 +4,8 @@
 ::
 
     RUN/scene.yaml                      the scene as it was given
-    RUN/run.json                        plan, versions, seeds, what was skipped; written once
+    RUN/run.json                        plan, versions, seeds, what was skipped; written again where a scan
+                                        that chooses its points appends one
     RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
     RUN/recording/reference-00-air.mcap references of the session
     RUN/recording/metadata.yaml         makes all of them one rosbag2 recording
@@ -26,6 +27,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,6 +96,7 @@ class RunDirectory:
         points: Sequence[ScanPoint],
         facts: Mapping[str, Any],
         needed_bytes: int = 0,
+        places: Sequence[ScanPoint] = (),
     ) -> RunDirectory:
         """Begin a run.
 
@@ -109,6 +112,8 @@ class RunDirectory:
             What JSON can hold: versions, seeds, what the plan skips.
         needed_bytes : int
             What the run may take on disk; `expected_bytes` estimates it.
+        places : sequence of ScanPoint
+            Among which further points will be chosen.
 
         Raises
         ------
@@ -123,18 +128,13 @@ class RunDirectory:
             indices = [point.index for point in points][:10]
             raise ValueError(f"points: got indices {indices}; accepted are 0, 1, 2 ... in order")
         cls.check_new(path, needed_bytes)
-        content = {
-            "format": FORMAT,
-            "facts": dict(facts),
-            "points": [point.as_json() for point in points],
-        }
-        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        text = _plan_text(RunContent(path, scene, facts, tuple(points), places=tuple(places)))
         (path / RECORDING).mkdir(parents=True)
         lock = _lock(path)
         try:
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
-            write_whole(path / "run.json", text.encode())  # last: with it the run exists
+            write_whole(path / "run.json", text)  # last: with it the run exists
             sync_folder(path)
             sync_folder(path.parent)
             return cls(path, lock, read_run(path))
@@ -202,6 +202,14 @@ class RunDirectory:
                     self._write_metadata()
             os.close(self._lock)
             self._lock = -1
+
+    def append(self, point: ScanPoint) -> ScanPoint:
+        """Add the next point of a scan that chooses them, durably; returns it."""
+        content = replace(self.content, points=(*self.content.points, point))
+        write_whole(self.path / "run.json", _plan_text(content))
+        sync_folder(self.path)
+        self.content = content
+        return point
 
     def begin_point(self, index: int) -> PointRecording:
         """Begin the next attempt at a point of the plan."""
@@ -315,6 +323,18 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
     """
     block = 2 * 8 * design.samples + 10 * 8 * design.lines + 10_000
     return points * (design.periods * block + 1_000_000)
+
+
+def _plan_text(content: RunContent) -> bytes:
+    """``run.json``; places only where there are some."""
+    plan = {
+        "format": FORMAT,
+        "facts": dict(content.facts),
+        "points": [point.as_json() for point in content.points],
+    }
+    if content.places:
+        plan["places"] = [point.as_json() for point in content.places]
+    return (json.dumps(plan, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _other_definitions(content: RunContent) -> list[str]:

@@ -75,7 +75,7 @@ def new_run(goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool) -
     wanted = read_goal(goal, frames)
     _require_force(wanted.plan.scene, forces)
     path = Path(goal.run_directory) if goal.run_directory else files.unused()
-    needed = expected_bytes(len(wanted.plan.points), wanted.plan.measurement)
+    needed = expected_bytes(wanted.plan.most_points, wanted.plan.measurement)
     RunDirectory.check_new(path, needed)
     return NewRun(wanted, path, needed)
 
@@ -139,7 +139,10 @@ def start_run(
             **found,
         },
     )
-    run = RunDirectory.create(new.path, new.wanted.text, plan.points, facts, new.needed_bytes)
+    places = plan.points if scene.adaptive else ()
+    run = RunDirectory.create(
+        new.path, new.wanted.text, plan.first_points, facts, new.needed_bytes, places
+    )
     return StartedRun(plan, run, seed)
 
 
@@ -155,7 +158,8 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
         scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
-        return StartedRun(plan_points(scene, run.content.points), run, int(facts["seed"]))
+        points = run.content.places or run.content.points
+        return StartedRun(plan_points(scene, points), run, int(facts["seed"]))
     except BaseException:
         run.close()
         raise

@@ -121,7 +121,7 @@ class ScanRunner:
     def _next(self) -> ScanPoint | None:
         """The point to touch next; waits while the scan is paused or a node is away."""
         self._wait()
-        point = self._run.content.next_point
+        point = self._known_next()
         request = self._controls.take()
         if request is Request.REPEAT and self._run.content.results:
             latest = max(self._run.content.results, key=lambda result: result.time_ns)
@@ -132,6 +132,14 @@ class ScanRunner:
                 self._publish(recording.finish(result))
             return self._next()
         return point
+
+    def _known_next(self) -> ScanPoint | None:
+        """The first point that is not finished; an adaptive scan chooses and appends one where all are."""
+        content = self._run.content
+        if (point := content.next_point) is not None:
+            return point
+        chosen = self._plan.next_point(content.points, content.latest)
+        return None if chosen is None else self._run.append(chosen)
 
     def _wait(self) -> None:
         """With the tip free, while the scan is paused or a node is held, and until all are at work."""
@@ -264,7 +272,7 @@ class ScanRunner:
         if any(f"-{name}." in file.name for file in self._run.content.files):
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
-        point = air_point(len(self._plan.points) + (name == AFTER))
+        point = air_point(self._plan.most_points + (name == AFTER))
         design = replace(self._plan.measurement, periods=self._scene.blocks.least)
         if silent:
             design = replace(design, silent=True)
@@ -324,7 +332,7 @@ class ScanRunner:
         duration_s: float = NAN,
     ) -> PointResult:
         """Result of an attempt that has ended, without poles."""
-        kind = PointKind.AIR if point.index >= len(self._plan.points) else PointKind.TISSUE
+        kind = PointKind.AIR if point.index >= self._plan.most_points else PointKind.TISSUE
         return replace(
             attempt_at(point, recording.attempt, self._scene.frame_id),
             outcome=outcome,
@@ -348,7 +356,7 @@ class ScanRunner:
         poles: Poles | None = None,
         waiting_for: str = "",
     ) -> None:
-        points, finished = len(self._plan.points), len(self._run.content.latest)
+        points, finished = self._plan.most_points, len(self._run.content.latest)
         each_s = self._plan.longest_s / points
         if self._durations_s:
             each_s = sum(self._durations_s) / len(self._durations_s)
@@ -366,13 +374,14 @@ class ScanRunner:
     def _summary(self, message: str) -> Summary:
         latest = self._run.content.latest
         count = {o: sum(result.outcome is o for result in latest) for o in PointOutcome}
-        complete = self._run.content.next_point is None
+        content = self._run.content
+        left = content.next_point or self._plan.next_point(content.points, latest)
         health, sentence = sensor_health(self._run.content, self._scene.drift_limits)
-        message = message or ("complete" if complete else "ended early")
+        message = message or ("ended early" if left else "complete")
         if problems := self._run.content.problems:
             message += f"; {len(problems)} damaged files left out, the first: {problems[0]}"
         return Summary(
-            complete=complete,
+            complete=left is None,
             message=message,
             done=count[PointOutcome.DONE],
             failed=count[PointOutcome.FAILED],

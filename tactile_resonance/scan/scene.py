@@ -32,9 +32,10 @@ from tactile_resonance.fields import (
     section,
 )
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
+from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
-from tactile_resonance.scan.patterns import read_positions
+from tactile_resonance.scan.patterns import flat, read_positions
 from tactile_resonance.scan.surface import (
     NormalRequest,
     Plane,
@@ -202,7 +203,7 @@ class ScanScene:
     sensor : SensorUse
     surface : Surface or TouchRequest
     positions_m : (n, 3) float
-        In order; z is NaN where the surface decides it [m].
+        In order; z is NaN where the surface decides it [m]. Of an adaptive scan those it may choose.
     outputs : tuple of Output
     precision : Precise, Separate or None
         When a point's blocks are enough; None: after the most blocks.
@@ -221,6 +222,8 @@ class ScanScene:
         How the normal of each point is found by touch; None: it is the surface's.
     notes : Notes
         What people know of the session and no instrument measures.
+    adaptive : Adaptive or None
+        How positions are chosen; None: all are touched.
     """
 
     name: str
@@ -241,6 +244,7 @@ class ScanScene:
     drift_limits: DriftLimits = field(default_factory=DriftLimits)
     normals: NormalRequest | None = None
     notes: Notes = field(default_factory=Notes)
+    adaptive: Adaptive | None = None
 
     def __post_init__(self) -> None:
         check_above_zero(self, "force_n")
@@ -250,6 +254,12 @@ class ScanScene:
             good = 0.1 <= nominal_n / self.force_n <= 10
             accepted = f"a tenth to ten times force_n, {self.force_n:g}"
             require(good, "nominal_contact.force_n", nominal_n, accepted)
+        if self.adaptive is not None:
+            accepted = "none with adaptive positions: their normals are the surface's"
+            require(self.normals is None, "normals", self.normals, accepted)
+            form = getattr(self.surface, "form", type(self.surface).__name__.lower())
+            accepted = "a plane with adaptive positions: of other surfaces the ways between points are checked"
+            require(form == "plane", "surface", form, accepted)
 
 
 def read_scan_scene(path: Path) -> ScanScene:
@@ -296,12 +306,20 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
         One line that names the field, its value and what is accepted.
     """
     where = f"{path.name}:"
-    keys = {item.name for item in fields(ScanScene)} - {"positions_m"} | {"positions"}
+    keys = {item.name for item in fields(ScanScene)} - {"positions_m", "adaptive"} | {"positions"}
     known_keys(content, keys | BENCH_KEYS, where)
-    given: dict[str, Any] = {
-        "positions_m": read_positions(section(content, "positions", where), f"{where} positions")
-    }
+    given: dict[str, Any] = {}
     given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, path, where)
+    positions = section(content, "positions", where)
+    if "adaptive" in positions:
+        require(len(positions) == 1, f"{where} positions", [*positions], "adaptive, or another one")
+        asked = section(positions, "adaptive", f"{where} positions")
+        given["adaptive"] = read_adaptive(
+            asked, given["tissue_classes"], f"{where} positions.adaptive"
+        )
+        given["positions_m"] = flat(given["adaptive"].places_m())
+    else:
+        given["positions_m"] = read_positions(positions, f"{where} positions")
     if "precision" in content:
         classes = given["tissue_classes"]
         given["precision"] = _read_precision(content["precision"], classes, f"{where} precision")

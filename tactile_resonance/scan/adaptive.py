@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans that choose their touches: until a boundary, a tissue or the map is known as well as it is wanted.
+
+The first touches are spread over the region such that every disc of the diameter `smallest_m` is touched; each
+of the others is where the loss that is left (expected area on the wrong side of the boundary, or variance of
+the map above what is wanted) is expected to fall most per second of way and touch (Bect et al., Statistics and
+Computing 22, 2012). The choice is a function of what was found so far, among places that are known beforehand,
+and of places whose gains differ by less than a thousandth the first is taken: equal results, equal touches.
+
+Few points do not determine length and size of the process. What is known beforehand bounds them: a length of
+at most `smallest_m`, and a size such that a level is not more than two standard deviations from the mean, also
+where all points are alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.distance import cdist
+
+from tactile_resonance.fields import build, check_above_zero, check_within, read_dataclass, require
+from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
+from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
+from tactile_resonance.scan.patterns import Pair, Places, grid, inside_polygon
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.tissue.classify import TissueClass
+
+FloatArray = npt.NDArray[np.float64]
+MOST_PLACES = 2500
+"""The time to choose one grows with their square."""
+MOST_TOUCHES = 500
+CELLS = 80
+"""Along the longer side of the region, where areas are summed."""
+_ALIKE = 1e-3  # gains that differ by less of the largest count as equal
+_STEPS = 50  # in which the first touches are spread
+
+
+@dataclass(frozen=True)
+class WantedBoundary:
+    """Wanted: where f0 lies between two levels, up to an expected area on the wrong side."""
+
+    level_set: LevelSet
+    most_loss: float  # [m^2]
+
+    def loss(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
+        """(...) per area."""
+        return self.level_set.wrong(f0_hz, std_hz)
+
+    def loss_after(self, f0_hz: FloatArray, std_hz: FloatArray, after: FloatArray) -> FloatArray:
+        """(...) as it is expected after a touch that leaves another standard deviation."""
+        return self.level_set.wrong_after(f0_hz, std_hz, after)
+
+    def least_std(self, values: FloatArray) -> float:
+        """Of the process: the mean is at most two of them from a level [Hz]."""
+        return float(np.min(np.abs(np.array(self.level_set.levels) - values.mean()))) / 2
+
+
+@dataclass(frozen=True)
+class WantedMap:
+    """Wanted: f0 everywhere with this standard deviation; the loss is the variance above it."""
+
+    f0_std_hz: float
+    most_loss: float = 0.0
+
+    def loss(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
+        """(...) per area."""
+        return np.maximum(std_hz**2 - self.f0_std_hz**2, 0)
+
+    def loss_after(self, f0_hz: FloatArray, std_hz: FloatArray, after: FloatArray) -> FloatArray:
+        """(...) after a touch that leaves another standard deviation."""
+        return self.loss(f0_hz, after)
+
+    def least_std(self, values: FloatArray) -> float:
+        """Nothing is known beforehand."""
+        return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptive:
+    """Which touches a scan may choose, and what for.
+
+    Attributes
+    ----------
+    polygon_m : (k, 2) float
+        Corners of the region.
+    spacing_m : float
+        Of the grid of places that may be touched.
+    smallest_m : float
+        Every disc of this diameter with its centre in the region is touched.
+    most : int
+        Touches.
+    wanted : WantedBoundary or WantedMap
+    """
+
+    polygon_m: FloatArray
+    spacing_m: float
+    smallest_m: float
+    most: int
+    wanted: WantedBoundary | WantedMap
+
+    @property
+    def raster(self) -> Raster:
+        """Of the region, fine enough for areas."""
+        longest_m = float(np.max(np.ptp(self.polygon_m, axis=0)))
+        return Raster.over(self.polygon_m, longest_m / CELLS)
+
+    def places_m(self) -> FloatArray:
+        """(p, 2) places that may be touched, row by row.
+
+        Raises
+        ------
+        ValueError
+            If there are too few or too many.
+        """
+        low, high = self.polygon_m.min(axis=0), self.polygon_m.max(axis=0)
+        whole = grid((low + high) / 2, high - low, (self.spacing_m,) * 2, "raster")
+        kept = whole[inside_polygon(whole, self.polygon_m)]
+        good = LEAST_POINTS <= len(kept) <= MOST_PLACES
+        accepted = f"a spacing with {LEAST_POINTS} to {MOST_PLACES} places in the region"
+        require(good, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places", accepted)
+        return kept
+
+    def first(self, places_m: FloatArray) -> list[int]:
+        """Indices of the first touches among places (p, 2), in order: no disc of `smallest_m` is without one.
+
+        Middles of equal parts of the region (Lloyd), as few as are enough; from one to the nearest.
+
+        Raises
+        ------
+        ValueError
+            If they are more than `most`, or places are too far apart.
+        """
+        raster = self.raster
+        everywhere = raster.xy_m[raster.within]
+        for count in range(LEAST_POINTS, min(self.most, len(places_m)) + 1):
+            chosen = _spread(places_m, count)
+            farthest_m = cdist(everywhere, places_m[chosen]).min(axis=1).max()
+            if farthest_m <= self.smallest_m / 2:
+                return _nearest_first(places_m, chosen)
+        accepted = f"a larger one, or more than {self.most} touches on a finer grid of places"
+        raise ValueError(f"smallest_m: got {self.smallest_m:g}; accepted is {accepted}")
+
+    def krige(self, known: tuple[FloatArray, FloatArray, FloatArray]) -> KrigedSurface | None:
+        """What `known_points` lead to; None where they are too few or on one line."""
+        xy_m, f0_hz, std_hz = known
+        spread = (
+            np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=self.spacing_m / 2)
+            if len(xy_m)
+            else 0
+        )
+        if len(xy_m) < LEAST_POINTS or spread < 2:
+            return None
+        return krige(xy_m, f0_hz, std_hz, self.smallest_m, self.wanted.least_std(f0_hz))
+
+    def loss(self, surface: KrigedSurface) -> float:
+        """What is left over the region: m^2, or Hz^2 m^2."""
+        raster = self.raster
+        return (
+            float(np.sum(self.wanted.loss(*surface.predict(raster.xy_m[raster.within]))))
+            * raster.cell_m2
+        )
+
+    def boundary(self, results: Iterable[PointResult]) -> Boundary | None:
+        """Boundary that the points of a scan lead to; None where none is wanted, or they are too few."""
+        if not isinstance(self.wanted, WantedBoundary):
+            return None
+        surface = self.krige(known_points(results))
+        return None if surface is None else boundary_of(surface, self.wanted.level_set, self.raster)
+
+    def next(
+        self,
+        places_m: FloatArray,
+        touched: Sequence[int],
+        known: tuple[FloatArray, FloatArray, FloatArray],
+        seconds: FloatArray,
+    ) -> int | None:
+        """Index of the next touch among places (p, 2); None where what is wanted is known, or nothing is left.
+
+        Parameters
+        ----------
+        places_m : (p, 2) float
+        touched : sequence of int
+            Indices of places that are not touched again, whatever became of them; one at least.
+        known : tuple
+            Of `known_points`.
+        seconds : (p,) float
+            That way and touch would take.
+        """
+        free = np.setdiff1d(np.arange(len(places_m)), touched)
+        if not free.size or len(touched) >= self.most:
+            return None
+        surface = self.krige(known)
+        if surface is None:  # points failed: the place farthest from all of them
+            gain = cdist(places_m[free], places_m[list(touched)]).min(axis=1)
+        elif self.loss(surface) <= self.wanted.most_loss:
+            return None
+        else:
+            gain = self._gain(surface, places_m, free, float(np.median(known[2]))) / seconds[free]
+        return int(free[np.argmax(gain > (1 - _ALIKE) * gain.max())])
+
+    def _gain(
+        self,
+        surface: KrigedSurface,
+        places_m: FloatArray,
+        free: npt.NDArray[np.int64],
+        noise_hz: float,
+    ) -> FloatArray:
+        """(f,) loss that a touch at each free place is expected to take away, summed over all places."""
+        f0_hz, std_hz = surface.predict(places_m)
+        before = self.wanted.loss(f0_hz, std_hz)
+        open_ = before > 1e-6 * before.max()
+        f0, std = f0_hz[open_, None], std_hz[open_, None]
+        shared = surface.covariance(places_m[open_], places_m[free])  # (o, f)
+        known = shared**2 / (std_hz[free] ** 2 + noise_hz**2)
+        after = np.sqrt(np.maximum(std**2 - known, 0))
+        return np.asarray(
+            np.sum(before[open_, None] - self.wanted.loss_after(f0, std, after), axis=0)
+        )
+
+
+def known_points(results: Iterable[PointResult]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n, 2) places [m], (n,) f0 and its standard deviation [Hz] of the points that have them.
+
+    At the nominal contact where that is known of any: classes refer to it.
+    """
+    done = [result for result in results if result.outcome is PointOutcome.DONE]
+    prefix = "nominal_" if any(np.isfinite(r.nominal_f0_std_hz) for r in done) else ""
+    names = ("x_m", "y_m", f"{prefix}f0_hz", f"{prefix}f0_std_hz")
+    rows = [[getattr(result, name) for name in names] for result in done]
+    table = np.array(rows, float).reshape(-1, 4)
+    table = table[np.all(np.isfinite(table), axis=1)]
+    return table[:, :2], table[:, 2], table[:, 3]
+
+
+def read_adaptive(value: Mapping[str, Any], classes: Sequence[TissueClass], where: str) -> Adaptive:
+    """Read the section ``adaptive`` of a scene's positions.
+
+    Parameters
+    ----------
+    value : mapping
+    classes : sequence of TissueClass
+        Of the scene.
+    where : str
+
+    Raises
+    ------
+    ValueError
+        That names the field, its value and what is accepted.
+    """
+    asked = read_dataclass(_Asked, value, where)
+    return build(asked.adaptive, where, classes)
+
+
+@dataclass(frozen=True)
+class _Boundary:
+    area_m2: float
+    f0_hz: float | None = None
+    between: tuple[str, str] | None = None
+
+    def level_set(self, classes: Mapping[str, float]) -> LevelSet:
+        one = (self.f0_hz is None) != (self.between is None)
+        require(one, "boundary", None, "exactly one of f0_hz, between")
+        if self.between is None:
+            check_above_zero(self, "f0_hz")
+            return LevelSet(low=float(self.f0_hz or 0.0))
+        good = len({*self.between} & {*classes}) == 2
+        accepted = f"two out of tissue_classes: {sorted(classes)}"
+        require(good, "boundary.between", self.between, accepted)
+        first, second = (classes[name] for name in self.between)
+        require(first != second, "boundary.between", self.between, "classes of different f0_hz")
+        return LevelSet(low=(first + second) / 2)
+
+
+@dataclass(frozen=True)
+class _Tissue:
+    name: str
+    area_m2: float
+
+    def level_set(self, classes: Mapping[str, float]) -> LevelSet:
+        accepted = f"one out of two or more tissue_classes: {sorted(classes)}"
+        require(self.name in classes and len(classes) > 1, "tissue.name", self.name, accepted)
+        own = classes[self.name]
+        middles = [(own + other) / 2 for other in classes.values() if other != own]
+        below, above = [m for m in middles if m < own], [m for m in middles if m > own]
+        require(bool(middles), "tissue.name", self.name, "a class whose f0_hz differs from others")
+        return LevelSet(max(below, default=-np.inf), min(above, default=np.inf))
+
+
+@dataclass(frozen=True)
+class _Map:
+    f0_std_hz: float
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "f0_std_hz")
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    most: int
+    smallest_m: float
+    spacing_m: float = 0.001
+    center_m: Pair | None = None
+    size_m: Pair | None = None
+    polygon_m: Places | None = None
+    boundary: _Boundary | None = None
+    tissue: _Tissue | None = None
+    map: _Map | None = None
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "spacing_m", "smallest_m")
+        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES))
+
+    def adaptive(self, classes: Sequence[TissueClass]) -> Adaptive:
+        """Checked, with what follows from the classes."""
+        wanted = [each for each in (self.boundary, self.tissue, self.map) if each is not None]
+        accepted = "exactly one of boundary, tissue, map"
+        require(
+            len(wanted) == 1,
+            "wanted",
+            [type(each).__name__[1:].lower() for each in wanted],
+            accepted,
+        )
+        means = {each.name: float(each.mean[0]) for each in classes}
+        of_kind: WantedBoundary | WantedMap
+        if self.map is not None:
+            of_kind = WantedMap(self.map.f0_std_hz)
+        else:
+            asked = self.boundary or self.tissue
+            assert asked is not None
+            require(asked.area_m2 > 0, "area_m2", asked.area_m2, "a number above 0")
+            of_kind = WantedBoundary(asked.level_set(means), asked.area_m2)
+        made = Adaptive(self._polygon(), self.spacing_m, self.smallest_m, self.most, of_kind)
+        made.first(made.places_m())
+        return made
+
+    def _polygon(self) -> FloatArray:
+        box = self.center_m is not None and self.size_m is not None
+        given = (self.center_m, self.size_m, self.polygon_m)
+        alone = box and self.polygon_m is None
+        alone |= self.polygon_m is not None and self.center_m is None and self.size_m is None
+        require(alone, "center_m, size_m, polygon_m", given, "center_m and size_m, or polygon_m")
+        if self.polygon_m is not None:
+            corners = self.polygon_m[:, :2]
+            require(len(corners) >= 3, "polygon_m", len(corners), "three corners or more")
+            return corners
+        center, size = np.array(self.center_m), np.array(self.size_m)
+        require(bool(size.min() > 0), "size_m", self.size_m, "numbers above 0")
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        return np.asarray(center + signs * size / 2)
+
+
+def _spread(places_m: FloatArray, count: int) -> list[int]:
+    """Indices of the places nearest to the middles of as many equal parts of the region."""
+    middle = places_m.mean(axis=0)
+    chosen = [_first_of(-np.linalg.norm(places_m - middle, axis=1))]
+    while len(chosen) < count:
+        chosen.append(_first_of(cdist(places_m, places_m[chosen]).min(axis=1)))
+    middles = places_m[chosen]
+    for _ in range(_STEPS):
+        own = np.argmin(np.round(cdist(places_m, middles), 9), axis=1)
+        middles = np.array([places_m[own == k].mean(axis=0) for k in range(count)])
+    return list(dict.fromkeys(_first_of(-np.linalg.norm(places_m - m, axis=1)) for m in middles))
+
+
+def _first_of(values: FloatArray) -> int:
+    """Index of the largest, the first of those that differ by rounding only."""
+    return int(np.argmax(np.round(values, 9)))
+
+
+def _nearest_first(places_m: FloatArray, chosen: list[int]) -> list[int]:
+    """In the order from each to the nearest that is left, from the lowest index on."""
+    left = sorted(chosen)
+    order = [left.pop(0)]
+    while left:
+        order.append(left.pop(_first_of(-cdist(places_m[left], places_m[order[-1:]])[:, 0])))
+    return order
