@@ -61,7 +61,7 @@ def _expected(path: Path, plan: Plan) -> list[str]:
     except ValueError as error:
         return [f"precision unknown: nothing to try it on ({error})"]
     lines, blocks, tried = [], [], set()
-    for point in plan.points:
+    for point in plan.first_points:
         tissue = phantoms.tissue_at(point.position_m)
         if tissue is None or tissue.name in tried:
             continue
@@ -110,12 +110,16 @@ def _draw(plan: Plan) -> Figure:
     figure = new_figure(13, 5)
     figure.suptitle(f"plan of {plan.scene.name}")
     above, lines = figure.subplots(1, 2)
-    x, y = zip(*(point.position_m[:2] for point in plan.points), strict=True)
-    x_mm, y_mm = ([1e3 * value for value in values] for values in (x, y))
+    x_mm, y_mm = ([1e3 * point.position_m[k] for point in plan.first_points] for k in range(2))
+    title = f"{len(plan.points)} points"
+    if plan.scene.adaptive is not None:
+        title = f"{len(x_mm)} points first, then at most {plan.most_points - len(x_mm)} of the dots"
+        places_mm = ([1e3 * point.position_m[k] for point in plan.points] for k in range(2))
+        above.plot(*places_mm, ".", color="0.8", ms=2)
     above.plot(x_mm, y_mm, "-", color="0.7", lw=0.8)
     above.plot(x_mm, y_mm, "o", ms=5)
     above.plot(x_mm[0], y_mm[0], "s", ms=9, mfc="none", color="C3", label="first")
-    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{len(plan.points)} points")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=title)
     above.legend()
     first = excitation_of(plan.measurement, seed=1)
     lines.vlines(first.frequency_hz, 0, 1e3 * first.amplitude_v, lw=0.8)

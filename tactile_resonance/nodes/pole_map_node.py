@@ -150,7 +150,7 @@ class PoleMapNode(ManagedNode):
         self._nominal: NominalContact | None = None
         if classes_file:
             self._classes, self._nominal = read_classes(Path(classes_file))
-        low, high = numbers(values(self, "boundary_f0_hz")[0].tolist(), "boundary_f0_hz", 2)
+        low, high = numbers(list(values(self, "boundary_f0_hz")[0]), "boundary_f0_hz", 2)
         ends = low or -math.inf, high or math.inf
         self._wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
         self._map = PoleMap()

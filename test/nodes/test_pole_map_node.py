@@ -549,3 +549,35 @@ def test_a_classes_file_that_is_wrong_is_refused(tmp_path):
         assert node.state_name() == "unconfigured"
         assert "classes.yaml: tissue_classes.a.damping_ratio: got None" in node.health._error
         node.destroy_node()
+
+
+def test_a_boundary_that_is_wanted_is_drawn_where_it_is():
+    """Poles rise by 1 Hz per millimetre of x: the boundary at 254 Hz is a line across the map."""
+    arguments = [*OF_POLES, "-p", "boundary_f0_hz:=[254.0, 0.0]"]
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
+        x_mm = np.arange(0.0, 9.0, 2.0)
+        for k, y_m in enumerate((0.0, 0.004)):
+            bench.send(
+                *(
+                    poles(1 + 10 * k + j, 1e-3 * x, 252.5 + x, place=(1e-3 * x, y_m, 0.0))
+                    for j, x in enumerate(x_mm)
+                )
+            )
+        markers = bench.read(MarkerArray, "pole_map/markers")[0].markers
+    outline, band = (marker for marker in markers if marker.ns == "boundary")
+    places = np.array([[point.x, point.y] for point in outline.points])
+    np.testing.assert_allclose(places[:, 0], 0.0015, atol=5e-5)
+    assert np.ptp(places[:, 1]) > 0.004
+    around = np.array([point.x for point in band.points])
+    assert around.min() < 0.0015 < around.max()
+
+
+@pytest.mark.parametrize("given", ["[1.0]", "[255.0, 254.0]"])
+def test_a_boundary_that_cannot_be_is_refused(given):
+    arguments = [*OF_POLES, "-p", f"boundary_f0_hz:={given}"]
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments):
+        node = PoleMapNode()
+        node.trigger_configure()
+        assert node.state_name() == "unconfigured"
+        assert "boundary_f0_hz" in node.health._error
+        node.destroy_node()

@@ -46,6 +46,10 @@ class Bench:
         None  # of the force over the blocks so far, from the number of the measurement and of these
     )
     measurements: int = 0
+    f0_of: object = (
+        None  # of a position (3,); None: 254 Hz everywhere. With noise of the stated spread
+    )
+    at: object = None  # position of the point in contact
     beside: Poles | None = None  # another mode, of lower frequency, reported before the main one
 
     def now_s(self):
@@ -67,6 +71,7 @@ class Bench:
             raise PointFailed("contact: surface_missing: nothing there")
         self.time_s += TOUCH_S
         self.holding = True
+        self.at = point.position_m
         self.log.append(("touch", point.index))
 
     def measure(self, design, label, seed, enough, recording, check):
@@ -76,6 +81,10 @@ class Bench:
         origin = Origin(measurement_id=1000 + seed, contact=contact, simulated=True)
         recording.measurement_id = 1000 + seed
         recording.write("/note", "std_msgs/msg/String", time.time_ns(), note(label))
+        f0_hz, noise_hz = 254.0, 0.0
+        if self.f0_of is not None and label != "air":
+            f0_hz = self.f0_of(self.at)
+            noise_hz = SPREAD_HZ * np.random.default_rng(self.seeds[-1]).standard_normal()
         while blocks < design.periods:
             check()
             blocks += 1
@@ -83,7 +92,7 @@ class Bench:
             covariance = np.diag([SPREAD_HZ**2, 1e-9]) / blocks
             poles = Poles(
                 poles_rad_s=np.array([-50 + 1600j]),
-                f0_hz=np.array([254.0]),
+                f0_hz=np.array([f0_hz + noise_hz / np.sqrt(blocks)]),
                 damping_ratio=np.array([0.03]),
                 residues=np.array([100 + 0j]),
                 covariance=covariance[None],

@@ -85,6 +85,23 @@ SEPARATE = {
     },
     "nominal_contact": None,
 }
+ADAPTIVE = {
+    **{"center_m": [0.0, 0.0], "size_m": [0.01, 0.01], "spacing_m": 0.002},
+    **{"smallest_m": 0.01, "most": 8, "boundary": {"between": ["a", "b"], "area_m2": 1e-7}},
+}
+CHOSEN = {"positions": {"adaptive": ADAPTIVE}, "normals": None, "gate": None}
+
+
+def otherwise(left_out, **given):
+    """Adaptive positions with some fields left out and others given."""
+    kept = {key: value for key, value in ADAPTIVE.items() if key not in left_out}
+    return {**CHOSEN, "positions": {"adaptive": {**kept, **given}}}
+
+
+TRIANGLE = [[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]]
+IN_POLYGON = otherwise(("center_m", "size_m"), polygon_m=TRIANGLE)
+TISSUE = otherwise(("boundary",), tissue={"name": "a", "area_m2": 4e-7})
+MAP = otherwise(("boundary",), map={"f0_std_hz": 0.5})
 # A field, what it becomes, and what of the base it needs to be otherwise for that to show.
 CHANGES = {
     "name": ("other", {}),
@@ -127,6 +144,15 @@ CHANGES = {
     "surface.touch.tolerance_m": (1e-9, TOUCHED),
     "surface.touch.search_m": (4e-3, TOUCHED),
     "positions.list": ([[0.0, 0.0], [0.004, 0.0]], {}),
+    "positions.adaptive.center_m": ([0.001, 0.0], CHOSEN),
+    "positions.adaptive.size_m": ([0.012, 0.01], CHOSEN),
+    "positions.adaptive.polygon_m": ([[0.0, 0.0], [0.01, 0.0], [0.0, 0.008]], IN_POLYGON),
+    "positions.adaptive.spacing_m": (0.0015, CHOSEN),
+    "positions.adaptive.smallest_m": (0.006, CHOSEN),
+    "positions.adaptive.most": (9, CHOSEN),
+    "positions.adaptive.boundary": ({"f0_hz": 253.97, "area_m2": 1e-7}, CHOSEN),
+    "positions.adaptive.tissue": ({"name": "a", "area_m2": 1e-12}, TISSUE),
+    "positions.adaptive.map": ({"f0_std_hz": 1e-3}, MAP),
     "outputs": (["poles"], {}),
     "precision.f0_std_hz": (0.009, {}),
     "precision.damping_ratio_std": (1.2e-5, {}),
@@ -288,7 +314,8 @@ def test_no_field_is_forgotten():
         **{"precision": Precise, "surface.touch": TouchRequest},
     }
     tested = {*CHANGES, *(field.split(".")[0] for field in CHANGES)}
-    whole = {field.name for field in fields(ScanScene)} - {"positions_m"} | {"positions"}
+    chosen = {"positions_m", "adaptive"}
+    whole = {field.name for field in fields(ScanScene)} - chosen | {"positions"}
     assert whole <= tested
     for section, kind in sections.items():
         # the only sensor there is: any other name is refused

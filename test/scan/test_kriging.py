@@ -94,3 +94,37 @@ def test_coverage_is_honest(noise):
 def test_what_determines_nothing_is_refused(xy, noise, reason):
     with pytest.raises(ValueError, match=reason):
         krige(xy, np.arange(len(xy)), np.full(len(xy), noise))
+
+
+def test_covariance_is_what_a_further_point_takes_away():
+    """The variance that is left after one more measurement, by the covariance and by the points themselves."""
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(0, 0.02, (12, 2))
+    y = draw(rng, xy, 0.006, 2.0, 255.0)
+    at = rng.uniform(0, 0.02, (5, 2))
+    surface = krige(xy, y, np.full(12, 0.1))
+    covariance = surface.covariance(at, at)
+    _, std = surface.predict(at)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-9)
+    # ordinary kriging as its bordered system, with the first place measured too
+    both = np.concatenate([xy, at[:1]])
+
+    def k(a, b):
+        distance = np.linalg.norm(a[:, None] - b, axis=-1)
+        return surface.process_std**2 * matern(distance, surface.length_m)
+
+    system = np.ones((14, 14))
+    system[:13, :13] = k(both, both) + 0.1**2 * np.eye(13)
+    system[13, 13] = 0
+    right = np.vstack([k(both, at), np.ones((1, 5))])
+    left = surface.process_std**2 - np.sum(right * np.linalg.solve(system, right), axis=0)
+    update = std**2 - covariance[:, 0] ** 2 / (covariance[0, 0] + 0.1**2)
+    np.testing.assert_allclose(update, left, rtol=1e-6, atol=1e-9)
+
+
+def test_length_and_size_stay_within_what_is_known_beforehand():
+    xy = np.random.default_rng(7).uniform(0, 0.02, (9, 2))
+    flat = krige(xy, np.full(9, 254.0), np.full(9, 0.02), most_length_m=0.004, least_std=1.0)
+    assert flat.length_m <= 0.004 * (1 + 1e-9)
+    assert flat.process_std >= 1.0 * (1 - 1e-9)
+    assert flat.predict([[0.1, 0.1]])[1] >= 1.0
