@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans that choose their touches: until a boundary, a tissue or the map is known as well as it is wanted.
 
-The first touches are spread over the region such that every disc of the diameter `smallest_m` is touched; each
-of the others is where the loss that is left (expected area on the wrong side of the boundary, or variance of
-the map above what is wanted) is expected to fall most per second of way and touch (Bect et al., Statistics and
-Computing 22, 2012). The choice is a function of what was found so far, among places that are known beforehand,
-and of places whose gains differ by less than a thousandth the first is taken: equal results, equal touches.
+The first touches are spread over the region; each of the others is where the loss that is left (expected area
+on the wrong side of the boundary, or variance of the map above what is wanted) is expected to fall most per
+second of way and touch (Bect et al., Statistics and Computing 22, 2012). The choice is a function of what was
+found so far, among places that are known beforehand, and of places whose gains differ by less than a thousandth
+the first is taken: equal results, equal touches.
 
-Few points do not determine length and size of the process. What is known beforehand bounds them: a length of
-at most `smallest_m`, and a size such that a level is not more than two standard deviations from the mean, also
-where all points are alike.
+Few points do not determine length and size of the process, and where all of them are alike they would make it
+constant. What is known beforehand bounds both: a length at which something as narrow as `smallest_m` may lie
+between points, and a size such that a level is not more than one standard deviation from the mean.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ MOST_TOUCHES = 500
 CELLS = 80
 """Along the longer side of the region, where areas are summed."""
 _ALIKE = 1e-3  # gains that differ by less of the largest count as equal
+_SHORTLIST = 100  # places of greatest doubt, of which the gain is reckoned
+_OPEN = 1e-2  # of the largest loss: elsewhere a touch takes nothing away
+_LENGTH = 0.6  # of a process, over the width at half height of a bump of gelatine felt over a ball
 _STEPS = 50  # in which the first touches are spread
 
 
@@ -54,9 +57,13 @@ class WantedBoundary:
         """(...) as it is expected after a touch that leaves another standard deviation."""
         return self.level_set.wrong_after(f0_hz, std_hz, after)
 
+    def doubt(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
+        """(...) how little is known of places: the straddle heuristic (Bryan et al., NIPS 18, 2005)."""
+        return 1.96 * std_hz - np.abs(self.level_set.depth(f0_hz))
+
     def least_std(self, values: FloatArray) -> float:
-        """Of the process: the mean is at most two of them from a level [Hz]."""
-        return float(np.min(np.abs(np.array(self.level_set.levels) - values.mean()))) / 2
+        """Of the process: the mean is at most one of them from a level [Hz]."""
+        return float(np.min(np.abs(np.array(self.level_set.levels) - values.mean())))
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,10 @@ class WantedMap:
         """(...) after a touch that leaves another standard deviation."""
         return self.loss(f0_hz, after)
 
+    def doubt(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
+        """(...) how little is known of places."""
+        return std_hz
+
     def least_std(self, values: FloatArray) -> float:
         """Nothing is known beforehand."""
         return 0.0
@@ -90,23 +101,27 @@ class Adaptive:
     spacing_m : float
         Of the grid of places that may be touched.
     smallest_m : float
-        Every disc of this diameter with its centre in the region is touched.
-    most : int
-        Touches.
+        Width of the smallest thing that is looked for.
+    start, most : int
+        First touches, and all.
     wanted : WantedBoundary or WantedMap
     """
 
     polygon_m: FloatArray
     spacing_m: float
     smallest_m: float
+    start: int
     most: int
     wanted: WantedBoundary | WantedMap
 
     @property
     def raster(self) -> Raster:
         """Of the region, fine enough for areas."""
+        return self._raster(CELLS)
+
+    def _raster(self, cells: int) -> Raster:
         longest_m = float(np.max(np.ptp(self.polygon_m, axis=0)))
-        return Raster.over(self.polygon_m, longest_m / CELLS)
+        return Raster.over(self.polygon_m, longest_m / cells)
 
     def places_m(self) -> FloatArray:
         """(p, 2) places that may be touched, row by row.
@@ -125,24 +140,8 @@ class Adaptive:
         return kept
 
     def first(self, places_m: FloatArray) -> list[int]:
-        """Indices of the first touches among places (p, 2), in order: no disc of `smallest_m` is without one.
-
-        Middles of equal parts of the region (Lloyd), as few as are enough; from one to the nearest.
-
-        Raises
-        ------
-        ValueError
-            If they are more than `most`, or places are too far apart.
-        """
-        raster = self.raster
-        everywhere = raster.xy_m[raster.within]
-        for count in range(LEAST_POINTS, min(self.most, len(places_m)) + 1):
-            chosen = _spread(places_m, count)
-            farthest_m = cdist(everywhere, places_m[chosen]).min(axis=1).max()
-            if farthest_m <= self.smallest_m / 2:
-                return _nearest_first(places_m, chosen)
-        accepted = f"a larger one, or more than {self.most} touches on a finer grid of places"
-        raise ValueError(f"smallest_m: got {self.smallest_m:g}; accepted is {accepted}")
+        """Indices of the first touches among places (p, 2): middles of equal parts of the region, in order."""
+        return _nearest_first(places_m, _spread(places_m, min(self.start, len(places_m))))
 
     def krige(self, known: tuple[FloatArray, FloatArray, FloatArray]) -> KrigedSurface | None:
         """What `known_points` lead to; None where they are too few or on one line."""
@@ -154,7 +153,7 @@ class Adaptive:
         )
         if len(xy_m) < LEAST_POINTS or spread < 2:
             return None
-        return krige(xy_m, f0_hz, std_hz, self.smallest_m, self.wanted.least_std(f0_hz))
+        return krige(xy_m, f0_hz, std_hz, _LENGTH * self.smallest_m, self.wanted.least_std(f0_hz))
 
     def loss(self, surface: KrigedSurface) -> float:
         """What is left over the region: m^2, or Hz^2 m^2."""
@@ -199,6 +198,8 @@ class Adaptive:
         elif self.loss(surface) <= self.wanted.most_loss:
             return None
         else:
+            doubt = np.round(self.wanted.doubt(*surface.predict(places_m[free])), 9)
+            free = np.sort(free[np.argsort(-doubt, kind="stable")[:_SHORTLIST]])
             gain = self._gain(surface, places_m, free, float(np.median(known[2]))) / seconds[free]
         return int(free[np.argmax(gain > (1 - _ALIKE) * gain.max())])
 
@@ -209,13 +210,16 @@ class Adaptive:
         free: npt.NDArray[np.int64],
         noise_hz: float,
     ) -> FloatArray:
-        """(f,) loss that a touch at each free place is expected to take away, summed over all places."""
-        f0_hz, std_hz = surface.predict(places_m)
+        """(f,) loss that a touch at each free place is expected to take away, summed over the region."""
+        raster = self._raster(CELLS // 2)
+        at = raster.xy_m[raster.within]
+        f0_hz, std_hz = surface.predict(at)
         before = self.wanted.loss(f0_hz, std_hz)
-        open_ = before > 1e-6 * before.max()
+        open_ = before > _OPEN * before.max()
         f0, std = f0_hz[open_, None], std_hz[open_, None]
-        shared = surface.covariance(places_m[open_], places_m[free])  # (o, f)
-        known = shared**2 / (std_hz[free] ** 2 + noise_hz**2)
+        _, std_there = surface.predict(places_m[free])
+        shared = surface.covariance(at[open_], places_m[free])  # (o, f)
+        known = shared**2 / (std_there**2 + noise_hz**2)
         after = np.sqrt(np.maximum(std**2 - known, 0))
         return np.asarray(
             np.sum(before[open_, None] - self.wanted.loss_after(f0, std, after), axis=0)
@@ -302,6 +306,7 @@ class _Map:
 class _Asked:
     most: int
     smallest_m: float
+    start: int = 9
     spacing_m: float = 0.001
     center_m: Pair | None = None
     size_m: Pair | None = None
@@ -312,7 +317,7 @@ class _Asked:
 
     def __post_init__(self) -> None:
         check_above_zero(self, "spacing_m", "smallest_m")
-        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES))
+        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES), start=(LEAST_POINTS, self.most))
 
     def adaptive(self, classes: Sequence[TissueClass]) -> Adaptive:
         """Checked, with what follows from the classes."""
@@ -333,8 +338,10 @@ class _Asked:
             assert asked is not None
             require(asked.area_m2 > 0, "area_m2", asked.area_m2, "a number above 0")
             of_kind = WantedBoundary(asked.level_set(means), asked.area_m2)
-        made = Adaptive(self._polygon(), self.spacing_m, self.smallest_m, self.most, of_kind)
-        made.first(made.places_m())
+        made = Adaptive(
+            self._polygon(), self.spacing_m, self.smallest_m, self.start, self.most, of_kind
+        )
+        made.places_m()
         return made
 
     def _polygon(self) -> FloatArray:

@@ -43,9 +43,9 @@ def plan_rows(plan: Plan) -> Rows:
         rows += [
             (
                 "adaptive",
-                f"{len(plan.first_points)} points first, so that every disc of "
-                f"{1e3 * scene.adaptive.smallest_m:g} mm is touched; each of the others where it is "
-                f"expected to show most, among {len(plan.points)} places",
+                f"{len(plan.first_points)} points first, each of the others where it is expected to show "
+                f"most of what is {1e3 * scene.adaptive.smallest_m:g} mm wide or wider, among "
+                f"{len(plan.points)} places",
             ),
             ("chosen until", f"{adaptive_wanted(scene.adaptive)}, or the most points"),
         ]

@@ -3,7 +3,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,13 @@ CLASS = {"damping_ratio": 0.03, "f0_std_hz": 0.4, "damping_ratio_std": 4e-4}
 CLASSES = {
     name: {**CLASS, "f0_hz": f0} for name, f0 in zip("abc", (254.0, 258.0, 263.0), strict=True)
 }
-REGION = {"center_m": [0.0, 0.0], "size_m": [0.016, 0.016], "spacing_m": 0.001, "smallest_m": 0.008}
-BOUNDARY = {"boundary": {"between": ["a", "b"], "area_m2": 2e-6}}
+REGION = {"center_m": [0.0, 0.0], "size_m": [0.016, 0.016], "spacing_m": 0.001, "smallest_m": 0.006}
+BOUNDARY = {"boundary": {"between": ["a", "b"], "area_m2": 4e-6}}
 LEVEL_HZ = 256.0
 
 
-def content(most=40, **wanted):
-    adaptive = {**REGION, "most": most, **(wanted or BOUNDARY)}
+def content(most=40, start=9, **wanted):
+    adaptive = {**REGION, "start": start, "most": most, **(wanted or BOUNDARY)}
     return {
         **{"name": "test", "force_n": 0.01, "positions": {"adaptive": adaptive}},
         **{
@@ -86,19 +85,22 @@ def wrong_m2(asked, found, f0_hz):
     return difference_m2(asked.krige(found), asked.wanted.level_set, raster, f0_hz(raster.xy_m))
 
 
-@pytest.mark.parametrize("smallest_m", [0.005, 0.008, 0.012])
-def test_the_first_touches_leave_out_no_disc_of_the_smallest_size(tmp_path, smallest_m):
-    asked = replace(scene(tmp_path).adaptive, smallest_m=smallest_m)
+@pytest.mark.parametrize("start", [5, 9, 16])
+def test_the_first_touches_are_spread_evenly_over_the_region(tmp_path, start):
+    asked = scene(tmp_path, start=start).adaptive
     places = asked.places_m()
-    first = asked.first(places)
-    assert len(set(first)) == len(first)
-    rng = np.random.default_rng(1)
-    middles = rng.uniform(-0.008, 0.008, (2000, 2))
-    nearest = cdist(middles, places[first]).min(axis=1)
-    cell_m = 0.016 / 80  # of the raster on which this is looked at
-    assert nearest.max() <= smallest_m / 2 + cell_m
-    # not many more than circles of that size need to cover the region
-    assert len(first) <= 2.5 * 0.016**2 / (2.6 * (smallest_m / 2) ** 2) + 4
+    first = places[asked.first(places)]
+    assert len(np.unique(first, axis=0)) == start
+    middles = np.random.default_rng(1).uniform(-0.008, 0.008, (4000, 2))
+    apart = cdist(middles, first)
+    # no place is much farther from a touch than from the middle of a square part, and parts are much alike
+    assert apart.min(axis=1).max() < 1.5 * 0.016 / np.sqrt(2 * start)
+    shares = np.bincount(np.argmin(apart, axis=1), minlength=start) / 4000
+    assert 0.35 / start < shares.min()
+    assert shares.max() < 2 / start
+    # and the way from one to the next is short
+    way_m = np.linalg.norm(np.diff(first, axis=0), axis=1).sum()
+    assert way_m < 1.5 * (start - 1) * 0.016 / np.sqrt(start)
 
 
 def test_touches_lie_in_the_polygon(tmp_path):
@@ -110,12 +112,12 @@ def test_touches_lie_in_the_polygon(tmp_path):
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump(made))
     read = read_scan_scene(tmp_path / "scene.yaml")
     chosen, (xy, *rest) = touched(read.adaptive, lambda xy: 250.0 + 800 * np.asarray(xy)[..., 0])
-    assert len(chosen) > len(read.adaptive.first(read.adaptive.places_m()))
+    assert len(chosen) > read.adaptive.start
     assert np.all(xy.sum(axis=1) <= 0.02 + 1e-9)
     # the boundary is a straight line, from edge to edge
     surface = read.adaptive.krige((xy, *rest))
     (line,) = boundary_of(surface, read.adaptive.wanted.level_set, read.adaptive.raster).outline_m
-    np.testing.assert_allclose(line[:, 0], 0.0075, atol=1e-4)
+    np.testing.assert_allclose(line[:, 0], 0.0075, atol=2e-4)
     assert np.ptp(line[:, 1]) == pytest.approx(0.0125, abs=1e-3)
 
 
@@ -127,15 +129,15 @@ def test_boundaries_of_random_phantoms(tmp_path):
         phantom = Phantom(seed)
         chosen, found = touched(asked, phantom.f0_hz, seed=seed)
         expected = asked.loss(asked.krige(found))
-        later = found[0][len(asked.first(asked.places_m())) :]
+        later = found[0][asked.start :]
         near = np.abs(phantom.f0_hz(later) - LEVEL_HZ) < 1.5
         runs.append((len(chosen), expected, wrong_m2(asked, found, phantom.f0_hz), near.mean()))
     count, expected, wrong, near = np.array(runs).T
     met = count < asked.most
     assert met.mean() > 0.8
-    assert np.all(expected[met] <= 2e-6)
+    assert np.all(expected[met] <= 4e-6)
     # what is stated holds, with the error of a mean of 20
-    assert wrong[met].mean() <= 2e-6
+    assert wrong[met].mean() <= 4e-6
     assert wrong[met].mean() < expected[met].mean() + 4 * wrong.std() / np.sqrt(20)
     assert near.mean() > 0.4
     # a grid of as many touches is farther off
@@ -151,25 +153,34 @@ def test_boundaries_of_random_phantoms(tmp_path):
     assert np.median(of_grid) > 2 * np.median(wrong)
 
 
-def test_a_scan_does_not_stop_on_a_region_it_has_not_explored(tmp_path):
-    """20 phantoms with something as wide as `smallest_m`, however alike the first touches: none is missed."""
-    asked = scene(tmp_path).adaptive
+def test_a_scan_does_not_stop_before_it_has_found_what_it_looks_for(tmp_path):
+    """Seeded Monte Carlo: bumps that the first touches leave out are found, 18 of 20 at least.
+
+    They are `smallest_m` wide at half of their height and hardly felt beside that; a fit of length and size
+    that is left to itself takes the first nine points for a constant.
+    """
+    asked = scene(tmp_path, boundary={"between": ["a", "b"], "area_m2": 4e-6}).adaptive
+    places = asked.places_m()
+    first = places[asked.first(places)]
+    found_all, alike = 0, 0
     for seed in range(20):
-        rng = np.random.default_rng(seed)
-        centre = rng.uniform(-0.008, 0.008, 2)
+        phantom = Phantom(seed)
+        phantom.radius = (
+            asked.smallest_m / 2 * 2**0.25
+        )  # 257 Hz, half of the height, at smallest_m / 2
+        gaps = cdist(places, first).min(axis=1)
+        phantom.centre = places[np.argsort(-gaps)[seed]]
+        alike += np.ptp(phantom.f0_hz(first)) < 2.0
+        _, found = touched(asked, phantom.f0_hz, seed=seed)
+        found_all += wrong_m2(asked, found, phantom.f0_hz) < 3e-6
+    assert alike > 5
+    assert found_all >= 18
 
-        def step(xy, centre=centre):
-            inside = np.linalg.norm(np.asarray(xy)[..., :2] - centre, axis=-1) <= 0.0041
-            return np.where(inside, 258.0, 254.0)
 
-        _, found = touched(replace(asked, most=14), step, seed=seed)
-        assert np.any(found[1] > LEVEL_HZ), centre
-
-
-def test_where_all_is_alike_it_stops_after_the_first_touches_or_soon(tmp_path):
+def test_where_all_is_alike_it_looks_long_enough_and_stops(tmp_path):
     asked = scene(tmp_path).adaptive
     chosen, found = touched(asked, lambda xy: 254.0 + 0 * np.asarray(xy)[..., 0])
-    assert len(chosen) < 25
+    assert asked.start < len(chosen) < asked.most
     assert wrong_m2(asked, found, lambda xy: 254.0 + 0 * xy[..., 0]) == 0
 
 
@@ -317,7 +328,7 @@ def test_the_plan_of_an_adaptive_scan(tmp_path):
     texts = dict(rows)
     assert texts["touches"] == "at most 40: 40 points"
     assert f"{len(plan.first_points)} points first" in texts["adaptive"]
-    assert texts["chosen until"].startswith("the boundary at 256.00 Hz with 2 mm2")
+    assert texts["chosen until"].startswith("the boundary at 256.00 Hz with 4 mm2")
     assert plan.shortest_s < plan.longest_s
     assert plan.longest_s > 40 * 4 * plan.measurement.block_s
 
@@ -326,7 +337,8 @@ def test_the_plan_of_an_adaptive_scan(tmp_path):
     ("change", "message"),
     [
         ({"most": 3}, "most: got 3; accepted is 5 to 500"),
-        ({"most": 8, "smallest_m": 0.004}, r"smallest_m: got 0.004; accepted is a larger one"),
+        ({"most": 8}, "start: got 9; accepted is 5 to 8"),
+        ({"smallest_m": 0.0}, "smallest_m: got 0.0; accepted is a number above 0"),
         ({"spacing_m": 1e-4}, "spacing_m: got '0.0001, 25921 places'; accepted is"),
         ({"polygon_m": [[0, 0], [1, 0], [0, 1]]}, "accepted is center_m and size_m, or polygon_m"),
         ({"size_m": None}, "accepted is center_m and size_m, or polygon_m"),

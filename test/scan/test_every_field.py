@@ -87,7 +87,12 @@ SEPARATE = {
 }
 ADAPTIVE = {
     **{"center_m": [0.0, 0.0], "size_m": [0.01, 0.01], "spacing_m": 0.002},
-    **{"smallest_m": 0.01, "most": 8, "boundary": {"between": ["a", "b"], "area_m2": 1e-7}},
+    **{
+        "smallest_m": 0.01,
+        "start": 5,
+        "most": 12,
+        "boundary": {"between": ["a", "b"], "area_m2": 1e-7},
+    },
 }
 CHOSEN = {"positions": {"adaptive": ADAPTIVE}, "normals": None, "gate": None}
 
@@ -148,7 +153,8 @@ CHANGES = {
     "positions.adaptive.size_m": ([0.012, 0.01], CHOSEN),
     "positions.adaptive.polygon_m": ([[0.0, 0.0], [0.01, 0.0], [0.0, 0.008]], IN_POLYGON),
     "positions.adaptive.spacing_m": (0.0015, CHOSEN),
-    "positions.adaptive.smallest_m": (0.006, CHOSEN),
+    "positions.adaptive.smallest_m": (0.004, CHOSEN),
+    "positions.adaptive.start": (6, CHOSEN),
     "positions.adaptive.most": (9, CHOSEN),
     "positions.adaptive.boundary": ({"f0_hz": 253.97, "area_m2": 1e-7}, CHOSEN),
     "positions.adaptive.tissue": ({"name": "a", "area_m2": 1e-12}, TISSUE),
