@@ -20,8 +20,8 @@ NEW_RUNS = {
         "demo.yaml",
         "a short scan over a hidden inclusion, on the simulated bench",
         "What `scan` does, on a scene that takes little more than a minute: a simulated robot brings the "
-        "sensor to 1 cN at 16 points of a gelatine phantom with something stiffer hidden in it; poles, map and "
-        "table follow, beside the simulation's truth. Nothing here is a measurement.",
+        "sensor to 1 cN at up to 16 points of a gelatine phantom, chosen for the boundary of something stiffer "
+        "hidden in it; boundary, poles, map and table follow, beside the simulation's truth. Nothing here is a measurement.",
     ),
     "scan": (
         "inclusion_scan.yaml",
