@@ -21,7 +21,8 @@ NEW_RUNS = {
         "a short scan over a hidden inclusion, on the simulated bench",
         "What `scan` does, on a scene that takes little more than a minute: a simulated robot brings the "
         "sensor to 1 cN at up to 16 points of a gelatine phantom, chosen for the boundary of something stiffer "
-        "hidden in it; boundary, poles, map and table follow, beside the simulation's truth. Nothing here is a measurement.",
+        "hidden in it; boundary, poles, map and table follow, beside the simulation's truth. Nothing here is a "
+        "measurement.",
     ),
     "scan": (
         "inclusion_scan.yaml",
