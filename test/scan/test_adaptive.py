@@ -85,6 +85,15 @@ def wrong_m2(asked, found, f0_hz):
     return difference_m2(asked.krige(found), asked.wanted.level_set, raster, f0_hz(raster.xy_m))
 
 
+def covered(asked, found, phantom):
+    """Share of the true boundary, a circle, that lies in the band."""
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    circle = phantom.centre + phantom.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    within = np.all(np.abs(circle) <= 0.008, axis=1)
+    value, std = asked.krige(found).predict(circle[within])
+    return np.mean(np.abs(value - LEVEL_HZ) <= 1.96 * std)
+
+
 @pytest.mark.parametrize("start", [5, 9, 16])
 def test_the_first_touches_are_spread_evenly_over_the_region(tmp_path, start):
     asked = scene(tmp_path, start=start).adaptive
@@ -131,8 +140,9 @@ def test_boundaries_of_random_phantoms(tmp_path):
         expected = asked.loss(asked.krige(found))
         later = found[0][asked.start :]
         near = np.abs(phantom.f0_hz(later) - LEVEL_HZ) < 1.5
-        runs.append((len(chosen), expected, wrong_m2(asked, found, phantom.f0_hz), near.mean()))
-    count, expected, wrong, near = np.array(runs).T
+        wrong = wrong_m2(asked, found, phantom.f0_hz)
+        runs.append((len(chosen), expected, wrong, near.mean(), covered(asked, found, phantom)))
+    count, expected, wrong, near, share = np.array(runs).T
     met = count < asked.most
     assert met.mean() > 0.8
     assert np.all(expected[met] <= 4e-6)
@@ -140,6 +150,8 @@ def test_boundaries_of_random_phantoms(tmp_path):
     assert wrong[met].mean() <= 4e-6
     assert wrong[met].mean() < expected[met].mean() + 4 * wrong.std() / np.sqrt(20)
     assert near.mean() > 0.4
+    # and the true boundary lies in its 95 % band, on so much of its length and more
+    assert share.mean() > 0.95
     # a grid of as many touches is farther off
     side = int(np.ceil(np.sqrt(np.median(count))))
     axis = np.linspace(-0.008, 0.008, side)
