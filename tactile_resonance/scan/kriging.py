@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from tactile_resonance.fields import require
@@ -22,6 +23,11 @@ FloatArray = npt.NDArray[np.float64]
 LEAST_POINTS = 5
 # Length and size are fitted to so many points, evenly picked: the cost grows with the third power.
 FIT_POINTS = 100
+# So many points count together; of more, those next to each tile of the places asked for: time and memory then
+# grow with their number. Neighbours screen what is farther away (Chiles and Delfiner, Geostatistics, 2012,
+# section 3.6, moving neighbourhood).
+MOST_JOINT = 1000
+_NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
 # Of the variance of the process; below it neighbours are too much alike to invert their covariance.
 _JITTER = 1e-10
 
@@ -77,6 +83,70 @@ class KrigedSurface:
         weights = cho_solve(self.factor, cross)
         known = _mean(self.factor, self.values)[1]
         return cross, weights, (1 - np.sum(weights, axis=0)) / np.sqrt(known)
+
+
+@dataclass(frozen=True, eq=False)
+class TiledSurface:
+    """A quantity known at many points: `KrigedSurface` tile by tile, of one length and size.
+
+    Attributes
+    ----------
+    xy_m : (n, 2) float
+    values, noise_std : (n,) float
+    length_m, process_std : float
+    """
+
+    xy_m: FloatArray
+    values: FloatArray
+    noise_std: FloatArray
+    length_m: float
+    process_std: float
+
+    def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """As `KrigedSurface.predict`; the mean is that of each tile's neighbours."""
+        at = np.asarray(xy_m, float)
+        flat = at.reshape(-1, 2)
+        found = np.empty((2, len(flat)))
+        low_m, side_m = flat.min(axis=0), max(float(np.max(np.ptp(flat, axis=0))), 1e-9) / _ALONG
+        tiles, tile_of = np.unique(
+            np.floor((flat - low_m) / side_m).astype(int), axis=0, return_inverse=True
+        )
+        points = cKDTree(self.xy_m)
+        for k in range(len(tiles)):
+            own = tile_of.ravel() == k
+            _, near = points.query(flat[own].mean(axis=0), k=_NEIGHBOURS)
+            part = _surface(
+                self.xy_m[near],
+                self.values[near],
+                self.noise_std[near],
+                self.length_m,
+                self.process_std,
+            )
+            found[:, own] = part.predict(flat[own])
+        value, std = found.reshape(2, *at.shape[:-1])
+        return value, std
+
+
+def krige_many(
+    xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike
+) -> KrigedSurface | TiledSurface:
+    """`krige` of any number of points; beyond `MOST_JOINT` of them tile by tile.
+
+    Length and size are then those of some neighbourhoods, evenly picked.
+
+    Raises
+    ------
+    ValueError
+        As `krige`.
+    """
+    xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
+    if len(xy) <= MOST_JOINT:
+        return krige(xy, y, noise)
+    tree = cKDTree(xy)
+    centres = xy[np.linspace(0, len(xy) - 1, 5).astype(int)]
+    parts = [krige(xy[near], y[near], noise[near]) for near in tree.query(centres, k=FIT_POINTS)[1]]
+    length_m, std = np.median([[part.length_m, part.process_std] for part in parts], axis=0)
+    return TiledSurface(xy, y, noise, float(length_m), float(std))
 
 
 def krige(
@@ -138,8 +208,14 @@ def krige(
         key=lambda found: found.fun,
     )
     length, size = np.exp(best.x).tolist()
-    factor = _factor(distances, noise, length, size)
-    return KrigedSurface(xy, y, length, size, _mean(factor, y)[0], factor)
+    return _surface(xy, y, noise, length, size)
+
+
+def _surface(
+    xy_m: FloatArray, y: FloatArray, noise: FloatArray, length: float, size: float
+) -> KrigedSurface:
+    factor = _factor(cdist(xy_m, xy_m), noise, length, size)
+    return KrigedSurface(xy_m, y, length, size, _mean(factor, y)[0], factor)
 
 
 def _cost(x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray) -> float:

@@ -22,7 +22,7 @@ from contourpy import LineType, contour_generator  # comes with matplotlib
 from scipy.special import ndtr, ndtri, owens_t
 
 from tactile_resonance.fields import require
-from tactile_resonance.scan.kriging import KrigedSurface
+from tactile_resonance.scan.kriging import KrigedSurface, TiledSurface
 from tactile_resonance.scan.patterns import inside_polygon
 
 FloatArray = npt.NDArray[np.float64]
@@ -170,7 +170,7 @@ def difference_m2(
     return float(np.sum(wrong & raster.within)) * raster.cell_m2
 
 
-def boundary_of(surface: KrigedSurface, level_set: LevelSet, raster: Raster) -> Boundary:
+def boundary_of(surface: KrigedSurface | TiledSurface, level_set: LevelSet, raster: Raster) -> Boundary:
     """Boundary of what lies between two levels of a kriged quantity."""
     value, std = surface.predict(raster.xy_m)
     depth, reach = level_set.depth(value), float(ndtri((1 + PROBABILITY) / 2)) * std

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.adaptive import known_points
-from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
+from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, TiledSurface, krige_many
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN
@@ -225,7 +225,7 @@ class PoleMap:
         """Points with a pole and its covariance."""
         return tuple(p for p in self.estimated if np.all(np.isfinite(p.result.covariance)))
 
-    def krige(self) -> KrigedSurface | None:
+    def krige(self) -> KrigedSurface | TiledSurface | None:
         """Natural frequency over x, y; None where too few points have a covariance."""
         points = self.with_ellipse
         if len(points) < LEAST_POINTS:
@@ -233,7 +233,7 @@ class PoleMap:
         xy = np.array([p.position_m[:2] for p in points])
         if _on_a_line(xy):
             return None
-        return krige(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
+        return krige_many(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
 
     def boundary(self, level_set: LevelSet) -> Boundary | None:
         """Boundary of what lies between two natural frequencies about the points; None as of `krige`.
@@ -249,7 +249,7 @@ class PoleMap:
         low, high = xy.min(axis=0) - self.spacing_m / 2, xy.max(axis=0) + self.spacing_m / 2
         box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
         raster = Raster.over(box, float(np.max(high - low)) / _CELLS)
-        return boundary_of(krige(xy, f0_hz, std_hz), level_set, raster)
+        return boundary_of(krige_many(xy, f0_hz, std_hz), level_set, raster)
 
     def surface(self, cells: int = 40) -> MapSurface | None:
         """Kriged natural frequency on a grid over the points, `cells` along its longer side."""

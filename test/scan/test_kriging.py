@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.scan.kriging import krige
+from tactile_resonance.scan.kriging import TiledSurface, krige, krige_many
 
 
 def matern(distance, length):
@@ -128,3 +128,19 @@ def test_length_and_size_stay_within_what_is_known_beforehand():
     assert flat.length_m <= 0.004 * (1 + 1e-9)
     assert flat.process_std >= 1.0 * (1 - 1e-9)
     assert flat.predict([[0.1, 0.1]])[1] >= 1.0
+
+
+def test_of_many_points_tiles_predict_what_all_points_together_do():
+    """On the same length and size: the neighbours of a tile screen what is farther away."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, 0.05, (1200, 2))
+    noise = np.full(len(xy), 0.05)
+    y = 250 + np.sin(200 * xy[:, 0]) * np.cos(150 * xy[:, 1]) + noise * rng.standard_normal(len(xy))
+    at = rng.uniform(0.002, 0.048, (400, 2))
+    tiled = krige_many(xy, y, noise)
+    assert isinstance(tiled, TiledSurface)
+    (value, std), (together, std_together) = tiled.predict(at), krige(xy, y, noise).predict(at)
+    truth = 250 + np.sin(200 * at[:, 0]) * np.cos(150 * at[:, 1])
+    assert np.sqrt(np.mean((value - together) ** 2)) < 0.2 * np.median(std_together)
+    assert 0.8 < np.median(std / std_together) < 1.4
+    assert 0.9 < np.mean(np.abs(value - truth) < 1.96 * std) <= 1
