@@ -220,6 +220,7 @@ def design_multisine(
     mains_hz: Sequence[float] = (),
     lines_beside: int = 1,
     relative_amplitude: npt.ArrayLike | None = None,
+    sweep: bool = False,
     seed: int = 0,
     realisation: int = 0,
     realisations: int = 1,
@@ -252,6 +253,8 @@ def design_multisine(
     lines_beside : int
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.
+    sweep : bool
+        Phases of a rising sweep over each period in place of random ones (`sweep_phases`): of one realisation.
     seed, realisation, realisations, periods, measurement_id, excitation_id, label, bands
         See `Excitation`.
 
@@ -318,7 +321,12 @@ def design_multisine(
             raise ValueError(
                 f"relative_amplitude: shape {shape.shape}, expected {harmonics.shape} positive values"
             )
+    realisations = whole(realisations, "realisations", 1)
+    accepted = "1 with sweep: its phases are the same in each"
+    require(realisations == 1 or not sweep, "realisations", realisations, accepted)
     phase = np.random.default_rng([seed, 1, realisation]).uniform(0, 2 * np.pi, harmonics.size)
+    if sweep:
+        phase = sweep_phases(harmonics, shape)
     unscaled = Excitation(
         harmonics=harmonics,
         amplitude_v=shape,
@@ -327,15 +335,33 @@ def design_multisine(
         samples_per_period=samples,
         periods=whole(periods, "periods", 1),
         realisation=realisation,
-        realisations=whole(realisations, "realisations", 1),
+        realisations=realisations,
         grid=grid,
         seed=seed,
+        random_phases=not sweep,
         measurement_id=measurement_id,
         excitation_id=excitation_id,
         label=label,
         bands=bands,
     )
     return scaled_to(unscaled, level_v, scale_by)
+
+
+def sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
+    """(F,) phases [rad] with which lines sound one after the other over a period, from low to high.
+
+    Each has the time that its part of the power takes (Schroeder, IEEE Trans. Inf. Theory 16 (1970) 85-89).
+
+    Parameters
+    ----------
+    harmonics : (F,) int
+        Ascending.
+    amplitude : (F,) float
+    """
+    power = amplitude**2 / np.sum(amplitude**2)
+    delay = np.cumsum(power) - power / 2  # of each line, in periods: minus the slope of its phase
+    cycles = np.cumsum(delay * np.diff(harmonics, prepend=harmonics[0]))
+    return np.asarray(-2 * np.pi * cycles % (2 * np.pi))
 
 
 def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:

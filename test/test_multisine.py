@@ -89,6 +89,27 @@ def test_realisations_share_lines_but_not_phases_and_seeds_repeat():
     np.testing.assert_array_equal(second.phase_rad, again.phase_rad)
 
 
+def test_a_sweep_rises_over_the_period_and_is_flat():
+    lines = {"sample_rate_hz": 5e4, "samples_per_period": 2948, "band_hz": (200.0, 580.0)}
+    random, sweep = (design_multisine(**lines, sweep=chosen, seed=4) for chosen in (False, True))
+    np.testing.assert_array_equal(sweep.harmonics, random.harmonics)
+    np.testing.assert_array_equal(sweep.amplitude_v, random.amplitude_v)
+    assert (sweep.random_phases, random.random_phases) == (False, True)
+    assert sweep.crest_factor() < 2 < random.crest_factor()
+    # of each fifth of the period the mean frequency: as that of a linear sweep
+    parts = sweep.period()[:2945].reshape(5, -1) * np.hanning(589)
+    power = np.abs(np.fft.rfft(parts, 2948)) ** 2
+    mean_hz = power @ np.fft.rfftfreq(2948, 1 / 5e4) / power.sum(axis=1)
+    np.testing.assert_allclose(mean_hz, 200 + 380 * (np.arange(5) + 0.5) / 5, atol=38)
+    # phases follow the power: a line of nine tenths of it takes nine tenths of the time
+    shape = np.ones(sweep.harmonics.size)
+    shape[0] = np.sqrt(9 * (shape.size - 1))
+    loud = design_multisine(**lines, sweep=True, relative_amplitude=shape).period()
+    assert np.sqrt(np.mean(loud[300:2350] ** 2)) == pytest.approx(loud.std(), rel=0.1)
+    with pytest.raises(ValueError, match="realisations: got 2; accepted is 1 with sweep"):
+        design_multisine(**lines, sweep=True, realisations=2)
+
+
 def test_phases_are_uniform():
     """Mean of exp(j phi) over n phases has variance 1/n: here below 4.2 of its std (99.99 %)."""
     phases = np.concatenate([design_multisine(seed=s).phase_rad for s in range(20)])

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from tactile_resonance.scan.plan import Plan
     from tactile_resonance.simulation.tissue.hertz import Tissue
 
+HELD_S = 1.0
+"""Age of a contact on which a plan is tried."""
+
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
@@ -86,18 +89,28 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
     """Poles of one point measured block by block, and how many blocks that took."""
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
-    from tactile_resonance.scan.decision import Precise, decide_bands
+    from tactile_resonance.scan.decision import Separate, decide_bands, decide_tissue
     from tactile_resonance.scan.measurement import excitation_of
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
+    from tactile_resonance.tissue.nominal_contact import ContactLoad
 
     scene, design, frf, blocks = plan.scene, plan.measurement, MeasurementFrf(0), 0
-    wanted = scene.precision if isinstance(scene.precision, Precise) else None
+    wanted, limits = scene.precision, design.blocks
+    pressed = ContactLoad(scene.force_n, 0.0, HELD_S)
     excitation = excitation_of(design, seed=1)
-    at_rest = SimulatedBench.from_configuration().start(tissue, force_n=scene.force_n, seed=1)
+    bench = SimulatedBench.from_configuration()
+    at_rest = bench.start(tissue, force_n=scene.force_n, hold_time_s=HELD_S, seed=1)
     for record in at_rest.play(excitation, excitation.periods):
         blocks += 1
         poles = poles_of_bands(frf.add(record, excitation), design.bands)
-        if decide_bands(poles, blocks, wanted, scene.blocks, design.block_s).stop:
+        if isinstance(wanted, Separate):
+            nominal = scene.nominal_contact
+            decision = decide_tissue(
+                poles.main, pressed, nominal, blocks, wanted, limits, design.block_s
+            )
+        else:
+            decision = decide_bands(poles, blocks, wanted, limits, design.block_s)
+        if decision.stop:
             break
     return poles, blocks
 

@@ -126,6 +126,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
             grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
             mains_hz=(mains,) if mains else (),
             lines_beside=beside,
+            sweep=goal.sweep,
             seed=goal.seed or seed + measurements,
             realisation=realisation,
             realisations=realisations,
@@ -138,7 +139,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     ]
     if goal.silent:
         return [replace(each, amplitude_v=np.zeros(each.harmonics.size)) for each in excitations]
-    if passes:
+    if passes and not goal.sweep:
         return [compress_crest_factor(each, passes=passes) for each in excitations]
     return excitations
 

@@ -96,6 +96,7 @@ class MeasureClient:
             periods=design.periods,
             realisations=1,
             seed=seed,
+            sweep=design.sweep,
         )
         write_bands(goal, msg.Band, design.bands)
         self._recorder.record_into(recording, goal.measurement_id)

@@ -15,7 +15,8 @@ from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, file_of
 
-SAME_MIDDLE_NS = 50_000_000  # a quarter of what one block more makes
+SAME_MIDDLE_NS = 50_000_000
+"""Between the middles of an estimate and of its truth, at most."""
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -74,11 +75,12 @@ def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
             told.append((poles, origin))
         else:
             middle_ns = origin.time_ns
-    # the bench may have played on
-    near = [(p, o) for p, o in told if abs(o.time_ns - middle_ns) < SAME_MIDDLE_NS]
-    if not near:
+    if not told:
         return None
-    poles, origin = near[0]
+    # the bench may have played on
+    poles, origin = min(told, key=lambda each: abs(each[1].time_ns - middle_ns))
+    if abs(origin.time_ns - middle_ns) > SAME_MIDDLE_NS:
+        return None
     k = int(np.argmin(np.abs(poles.f0_hz - result.f0_hz)))
     estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
     contact = origin.contact

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import check_above_zero, require
-from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
+from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
 
 FloatArray = npt.NDArray[np.float64]
 # Poles outside of both classes by this much are of neither, and no block more will change it.
@@ -20,6 +21,8 @@ NEITHER_LEVEL = 1e-4
 # How far beyond what was asked the prediction for the last block must lie to give up before it: estimated
 # standard deviations scatter themselves.
 HOPELESS_FACTOR = 1.5
+# Likewise of a likelihood ratio: by how many standard deviations of what the blocks left will move it.
+HOPELESS_STDS = 3.0
 
 
 class Verdict(str, Enum):
@@ -130,15 +133,15 @@ def decide(
     block_s : float
         Duration of one block [s].
     """
-    x, best = np.asarray(estimate, float), np.asarray(covariance, float)
+    x, best, of_noise = (np.asarray(each, float) for each in (estimate, covariance, noise))
     verdict, reason, called = Verdict.CONTINUE, "fewer blocks than required at least", ""
     if blocks >= limits.least and wanted is not None:
         if not (np.all(np.isfinite(best)) and np.all(np.isfinite(x))):
             reason = "no pole with a covariance yet"
         elif isinstance(wanted, Separate):
-            verdict, reason, called = _separated(x, best, wanted)
+            verdict, reason, called = _separated(x, best, of_noise, blocks, wanted, limits)
         else:
-            verdict, reason = _precise(best, np.asarray(noise, float), blocks, wanted, limits)
+            verdict, reason = _precise(best, of_noise, blocks, wanted, limits)
     elif wanted is None:
         reason = "no precision requested"
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
@@ -173,6 +176,36 @@ def decide_bands(
     return next((each for each in imprecise if not each.stop), imprecise[0])
 
 
+def decide_tissue(
+    mode: MainMode,
+    pressed: ContactLoad,
+    nominal: NominalContact | None,
+    blocks: int,
+    wanted: Separate,
+    limits: BlockLimits,
+    block_s: float,
+) -> Decision:
+    """Whether the pole of all blocks so far tells two tissues apart: the one at the nominal contact.
+
+    Parameters
+    ----------
+    mode : MainMode
+        As measured.
+    pressed : ContactLoad
+        Force and age of the contact while it was.
+    nominal : NominalContact or None
+        To which the classes refer.
+    blocks, wanted, limits, block_s
+        As `decide`.
+    """
+    at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
+    noise = mode.noise if np.all(np.isfinite(mode.noise)) else mode.covariance
+    decision = decide(at.compared, at.covariance, noise, blocks, wanted, limits, block_s)
+    if np.isnan(at.compared).any() and at.note:
+        return replace(decision, reason=at.note)
+    return decision
+
+
 def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:
     """Logarithm of p(estimate | first) / p(estimate | second), class spread included.
 
@@ -185,9 +218,19 @@ def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: S
 
 
 def _separated(
-    estimate: FloatArray, covariance: FloatArray, wanted: Separate
+    estimate: FloatArray,
+    covariance: FloatArray,
+    noise: FloatArray,
+    blocks: int,
+    wanted: Separate,
+    limits: BlockLimits,
 ) -> tuple[Verdict, str, str]:
-    """Wald's sequential probability ratio test with equal errors (Ann. Math. Stat. 16 (1945) 117)."""
+    """Wald's sequential probability ratio test with equal errors (Ann. Math. Stat. 16 (1945) 117).
+
+    A likelihood ratio of all that was seen is a martingale under the class in its denominator, whatever the
+    blocks have in common, so that its bound holds whenever the test stops (Ville). It gives up where the
+    blocks left will not take it to either bound, which causes no errors.
+    """
     a, b = wanted.first, wanted.second
     if classify(estimate, covariance, [a, b], NEITHER_LEVEL).name == UNKNOWN:
         reason = f"outside of {a.name} and {b.name} ({NEITHER_LEVEL:g} of their members lie there)"
@@ -196,9 +239,42 @@ def _separated(
     ratio = log_likelihood_ratio(estimate, covariance, wanted)
     text = f"log likelihood ratio {ratio:+.2f}, +-{threshold:.2f} asked for"
     if abs(ratio) < threshold:
+        left = 1 - blocks / limits.most
+        if left > 0 and _out_of_reach(estimate, covariance, noise, left, wanted, threshold):
+            return Verdict.HOPELESS, f"{text}, out of reach of {limits.most} blocks", ""
         return Verdict.CONTINUE, text, ""
     called = a.name if ratio > 0 else b.name
     return Verdict.SEPARATED, f"{called}: {text}", called
+
+
+def _out_of_reach(
+    estimate: FloatArray,
+    covariance: FloatArray,
+    noise: FloatArray,
+    left: float,
+    wanted: Separate,
+    threshold: float,
+) -> bool:
+    """Whether the log likelihood ratio will stay within the bounds though this share of all blocks is left.
+
+    The estimate of all blocks differs from the present one by the noise that goes; the ratio is all but
+    linear in it.
+    """
+    known = np.all(np.diag(noise) <= np.diag(covariance))  # not where it is NaN
+    going = left * (noise if known else covariance)
+    last = covariance - going
+    ratio = abs(log_likelihood_ratio(estimate, last, wanted))
+    if ratio >= threshold:
+        return False
+    unit = np.sqrt(np.diag(going))
+    values, vectors = np.linalg.eigh(going / np.outer(unit, unit))
+    steps = (vectors * np.sqrt(np.maximum(values, 0))).T * unit
+    moved = [
+        log_likelihood_ratio(estimate + step, last, wanted)
+        - log_likelihood_ratio(estimate - step, last, wanted)
+        for step in steps
+    ]
+    return ratio + HOPELESS_STDS * float(np.linalg.norm(moved)) / 2 < threshold
 
 
 def _precise(

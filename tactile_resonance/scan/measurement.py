@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
+from tactile_resonance.scan.decision import BlockLimits, Separate
+from tactile_resonance.scan.period import lines_of, shortest_samples
 from tactile_resonance.scan.scene import Output, ScanScene
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
@@ -17,6 +19,12 @@ F_MIN_HZ, F_MAX_HZ = 10.0, 10_000.0
 """The sensor's whole range, to which the level of a scene refers."""
 MOST_OF_RATE = 0.4
 """Of the sample rate: up to here anti-alias filters pass lines."""
+ODD_RANDOM_SHARE = 3 / 8
+"""Of all lines: odd ones, three of four."""
+MOST_S = 3.2
+"""Of vibration at a point, where the plan chooses period and blocks: eight periods of 0.4 s."""
+REFERENCE_S = 0.8
+"""Of vibration in a reference, at least: two periods of 0.4 s (arXiv 1805.00682)."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +61,15 @@ class MeasurementDesign:
     sample_rate_hz : float
     samples : int
         Of each channel in a block, one period.
+    blocks : BlockLimits
+        Fewest and most at a point.
     periods : int
-        Most blocks.
+        Most blocks of this measurement.
     lines : int
         Excited where the grid leaves none out.
     skipped : tuple of Skipped
+    sweep : bool
+        Over each period, in place of random phases.
     silent : bool
         Nothing is played.
     """
@@ -68,15 +80,22 @@ class MeasurementDesign:
     level_v: float
     sample_rate_hz: float
     samples: int
+    blocks: BlockLimits
     periods: int
     lines: int
     skipped: tuple[Skipped, ...]
+    sweep: bool = False
     silent: bool = False
 
     @property
     def block_s(self) -> float:
         """Duration of a block [s]."""
         return self.samples / self.sample_rate_hz
+
+    @property
+    def of_reference(self) -> MeasurementDesign:
+        """The same with as many blocks as a reference has."""
+        return replace(self, periods=_of_reference(self.blocks, self.block_s))
 
 
 def design_measurement(scene: ScanScene) -> MeasurementDesign:
@@ -88,8 +107,6 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         If a band does not lie within what can be excited, or holds too few lines for its model.
     """
     use, outputs = scene.sensor, set(scene.outputs)
-    spacing_hz = use.sample_rate_hz / use.samples_per_period
-    block_s = use.samples_per_period / use.sample_rate_hz
     top_hz = min(F_MAX_HZ, MOST_OF_RATE * use.sample_rate_hz)
     for band in use.bands:
         if band.low_hz < F_MIN_HZ or band.high_hz > top_hz:
@@ -100,20 +117,25 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     whole_hz = ((F_MIN_HZ, top_hz),)
     # even distortion of a band falls outside of it: what is to show there must be excited there
     distortion = Output.DISTORTION in outputs
+    share = ODD_RANDOM_SHARE if distortion else 1.0
+    samples, margin = use.samples_per_period, MARGIN_LINES
+    if samples is None:
+        samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share), 0
+    spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
+    blocks = scene.blocks or _default_blocks(scene, block_s)
     narrow = not distortion and Output.FRF not in outputs
-    stretches_hz = _stretches(use.bands, MARGIN_LINES * spacing_hz, top_hz) if narrow else whole_hz
-    lines = sum(_lines(ends_hz, spacing_hz) for ends_hz in stretches_hz)
+    stretches_hz = _stretches(use.bands, margin * spacing_hz, top_hz) if narrow else whole_hz
+    lines = sum(lines_of(ends_hz, spacing_hz) for ends_hz in stretches_hz)
     for band in use.bands:
         fewest = ModelStructure.with_residual(band.order or 2, band.residual_terms).fewest_lines
-        found = _lines(band.ends_hz, spacing_hz)
-        found = found * 3 // 8 if distortion else found  # odd ones, three of four
+        found = lines_of(band.ends_hz, spacing_hz, share)
         if found <= fewest:
             raise ValueError(
                 f"sensor.band: got {found} excited lines from {band.low_hz:g} to {band.high_hz:g} Hz, "
                 f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
             )
     skipped = []
-    of_whole = _lines(whole_hz[0], spacing_hz)
+    of_whole = lines_of(whole_hz[0], spacing_hz)
     if narrow:
         text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
         named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
@@ -122,7 +144,11 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
     if Output.SILENT not in outputs:
         skipped.append(
-            Skipped("a silent record", "silent is not wanted", scene.blocks.least * block_s)
+            Skipped(
+                "a silent record",
+                "silent is not wanted",
+                _of_reference(blocks, block_s) * block_s,
+            )
         )
     if Output.MAP not in outputs:
         skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
@@ -130,12 +156,14 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         bands=use.bands,
         stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
-        level_v=use.level_v * math.sqrt(lines / _lines((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
+        level_v=use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
         sample_rate_hz=use.sample_rate_hz,
-        samples=use.samples_per_period,
-        periods=scene.blocks.most,
+        samples=samples,
+        blocks=blocks,
+        periods=blocks.most,
         lines=lines,
         skipped=tuple(skipped),
+        sweep=use.samples_per_period is None and not distortion,
     )
 
 
@@ -147,6 +175,7 @@ def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:
         band_hz=design.stretches_hz,
         level_v=design.level_v,
         grid=design.grid,
+        sweep=design.sweep,
         seed=seed,
         periods=design.periods,
         bands=design.bands,
@@ -166,7 +195,16 @@ def _stretches(
     return tuple(found)
 
 
-def _lines(ends_hz: tuple[float, float], spacing_hz: float) -> int:
-    """How many lines lie from the one end to the other."""
-    low, high = (hz / spacing_hz for hz in ends_hz)
-    return math.floor(high + 1e-9) - math.ceil(low - 1e-9) + 1
+def _default_blocks(scene: ScanScene, block_s: float) -> BlockLimits:
+    """Of a scene that says nothing; where the plan chooses the period, as many as take as long."""
+    usual = BlockLimits()
+    if scene.sensor.samples_per_period is not None:
+        return usual
+    # of two classes one block may tell; a precision is estimated too well by chance from the first
+    least = 1 if isinstance(scene.precision, Separate) else usual.least
+    return BlockLimits(least, max(usual.most, math.ceil(MOST_S / block_s - 1e-9)))
+
+
+def _of_reference(blocks: BlockLimits, block_s: float) -> int:
+    """Blocks of a reference."""
+    return max(blocks.least, math.ceil(REFERENCE_S / block_s - 1e-9))

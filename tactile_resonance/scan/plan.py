@@ -85,12 +85,12 @@ class Plan:
     @property
     def shortest_s(self) -> float:
         """With the fewest points and blocks [s]."""
-        return self.duration_s(self.scene.blocks.least, len(self.first_points))
+        return self.duration_s(self.measurement.blocks.least, len(self.first_points))
 
     @property
     def longest_s(self) -> float:
         """With the most [s]."""
-        return self.duration_s(self.scene.blocks.most)
+        return self.duration_s(self.measurement.blocks.most)
 
     def duration_s(self, blocks: int, points: int | None = None) -> float:
         """Time of so many points, by default the most, with so many blocks each [s].
@@ -126,7 +126,7 @@ class Plan:
         near = [is_along(last, point) for point in self.points]
         contact_s = np.where(near, NEAR_CONTACT_S, CONTACT_S)
         seconds = way_m / TRAVEL_M_S + contact_s
-        seconds += self.scene.blocks.least * self.measurement.block_s
+        seconds += self.measurement.blocks.least * self.measurement.block_s
         place = adaptive.next(self._places_m, before, known_points(results), seconds)
         return None if place is None else self._numbered(self.points[place], len(touched))
 
@@ -212,7 +212,7 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
         for index in range(len(where))
     )
     plan = plan_points(scene, points)
-    each_s = CONTACT_S + scene.blocks.most * plan.measurement.block_s
+    each_s = CONTACT_S + plan.measurement.blocks.most * plan.measurement.block_s
     left_out = tuple(
         Skipped(f"{int(left.sum())} points", why, float(left.sum() * each_s))
         for left, why in (

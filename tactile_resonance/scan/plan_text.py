@@ -9,6 +9,8 @@ import numpy as np
 
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
+from tactile_resonance.scan.measurement import MeasurementDesign, design_measurement
+from tactile_resonance.scan.period import LEAST_DISTANCE, lines_wanted, mains_distances, mains_in
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.references import SILENT
@@ -53,13 +55,15 @@ def plan_rows(plan: Plan) -> Rows:
         (
             "excited",
             f"{design.grid.value} grid of {design.lines} lines, {stretches} Hz, at "
-            f"{design.level_v:.3g} V rms",
+            f"{design.level_v:.3g} V rms" + (", a rising sweep" if design.sweep else ""),
         ),
         (
             "sampled",
             f"{design.sample_rate_hz:g} Hz, blocks of {design.samples} samples, {design.block_s:g} s",
         ),
-        ("measured", f"{scene.blocks.least} to {scene.blocks.most} blocks a point"),
+        ("period", _period(plan)),
+        ("mains", _mains(design)),
+        ("measured", f"{design.blocks.least} to {design.blocks.most} blocks a point"),
         ("until", _wanted(scene)),
     ]
     for band in design.bands:
@@ -107,6 +111,30 @@ def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
     return f"{met}: {1e6 * loss:.2g} mm2, {len(results)} touches"
 
 
+def _period(plan: Plan) -> str:
+    """Who chose the period, and why so long."""
+    design = plan.measurement
+    if plan.scene.sensor.samples_per_period is not None:
+        return "as the scene says"
+    needed = max(design.bands, key=lambda band: lines_wanted(band) / (band.high_hz - band.low_hz))
+    return (
+        f"the shortest with {lines_wanted(needed)} lines from {needed.low_hz:g} to {needed.high_hz:g} Hz, as "
+        "many as one block takes for its model and noise"
+    )
+
+
+def _mains(design: MeasurementDesign) -> str:
+    """Which harmonics of the mains cannot be distinguished from the response at excited lines."""
+    hum_hz = mains_in(design.bands)
+    spacing_hz = design.sample_rate_hz / design.samples
+    near = [hz for hz in hum_hz if mains_distances(np.array([hz]), spacing_hz) < LEAST_DISTANCE]
+    distance = f"{LEAST_DISTANCE:g} of the spacing of lines"
+    if not near:
+        return f"harmonics of 50 and 60 Hz in the bands are {distance} or more from the next line"
+    names = ", ".join(f"{hz:g}" for hz in near)
+    return f"hum at {names} Hz would count as response: it is within {distance} from the next line"
+
+
 def map_names(bands: int) -> list[str]:
     """Names of the figures of the map, one for each band."""
     return [f"pole_map{f'_{k + 1}' if k else ''}.png" for k in range(bands)]
@@ -124,10 +152,11 @@ def plan_against_outcome(scene: ScanScene, run: RunContent) -> list[tuple[str, s
     """
     results, count = run.latest, len(run.points)
     done = [result for result in results if result.outcome is PointOutcome.DONE]
-    blocks = f"{scene.blocks.least * count} to {scene.blocks.most * count}"
+    limits = design_measurement(scene).blocks
+    blocks = f"{limits.least * count} to {limits.most * count}"
     points, chosen = f"{count}", scene.adaptive
     if chosen is not None:
-        points, blocks = (f"at most {n}" for n in (chosen.most, scene.blocks.most * chosen.most))
+        points, blocks = (f"at most {n}" for n in (chosen.most, limits.most * chosen.most))
     taken_s = float(np.nansum([result.duration_s for result in results]))
     planned_s = [run.facts.get(name) for name in ("shortest_s", "longest_s")]
     rows = [

@@ -212,6 +212,7 @@ def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> d
             "sample_rate_hz": design.sample_rate_hz,
             "samples_per_period": design.samples,
             "level_v": design.level_v,
+            "sweep": design.sweep,
             "most_periods": design.periods,
         },
         "skipped": [asdict(skipped) for skipped in plan.skipped],

@@ -14,7 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide, decide_bands
+from tactile_resonance.scan.decision import (
+    Decision,
+    Separate,
+    Verdict,
+    decide_bands,
+    decide_tissue,
+)
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -41,7 +47,7 @@ from tactile_resonance.scan.references import (
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, Output
-from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
+from tactile_resonance.tissue.nominal_contact import ContactLoad
 
 POLL_S = 0.05
 ATTEMPT_SEEDS = 1_000_003
@@ -243,22 +249,13 @@ class ScanRunner:
             )
 
     def _decide(self, measured: Measured, blocks: int) -> Decision:
-        mode = measured.poles.main
         block_s = self._plan.measurement.block_s
-        wanted, limits = self._scene.precision, self._scene.blocks
+        wanted, limits = self._scene.precision, self._plan.measurement.blocks
         if isinstance(wanted, Separate):
-            # tissues are distinguished by the pole at the nominal contact, not by the measured one
-            force = measured.origin.contact
+            force, nominal = measured.origin.contact, self._scene.nominal_contact
             pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
-            at = refer_to_nominal(
-                mode.estimate, mode.covariance, pressed, self._scene.nominal_contact
-            )
-            decision = decide(
-                at.compared, at.covariance, at.covariance, blocks, wanted, limits, block_s
-            )
-            if np.isnan(at.compared).any() and at.note:
-                return replace(decision, reason=at.note)
-            return decision
+            mode = measured.poles.main
+            return decide_tissue(mode, pressed, nominal, blocks, wanted, limits, block_s)
         return decide_bands(measured.poles, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
@@ -273,7 +270,7 @@ class ScanRunner:
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
         point = air_point(self._plan.most_points + (name == AFTER))
-        design = replace(self._plan.measurement, periods=self._scene.blocks.least)
+        design = self._plan.measurement.of_reference
         if silent:
             design = replace(design, silent=True)
             point = replace(point, label=SILENT)

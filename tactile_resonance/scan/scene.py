@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from enum import Enum
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,7 @@ from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.patterns import flat, read_positions
+from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.surface import (
     NormalRequest,
     Plane,
@@ -53,6 +54,8 @@ from tactile_resonance.tissue.references import (
 
 # Of the simulated bench: what lies on its table, and how it moves.
 BENCH_KEYS = {"regions", "buried", "motion"}
+AUTO = "auto"
+"""What the plan chooses."""
 
 
 class Hold(str, Enum):
@@ -79,6 +82,14 @@ class OnFailure(str, Enum):
     STOP = "stop"
 
 
+def _read_period(value: object, field: str) -> int | None:
+    """Samples of a period; None where the plan chooses them."""
+    if value == AUTO:
+        return None
+    require(type(value) is int, field, value, f"an integer or {AUTO}")
+    return cast(int, value)
+
+
 @dataclass(frozen=True)
 class SensorUse:
     """The sensor and how it is used.
@@ -90,12 +101,14 @@ class SensorUse:
     band_low_hz, band_high_hz : float
         Around the main mode: precision, tissue and the comparison with free air are of this one.
     order, residual_terms : int
-        Of the model there: see `PoleBand`.
+        Of the model there: see `PoleBand`. Terms None: as many as are usual or, where the plan chooses the
+        period, as the band needs.
     further_bands : tuple of PoleBand
         Around other modes that are identified and mapped too.
     sample_rate_hz : float
-    samples_per_period : int
-        Lines are multiples of their ratio; a block is one period.
+    samples_per_period : int or None
+        Lines are multiples of their ratio; a block is one period. None (``auto``): the plan chooses it, see
+        `tactile_resonance.scan.period`.
     level_v : float
         Drive [V rms], if the sensor's whole range were excited: the amplitude of each line follows from
         it, however few are.
@@ -107,10 +120,10 @@ class SensorUse:
     band_low_hz: float = 200.0
     band_high_hz: float = 300.0
     order: int = 2
-    residual_terms: int = DEFAULT_RESIDUAL_TERMS
+    residual_terms: int | None = None
     further_bands: tuple[PoleBand, ...] = ()
     sample_rate_hz: float = 50_000.0
-    samples_per_period: int = 20_000
+    samples_per_period: Annotated[int | None, _read_period] = 20_000
     level_v: float = 1.0
     heading_rad: float = 0.0
 
@@ -135,7 +148,11 @@ class SensorUse:
     @property
     def bands(self) -> tuple[PoleBand, ...]:
         """All, the main one first."""
-        main = PoleBand(self.band_low_hz, self.band_high_hz, self.order, self.residual_terms)
+        ends_hz, terms = (self.band_low_hz, self.band_high_hz), self.residual_terms
+        if terms is None:
+            chosen = self.samples_per_period is None
+            terms = residual_terms_of(ends_hz) if chosen else DEFAULT_RESIDUAL_TERMS
+        main = PoleBand(*ends_hz, self.order, terms)
         return (main, *self.further_bands)
 
 
@@ -207,7 +224,8 @@ class ScanScene:
     outputs : tuple of Output
     precision : Precise, Separate or None
         When a point's blocks are enough; None: after the most blocks.
-    blocks : BlockLimits
+    blocks : BlockLimits or None
+        None: as the plan chooses.
     gate : Gate or None
         A measurement during which the force moved more is repeated; None: none is.
     tissue_classes : tuple of TissueClass
@@ -235,7 +253,7 @@ class ScanScene:
     surface: Surface | TouchRequest = field(default_factory=Plane)
     outputs: tuple[Output, ...] = (Output.POLES, Output.MAP)
     precision: Precise | Separate | None = None
-    blocks: BlockLimits = field(default_factory=BlockLimits)
+    blocks: BlockLimits | None = None
     gate: Gate | None = None
     tissue_classes: tuple[TissueClass, ...] = ()
     nominal_contact: NominalContact | None = None

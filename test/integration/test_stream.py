@@ -2,6 +2,7 @@
 """The stream of nodes, seen by a program of its own that only listens."""
 
 import time
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from tactile_resonance.action import Measure
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
+from tactile_resonance.configuration import share_path
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.nodes.client import HANGS_S, NoAnswer, NodeClient
@@ -23,6 +25,8 @@ from tactile_resonance.recording.messages import (
     poles_from_message,
     record_from_message,
 )
+from tactile_resonance.scan.measurement import design_measurement
+from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -175,6 +179,24 @@ def test_poles_of_two_bands_in_one_measurement(session):
         assert poles.status is PolesStatus.OK, poles.message
         assert abs(poles.main.f0_hz - truth) < 5 * np.sqrt(poles.best_covariance[0, 0, 0])
         assert np.sqrt(poles.best_covariance[0, 0, 0]) < 0.1
+
+
+def test_a_pole_from_one_short_block(session):
+    design = design_measurement(read_scan_scene(share_path("config/scenes/two_gelatines.yaml")))
+    (band,) = design.bands
+    goal = Measure.Goal(
+        **{"periods": 1, "seed": 6, "sweep": design.sweep, "level_v": design.level_v},
+        bands=[msg.Band(**asdict(band))],
+        excited_low_hz=[band.low_hz],
+        excited_high_hz=[band.high_hz],
+        samples_per_period=design.samples,
+    )
+    result = session.measure(GEL_10, goal, quiet)
+    (truth,) = (f for f in result.truth.f0_hz if 200 < f < 300)
+    f0_std_hz = result.poles.main.std[0]
+    # the level of the noise is from the residuals alone
+    assert result.poles.status is PolesStatus.NO_COVARIANCE
+    assert abs(result.poles.main.f0_hz - truth) < 5 * f0_std_hz < 0.5
 
 
 def test_the_bench_tells_its_truth_on_request(session):

@@ -118,6 +118,24 @@ def test_compressed_phases_for_one_realisation_only(ros):
         node.destroy_node()
 
 
+def test_a_sweep_keeps_its_phases(ros):
+    from tactile_resonance.action import Measure
+
+    from tactile_resonance.nodes import excitation_design
+
+    node = excitation_node.ExcitationNode()
+    try:
+        node.set_parameters([RosParameter("compression_passes", value=300)])
+        goal = Measure.Goal(f_max_hz=500.0, sweep=True, periods=2)
+        first, second = (excitation_design.design(node, goal, n)[0] for n in range(2))
+        assert not first.random_phases
+        np.testing.assert_array_equal(first.period(), second.period())
+        with pytest.raises(ValueError, match="realisations: got 2; accepted is 1 with sweep"):
+            excitation_design.design(node, Measure.Goal(realisations=2, sweep=True), 0)
+    finally:
+        node.destroy_node()
+
+
 def test_a_silent_measurement_plays_nothing(ros):
     from tactile_resonance.action import Measure
 

@@ -5,15 +5,22 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tactile_resonance.poles.result import MainMode
 from tactile_resonance.scan.decision import (
     BlockLimits,
     Precise,
     Separate,
     Verdict,
     decide,
+    decide_tissue,
     log_likelihood_ratio,
 )
 from tactile_resonance.tissue.classify import TissueClass
+from tactile_resonance.tissue.nominal_contact import (
+    ContactLoad,
+    ForceSensitivity,
+    NominalContact,
+)
 
 # of one block
 BLOCK = np.array([[0.02**2, 0.2 * 0.02 * 8e-5], [0.2 * 0.02 * 8e-5, 8e-5**2]])
@@ -38,7 +45,9 @@ def run(rng, wanted, mean, limits=LIMITS):
     factor = np.linalg.cholesky(BLOCK)
     for blocks in range(1, limits.most + 1):
         total += mean + factor @ rng.standard_normal(2)
-        decision = decide(total / blocks, BLOCK / blocks, BLOCK / blocks, blocks, wanted, limits, 0.4)
+        decision = decide(
+            total / blocks, BLOCK / blocks, BLOCK / blocks, blocks, wanted, limits, 0.4
+        )
         if decision.stop:
             return decision
     raise AssertionError("unreachable")
@@ -136,3 +145,61 @@ def test_without_poles_or_precision_it_goes_on_to_the_most_blocks():
             decision = decide([np.nan] * 2, unknown, unknown, n, wanted, BlockLimits(), 0.4)
             assert decision.verdict is verdict
             assert decision.blocks_saved == 0
+
+
+def middle(wanted, share=0.5):
+    """Between the means of both classes."""
+    return wanted.first.mean + share * (wanted.second.mean - wanted.first.mean)
+
+
+def test_gives_up_between_the_classes_only_where_no_block_left_would_help():
+    wanted = Separate(*point_classes(25.0, 25 * BLOCK), probability=0.99)
+
+    def at(share, blocks, noise):
+        limits = BlockLimits(1, 50)
+        return decide(middle(wanted, share), noise, noise, blocks, wanted, limits, 0.06)
+
+    # the noise is small beside the spread: where the pole lies now decides
+    stopped = at(0.5, 2, BLOCK / 2)
+    assert (stopped.verdict, stopped.called) == (Verdict.HOPELESS, "")
+    assert stopped.blocks_saved == 48
+    assert "out of reach of 50 blocks" in stopped.reason
+    assert at(0.1, 2, BLOCK / 2).verdict is Verdict.SEPARATED
+    # the noise is large: it may yet come to lie anywhere
+    assert at(0.5, 1, 30 * BLOCK).verdict is Verdict.CONTINUE
+    assert at(0.5, 50, BLOCK / 50).verdict is Verdict.MOST_BLOCKS
+
+
+@pytest.mark.parametrize("distance", [2.0, 3.5])
+def test_errors_are_as_allowed_with_a_covariance_of_few_lines(distance):
+    """Of a level that twelve complex degrees of freedom a block tell, as `levels.Level` states it."""
+    rng, runs, dof = np.random.default_rng(8), 1500, 12
+    wanted = Separate(*point_classes(distance), probability=0.99)
+    limits, factor, wrong = BlockLimits(1, 200), np.linalg.cholesky(BLOCK), 0
+    for _ in range(runs):
+        total, level = np.zeros(2), 0.0
+        for blocks in range(1, limits.most + 1):
+            total += wanted.first.mean + factor @ rng.standard_normal(2)
+            level += rng.gamma(dof)
+            nu = dof * blocks
+            stated = BLOCK / blocks * level / nu * nu / (nu - 1)
+            decision = decide(total / blocks, stated, stated, blocks, wanted, limits, 0.06)
+            if decision.stop:
+                break
+        wrong += decision.called == "second"
+    assert wrong <= stats.binom.isf(1e-4, runs, 0.01)
+
+
+def test_tissues_are_told_apart_by_the_pole_at_the_nominal_contact():
+    slope = np.array([300.0, 1.3])
+    nominal = NominalContact(0.01, 1.0, ForceSensitivity(slope, np.zeros((2, 2))))
+    wanted, nothing = Separate(*point_classes(9.0), probability=0.99), np.full(2, np.nan)
+    pressed_by = ContactLoad(0.011, 1e-6, 1.0)  # 1 mN too much
+    mode = MainMode(middle(wanted, 0.1) + 1e-3 * slope, BLOCK, BLOCK, -50 + 1600j, nothing, nothing)
+    asked = (1, wanted, LIMITS, 0.06)
+    referred = decide_tissue(mode, pressed_by, nominal, *asked)
+    assert (referred.verdict, referred.called) == (Verdict.SEPARATED, "first")
+    assert decide_tissue(mode, pressed_by, None, *asked).called != "first"
+    unknown = decide_tissue(mode, ContactLoad(), nominal, *asked)
+    assert unknown.verdict is Verdict.CONTINUE
+    assert "the force is unknown" in unknown.reason

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The period that a plan chooses: lines enough for the model, no more, and away from the mains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactile_resonance.configuration import share_path
+from tactile_resonance.multisine import Grid
+from tactile_resonance.poles.structure import PoleBand
+from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
+from tactile_resonance.scan.measurement import design_measurement, excitation_of
+from tactile_resonance.scan.period import (
+    LEAST_DISTANCE,
+    LONGER,
+    lines_of,
+    lines_wanted,
+    mains_distances,
+    mains_in,
+    residual_terms_of,
+    shortest_samples,
+)
+from tactile_resonance.scan.plan import make_plan
+from tactile_resonance.scan.plan_text import plan_rows
+from tactile_resonance.scan.scene import Output, parse_scan_scene, read_scan_scene
+
+SCENE = share_path("config/scenes/two_gelatines.yaml")
+
+
+def test_lines_are_those_of_coefficients_and_noise():
+    # numerator 8, denominator 2, transient 6: eight lines; and twelve
+    assert lines_wanted(PoleBand(200.0, 300.0, 2, 6)) == 20
+    # the transient has no more terms for more residual terms
+    assert lines_wanted(PoleBand(200.0, 580.0, 2, 12)) == 23
+    assert lines_wanted(PoleBand(200.0, 580.0, 0, 12)) == 23
+
+
+bands = st.builds(
+    lambda low, width, terms: PoleBand(low, low + width, 2, terms),
+    st.floats(20.0, 2000.0),
+    st.floats(50.0, 1000.0),
+    st.integers(1, 14),
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(bands, min_size=1, max_size=2), st.sampled_from([1.0, 3 / 8]))
+def test_no_shorter_period_has_the_lines(several, share):
+    rate_hz = 2e4
+
+    def enough(samples):
+        spacing_hz = rate_hz / samples
+        return all(lines_of(b.ends_hz, spacing_hz, share) >= lines_wanted(b) for b in several)
+
+    samples = shortest_samples(several, rate_hz, share)
+    assert enough(samples)
+    shortest = next(n for n in range(4, samples + 1) if enough(n))
+    assert samples <= LONGER * shortest
+    # longer than that only for the mains: none between is as far from them, or far enough
+    between = np.array([n for n in range(shortest, samples) if enough(n)], float)
+    away = mains_distances(mains_in(several), rate_hz / between)
+    found = mains_distances(mains_in(several), rate_hz / samples)
+    assert np.all(away < min(LEAST_DISTANCE, found))
+
+
+def test_distances_from_the_mains():
+    hum_hz = mains_in([PoleBand(200.0, 300.0)])
+    np.testing.assert_array_equal(hum_hz, [200, 240, 250, 300])
+    np.testing.assert_allclose(mains_distances(hum_hz, [2.5, 16.0, 40.0]), [0, 0, 0])
+    np.testing.assert_allclose(mains_distances(np.array([250.0]), 100.0), 0.5)
+    assert mains_distances(mains_in([PoleBand(201.0, 239.0)]), 10.0) == 0.5
+    np.testing.assert_array_equal(
+        mains_in([PoleBand(590.0, 610.0), PoleBand(95.0, 125.0)]), [100, 120, 600]
+    )
+
+
+@pytest.mark.parametrize("ends_hz", [(200.0, 300.0), (200.0, 620.0), (140.0, 420.0)])
+def test_residual_terms_follow_a_neighbour_and_not_many_more(ends_hz):
+    low_hz, high_hz = ends_hz
+    terms = residual_terms_of(ends_hz)
+    x = np.cos(np.linspace(0, np.pi, 400))
+    s = 2j * np.pi * ((low_hz + high_hz) / 2 + (high_hz - low_hz) / 2 * x)
+    neighbour = 1 / (s - 2j * np.pi * low_hz / 2)
+
+    def left(count):
+        fitted = np.polynomial.chebyshev.chebfit(x, neighbour, count - 1)
+        rest = neighbour - np.polynomial.chebyshev.chebval(x, fitted)
+        return np.max(np.abs(rest)) / np.max(np.abs(neighbour))
+
+    assert left(terms) < 2e-6
+    assert left(terms - 2) > 1e-6
+
+
+def test_a_scene_that_leaves_it_to_the_plan():
+    scene = read_scan_scene(SCENE)
+    design = design_measurement(scene)
+    (band,) = design.bands
+    assert design.samples == shortest_samples(design.bands, 5e4) == 2948
+    assert 0.02 < design.block_s < 0.08
+    assert (band.residual_terms, design.lines) == (residual_terms_of(band.ends_hz), 25)
+    assert design.sweep
+    # nothing beside the band, and the power density of the scene's level
+    assert design.stretches_hz == ((200.0, 620.0),)
+    assert design.level_v == pytest.approx(np.sqrt(25 / 589))
+    assert not excitation_of(design, seed=3).random_phases
+    # of two classes one block may be enough; as long a time as ever at most
+    assert design.blocks == BlockLimits(1, 55)
+    assert 3.2 <= design.blocks.most * design.block_s < 3.2 + design.block_s
+    assert 0.8 <= design.of_reference.periods * design.block_s < 0.8 + design.block_s
+    assert isinstance(scene.precision, Separate)
+    precise = design_measurement(replace(scene, precision=Precise(0.02)))
+    assert precise.blocks == BlockLimits(3, 55)
+    given = design_measurement(replace(scene, blocks=BlockLimits(2, 4)))
+    assert given.blocks == BlockLimits(2, 4)
+
+
+def test_what_the_scene_says_stays():
+    scene = read_scan_scene(SCENE)
+    usual = replace(scene, sensor=replace(scene.sensor, samples_per_period=20_000))
+    design = design_measurement(usual)
+    assert (design.samples, design.sweep, design.blocks) == (20_000, False, BlockLimits())
+    assert design.bands[0].residual_terms == 6
+    assert design.of_reference.periods == 3
+
+
+def test_distortion_has_random_phases_and_enough_of_its_fewer_lines():
+    scene = replace(read_scan_scene(SCENE), outputs=(Output.POLES, Output.DISTORTION))
+    design = design_measurement(scene)
+    assert (design.grid, design.sweep) == (Grid.ODD_RANDOM, False)
+    excited = excitation_of(design, seed=1).frequency_hz
+    here = np.count_nonzero((excited >= 200) & (excited <= 620))
+    assert here >= lines_wanted(design.bands[0]) - 1  # a last block of lines may be incomplete
+
+
+def test_the_plan_says_who_chose_and_which_hum_it_cannot_tell():
+    scene = read_scan_scene(SCENE)
+    rows = dict(plan_rows(make_plan(scene)))
+    assert rows["period"].startswith("the shortest with 25 lines from 200 to 620 Hz")
+    assert rows["mains"].startswith("harmonics of 50 and 60 Hz in the bands are 0.15")
+    assert rows["measured"] == "1 to 55 blocks a point"
+    assert "a rising sweep" in rows["excited"]
+    usual = replace(scene.sensor, band_high_hz=300.0, samples_per_period=20_000)
+    rows = dict(plan_rows(make_plan(replace(scene, sensor=usual))))
+    assert rows["period"] == "as the scene says"
+    assert rows["mains"].startswith("hum at 200, 240, 250, 300 Hz would count as response")
+
+
+@pytest.mark.parametrize(
+    ("sensor", "reason"),
+    [
+        ({"samples_per_period": "fast"}, "samples_per_period: got 'fast'; accepted is an integer"),
+        ({"samples_per_period": 2e4}, "samples_per_period: got 20000.0; accepted is an integer"),
+        (
+            {"samples_per_period": "auto", "band_low_hz": 20.0, "band_high_hz": 9000.0},
+            "residual_terms: got .*; accepted is 1 to 20",
+        ),
+    ],
+)
+def test_what_cannot_be_chosen_is_refused(sensor, reason):
+    content = {"force_n": 0.01, "positions": {"list": [[0, 0]]}, "sensor": sensor}
+    with pytest.raises(ValueError, match=reason):
+        parse_scan_scene(content, SCENE)
