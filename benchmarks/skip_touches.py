@@ -15,7 +15,8 @@ from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary
 from tactile_resonance.scan.kriging import KrigedSurface, krige
 from tactile_resonance.scan.level_set import LevelSet, difference_m2
 from tactile_resonance.scan.patterns import grid
-from tactile_resonance.scan.plan import CONTACT_S, TRAVEL_M_S
+from tactile_resonance.scan.plan import CONTACT_S, NEAR_CONTACT_S, TRAVEL_M_S
+from tactile_resonance.scan.standoff import NEAR_M
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -149,7 +150,7 @@ def _chosen(phantom: Phantom, rng: np.random.Generator) -> Touches:
         assert surface is not None
         found.append((len(f0), _seconds(places[touched]), *_areas(phantom, surface)))
         way_m = np.linalg.norm(places - places[touched[-1]], axis=1)
-        place = ASKED.next(places, touched, known, way_m / TRAVEL_M_S + CONTACT_S + MEASURE_S)
+        place = ASKED.next(places, touched, known, _each_s(way_m))
         if place is not None:
             touched.append(place)
     return Touches(*np.array(found, float).T)
@@ -178,5 +179,11 @@ def _areas(phantom: Phantom, surface: KrigedSurface) -> tuple[float, float]:
 
 def _seconds(path_m: FloatArray) -> float:
     """That touches along a path take, as plans reckon them."""
-    way_m = float(np.sum(np.linalg.norm(np.diff(path_m, axis=0), axis=1)))
-    return way_m / TRAVEL_M_S + len(path_m) * (CONTACT_S + MEASURE_S)
+    ways_m = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
+    return CONTACT_S + MEASURE_S + float(np.sum(_each_s(ways_m)))
+
+
+def _each_s(way_m: FloatArray) -> FloatArray:
+    """Of touches and the ways to them."""
+    contact_s = np.where(way_m <= NEAR_M, NEAR_CONTACT_S, CONTACT_S)
+    return np.asarray(way_m / TRAVEL_M_S + contact_s + MEASURE_S)

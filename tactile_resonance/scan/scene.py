@@ -37,6 +37,7 @@ from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.patterns import flat, read_positions
 from tactile_resonance.scan.period import residual_terms_of
+from tactile_resonance.scan.standoff import is_plane
 from tactile_resonance.scan.surface import (
     NormalRequest,
     Plane,
@@ -276,8 +277,10 @@ class ScanScene:
             accepted = "none with adaptive positions: their normals are the surface's"
             require(self.normals is None, "normals", self.normals, accepted)
             form = getattr(self.surface, "form", type(self.surface).__name__.lower())
-            accepted = "a plane with adaptive positions: of other surfaces the ways between points are checked"
-            require(form == "plane", "surface", form, accepted)
+            accepted = (
+                "a plane with adaptive positions: of others the ways between points are checked"
+            )
+            require(is_plane(self.surface), "surface", form, accepted)
 
 
 def read_scan_scene(path: Path) -> ScanScene:
