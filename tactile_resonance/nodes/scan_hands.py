@@ -39,7 +39,7 @@ from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.standoff import Standoffs
+from tactile_resonance.scan.standoff import STILL_M, Standoffs
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 
@@ -218,7 +218,7 @@ class NodeHands:
         """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N]."""
         if self._tip is None:
             return 0.0
-        if self._tip.tissue_moves:
+        if self._tip.tissue_moves_m > STILL_M:
             self.standoffs.forget()
         return self._tip.retract()
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable
 
@@ -34,6 +35,8 @@ from tactile_resonance.scan.point_times import StateTimes
 from tactile_resonance.scan.scene import Hold
 
 STATE_TOPIC = "contact_state"
+HALF_WAY = re.compile(r"moving tissue: (\d+) um ")
+"""In the message of a contact that is held: `HeldMotion.describe`."""
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
@@ -99,10 +102,13 @@ class TipContact:
         return self._times.fields
 
     @property
-    def tissue_moves(self) -> bool:
-        """Whether the tip was seen to follow tissue that moves while it held its force."""
+    def tissue_moves_m(self) -> float:
+        """Half the way of tissue that the tip follows while it holds its force [m]; 0: none is seen."""
         state = self._state
-        return state is not None and state.state == state.STATE_HOLD and bool(state.message)
+        if state is None or state.state != state.STATE_HOLD:
+            return 0.0
+        found = HALF_WAY.match(state.message)
+        return 1e-6 * float(found[1]) if found else 0.0
 
     def hold(
         self,

@@ -23,6 +23,8 @@ STDS = 3.0
 HEIGHT_STD_M, SLOPE_STD, ROUGH_M = 1e-3, 0.03, 5e-5
 """Standard deviations before any touch: of the surface about its place, of its tilt [rad], and of what is not
 plane, unless the touches show more."""
+STILL_M = 5e-5
+"""A surface whose motion goes less than this to either side stays where it is: noise may look like 20 um."""
 FLAT_M, ALIKE = 1e-4, 1e-6
 """Points lie in one plane where they are no further off it, and their normals have such a cosine to 1."""
 

@@ -117,7 +117,7 @@ class Tip:
     """In place of contact_node: the surface is where its `off_m` says, or too early."""
 
     def __init__(self):
-        self.off_m, self.early_below_m, self.tissue_moves, self.stopped = 1e-4, 0.0, False, False
+        self.off_m, self.early_below_m, self.tissue_moves_m, self.stopped = 1e-4, 0.0, 0.0, False
         self.asked_m = []
 
     def hold(self, pose, force_n, hold, check, poll, standoff_m=math.inf):
@@ -161,8 +161,9 @@ def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_ear
             touch(55e-3)
         tip.early_below_m = 0.0
         hands.standoffs = Standoffs(Plane())
-        tip.tissue_moves = True
-        for x_m in (0.0, 5e-3):
-            touch(x_m)
-        assert tip.asked_m[-2:] == [math.inf] * 2
+        for moves_m, known in ((2e-5, True), (2e-4, False)):
+            tip.tissue_moves_m = moves_m
+            for x_m in (0.0, 5e-3):
+                touch(x_m)
+            assert math.isfinite(tip.asked_m[-1]) == known
         hands._tip = None
