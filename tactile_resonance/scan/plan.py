@@ -55,7 +55,9 @@ class Plan:
         count = self.most_points
         each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
         if near := self.near:
-            what = f"rest for the tare, and height that the surface does not ask for, at {near} points"
+            what = (
+                f"rest for the tare, and height that the surface does not ask for, at {near} points"
+            )
             why = "zero and plane are known from the point before"
             each.append(Skipped(what, why, near * (CONTACT_S - NEAR_CONTACT_S)))
         return (*self.left_out, *each)

@@ -139,7 +139,9 @@ def test_messages_of_a_measurement(session):
         for name in ("actuator", "sensor")
     )
     frf, _ = frf_from_message(last)
-    alone = frf_of_record(Spectrum.of(u, y), sample_rate_hz=50e3, harmonics=excitations[0].harmonics)
+    alone = frf_of_record(
+        Spectrum.of(u, y), sample_rate_hz=50e3, harmonics=excitations[0].harmonics
+    )
     np.testing.assert_allclose(frf.g, alone.g, rtol=1e-12)
     np.testing.assert_allclose(frf.variance_total, alone.variance_total, rtol=1e-9)
     assert (frf.periods, frf.realisations) == (5, 2)
