@@ -13,7 +13,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -229,13 +228,6 @@ def carry_out(task: tuple[str, str | float, int]) -> Outcome:
     return measure(known.library.gelatine(casting), case, seed)
 
 
-def run(output: Path, quick: bool) -> str:
-    """Measure, write ``skip_decision.md`` into `output`, and return the page."""
-    page = "\n".join(decision_lines(quick))
-    (output / "skip_decision.md").write_text(page + "\n")
-    return page
-
-
 def decision_lines(quick: bool) -> list[str]:
     """All tables, as lines of a page."""
     count, known = QUICK if quick else Count(), shared()
@@ -261,25 +253,21 @@ def decision_lines(quick: bool) -> list[str]:
     ]
     times = "vibration [ms], median | mean | 90 % | 99 % | errors | undecided | of neither |"
     return [
-        "# Vibration until a decision",
-        "",
-        "`tools/run.sh python -m benchmarks.skip_decision`. Simulated.",
-        "",
         f"`{SCENE}`: blocks of {1e3 * block_s:.1f} ms, from rest, on the bench's ten modes. Coverage is that "
         "of 95 % ellipses, with its 95 % limits; deviations are standard deviations, stated ones medians.",
         "",
-        "## One block",
+        "### One block",
         "",
         *header,
         *map(_tissue_row, TISSUES, one),
         _tissue_row(f"{TISSUES[0]}, random phases", random),
         "",
-        f"## Blocks until the standard deviation of f0 is {1e3 * STOP_STD_HZ:g} mHz",
+        f"### Blocks until the standard deviation of f0 is {1e3 * STOP_STD_HZ:g} mHz",
         "",
         *header,
         *map(_tissue_row, TISSUES, precise),
         "",
-        f"## {PERCENT[0]:g} against {PERCENT[1]:g} % gelatine at {100 * wanted.probability:g} %",
+        f"### {PERCENT[0]:g} against {PERCENT[1]:g} % gelatine at {100 * wanted.probability:g} %",
         "",
         f"{count.called} castings, half of each, that spread by {PREPARATION_PERCENT:g} % w/w; contacts "
         f"{AGES_S[0]:g} to {AGES_S[1]:g} s old; the force is off by {1e3 * FORCE_STD_N:g} mN where it is. "
@@ -301,7 +289,7 @@ def decision_lines(quick: bool) -> list[str]:
             for of, each in zip(classes, done, strict=True)
         ),
         "",
-        "## Noise alone, several blocks",
+        "### Noise alone, several blocks",
         "",
         f"{count.close} points of two gelatines {CLOSE_PERCENT:g} % w/w apart, without spread: what errors the "
         "test makes when its covariance is that of few lines and it stops when it likes.",

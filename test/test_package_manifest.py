@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 KEYS = {name: f"python3-{name}" for name in ("matplotlib", "numpy", "scipy", "tqdm", "yaml")}
-KEYS["tf2_ros"] = "tf2_ros_py"
+KEYS |= {"tf2_ros": "tf2_ros_py", "contourpy": "python3-matplotlib"}  # which depends on contourpy
 BY_PIP = {"can": "python-can", "numba": "numba", "rosbags": "rosbags", "nidaqmx": "nidaqmx"}
 BY_PIP |= {"trimesh": "trimesh"} | dict.fromkeys(("dashboard_client", "rtde_control"), "ur-rtde")
 TYPES_ONLY = {"typing_extensions"}
