@@ -59,6 +59,10 @@ AUTO = "auto"
 """What the plan chooses."""
 
 
+MOST_FORCE_N = 1.0
+"""A hundred times the preload of the method: beyond it a figure is a slip of the unit."""
+
+
 class Hold(str, Enum):
     """What contact control keeps while it is measured."""
 
@@ -267,6 +271,8 @@ class ScanScene:
 
     def __post_init__(self) -> None:
         check_above_zero(self, "force_n")
+        accepted = f"at most {MOST_FORCE_N:g}; contact control accepts less, by its limits"
+        require(self.force_n <= MOST_FORCE_N, "force_n", self.force_n, accepted)
         require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")
         if self.nominal_contact is not None:
             nominal_n = self.nominal_contact.force_n

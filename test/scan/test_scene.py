@@ -138,6 +138,7 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     [
         ({"force": 1}, r"scene.yaml: force: got 1; accepted is one of"),
         ({"force_n": -1}, "force_n: got -1.0; accepted is a number above 0"),
+        ({"force_n": 8}, "force_n: got 8.0; accepted is at most 1; contact control accepts less"),
         ({"force_n": "1 cN"}, "force_n: got '1 cN'; accepted is a finite number"),
         ({"hold": "pressure"}, "hold: got 'pressure'; accepted is one of force, indentation"),
         (
