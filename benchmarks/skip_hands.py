@@ -18,6 +18,7 @@ from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.hands import Check, Measured, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
+from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.plan import TRAVEL_M_S, make_plan
 from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import RunContent, read_run
@@ -38,6 +39,7 @@ AGE_S = 1.0
 """Of each contact, held throughout a measurement: the bench's contact does not creep here."""
 MODE_HZ = 250.0
 """Near it the mode of all tissues lies."""
+RECORD = "tactile_resonance/msg/Record"
 SAMPLE_BYTES = 2 * 4
 """Of one sample of both channels, as counts."""
 
@@ -128,6 +130,11 @@ class VirtualHands:
             self.time_s += design.block_s
             self.vibration_s += design.block_s
             self.sample_bytes += SAMPLE_BYTES * design.samples
+            counts = {
+                "actuator_counts": record.actuator.samples,
+                "sensor_counts": record.sensor.samples,
+            }
+            recording.write("/record", RECORD, time.time_ns(), to_cdr(make_message(RECORD, **counts)))
             begun_s = time.process_time()
             found = frf.add(replace(record, origin=origin), excitation)
             poles = poles_of_bands(found, design.bands)
@@ -135,8 +142,6 @@ class VirtualHands:
             measured = Measured(poles, origin, AGE_S, found.distortion)
             if enough(measured, blocks):
                 break
-        text = make_text(label)
-        recording.write("/note", "std_msgs/msg/String", time.time_ns(), text)
         return measured
 
     def retract(self) -> float:
@@ -146,13 +151,6 @@ class VirtualHands:
     def spent_s(self) -> Mapping[str, Any]:
         """The last table of the page has the phases."""
         return {}
-
-
-def make_text(text: str) -> bytes:
-    """A message that a run's file cannot be without."""
-    from tactile_resonance.scan.messages import make_message, to_cdr
-
-    return to_cdr(make_message("std_msgs/msg/String", data=text))
 
 
 @dataclass(frozen=True)
