@@ -126,7 +126,8 @@ def _read_mat(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
         target = Path(folder) / "arrays.npz"
         try:
             done = subprocess.run(
-                [sys.executable, "-c", _MAT_READER, path, target, *wanted],
+                [sys.executable, "-c", _MAT_READER, path.absolute(), target, *wanted],
+                cwd=folder,  # Python imports from there first: not from where the record may lie
                 capture_output=True,
                 text=True,
                 timeout=_MAT_WITHIN_S,

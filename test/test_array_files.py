@@ -24,6 +24,14 @@ def test_a_damaged_mat_file_does_not_end_this_process():
         read_arrays(DAMAGED, NAMES)
 
 
+def test_no_module_beside_a_mat_file_is_run(tmp_path, monkeypatch):
+    (tmp_path / "scipy.py").write_text("raise SystemExit('run from the folder of the record')")
+    scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3)})
+    monkeypatch.chdir(tmp_path)
+    arrays, _ = read_arrays(Path("a.mat"), NAMES)
+    np.testing.assert_array_equal(np.ravel(arrays["u"]), np.arange(3))
+
+
 def test_what_is_not_wanted_is_neither_read_nor_in_the_way(tmp_path):
     np.savez(tmp_path / "a.npz", u=np.arange(3), text=np.array("x"), o=np.array([{}], object))
     scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3), "text": "x", "o": {"a": 1}})
