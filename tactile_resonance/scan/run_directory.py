@@ -346,12 +346,10 @@ def _other_definitions(content: RunContent) -> list[str]:
 def _mend_index(path: Path) -> None:
     """Remove what an interruption left at the end: part of a line, or one whose file never got its name."""
     entries, index = read_entries(path), path / INDEX
-    if not entries:
-        return
-    last = next(reversed(entries))
-    if not (path / last).exists():
+    last = next(reversed(entries), None)
+    if last is not None and not (path / last).exists():
         del entries[last]
-    elif index.read_bytes().endswith(b"\n"):
+    elif not index.exists() or index.read_bytes().endswith(b"\n"):
         return
     write_entries(path, entries.values())
 

@@ -116,6 +116,16 @@ def test_what_an_interruption_left_in_the_index_is_mended(tmp_path):
     assert [(r.index, r.attempt) for r in found.results] == [(0, 0), (0, 1), (1, 0)]
 
 
+def test_half_a_first_line_does_not_swallow_the_next(tmp_path):
+    """A run of an earlier version, whose first point since was interrupted."""
+    run = recorded(tmp_path / "run", 2)
+    (run / INDEX).write_bytes(b"12345678 {half a l")
+    with RunDirectory.open(run) as again:
+        record_point(again, 0)
+    found = read_run(run)
+    assert (len(found.files), found.unchecked) == (4, 3)  # the new one is checked
+
+
 def test_checksum_is_that_of_other_tools(tmp_path):
     """The check value of CRC-32/ISO-HDLC (Williams, A painless guide to CRC error detection, 1993)."""
     (tmp_path / "file").write_bytes(b"123456789")
