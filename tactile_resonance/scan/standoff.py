@@ -44,7 +44,7 @@ class Standoffs:
 
     def add(self, point: ScanPoint, off_m: float, std_m: float) -> None:
         """Take a touch: how far above its place the surface was, and the standard deviation of that [m]."""
-        if self._plane and math.isfinite(off_m):
+        if self._plane and math.isfinite(off_m) and math.isfinite(std_m):
             self._found.append((point, off_m, std_m))
 
     def forget(self) -> None:

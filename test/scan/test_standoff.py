@@ -32,6 +32,13 @@ def test_nothing_is_known_before_the_first_touch_nor_far_from_it():
     assert known.lowest_m(point(1.1 * NEAR_M)) == math.inf
 
 
+@pytest.mark.parametrize(("off_m", "std_m"), [(math.nan, STD_M), (0.0, math.nan)])
+def test_a_touch_of_which_little_is_known_lowers_nothing(off_m, std_m):
+    known = Standoffs(FLAT)
+    known.add(point(0.0), off_m, std_m)
+    assert known.lowest_m(point(2e-3)) == math.inf
+
+
 def test_it_falls_with_each_touch_and_rises_with_the_way_and_what_is_stated():
     known = Standoffs(FLAT)
     known.add(point(0.0), 0.0, STD_M)
