@@ -137,6 +137,9 @@ class Adaptive:
         good = LEAST_POINTS <= len(kept) <= MOST_PLACES
         accepted = f"a spacing with {LEAST_POINTS} to {MOST_PLACES} places in the region"
         require(good, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places", accepted)
+        wide = _is_wide(kept, self.spacing_m)
+        accepted = "a region and a spacing with places that are not all on one line"
+        require(wide, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places on a line", accepted)
         return kept
 
     def first(self, places_m: FloatArray) -> list[int]:
@@ -146,12 +149,7 @@ class Adaptive:
     def krige(self, known: tuple[FloatArray, FloatArray, FloatArray]) -> KrigedSurface | None:
         """What `known_points` lead to; None where they are too few or on one line."""
         xy_m, f0_hz, std_hz = known
-        spread = (
-            np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=self.spacing_m / 2)
-            if len(xy_m)
-            else 0
-        )
-        if len(xy_m) < LEAST_POINTS or spread < 2:
+        if len(xy_m) < LEAST_POINTS or not _is_wide(xy_m, self.spacing_m):
             return None
         return krige(xy_m, f0_hz, std_hz, _LENGTH * self.smallest_m, self.wanted.least_std(f0_hz))
 
@@ -358,6 +356,11 @@ class _Asked:
         require(bool(size.min() > 0), "size_m", self.size_m, "numbers above 0")
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         return np.asarray(center + signs * size / 2)
+
+
+def _is_wide(xy_m: FloatArray, spacing_m: float) -> bool:
+    """Whether places (n, 2) are not all on one line."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=spacing_m / 2) == 2)
 
 
 def _spread(places_m: FloatArray, count: int) -> list[int]:

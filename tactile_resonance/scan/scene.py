@@ -35,7 +35,7 @@ from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
-from tactile_resonance.scan.patterns import flat, read_positions
+from tactile_resonance.scan.patterns import flat, read_positions, require_near
 from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.standoff import is_plane
 from tactile_resonance.scan.surface import (
@@ -345,6 +345,7 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
             asked, given["tissue_classes"], f"{where} positions.adaptive"
         )
         given["positions_m"] = flat(given["adaptive"].places_m())
+        require_near(given["positions_m"], f"{where} positions.adaptive")
     else:
         given["positions_m"] = read_positions(positions, f"{where} positions")
     if "precision" in content:

@@ -361,6 +361,8 @@ def test_the_plan_of_an_adaptive_scan(tmp_path):
         ({"boundary": {"f0_hz": 255.0, "area_m2": 0.0}}, "area_m2: got 0.0; accepted is"),
         ({"boundary": None, "tissue": {"name": "d", "area_m2": 1e-6}}, "tissue.name: got 'd'"),
         ({"boundary": None, "map": {"f0_std_hz": -1.0}}, "f0_std_hz: got -1.0"),
+        ({"size_m": [0.016, 0.0005]}, "spacing_m: got '0.001, 17 places on a line'"),
+        ({"center_m": [40.0, 0.0]}, r"accepted is within 10 m of the frame's origin"),
         ({"acquisition": "random"}, "acquisition: got 'random'; accepted is one of"),
     ],
 )
