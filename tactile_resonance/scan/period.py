@@ -40,6 +40,8 @@ NEIGHBOUR = 0.5
 """Of the lower end of a band: other modes are expected from there downwards."""
 LEFT_OF_NEIGHBOURS = 1e-6
 """Of the response of such a mode, what residual terms may leave."""
+LONGEST_S = 20.0
+"""Of a period: the time of a point is a minute."""
 
 
 def lines_of(ends_hz: tuple[float, float], spacing_hz: float, share: float = 1.0) -> int:
@@ -80,7 +82,20 @@ def shortest_samples(bands: Sequence[PoleBand], sample_rate_hz: float, share: fl
     sample_rate_hz : float
     share : float
         Of the lines that are excited.
+
+    Raises
+    ------
+    ValueError
+        If a band is so narrow that the period would be longer than `LONGEST_S`.
     """
+    for band in bands:
+        width_hz = band.high_hz - band.low_hz
+        least_hz = lines_wanted(band) / share / LONGEST_S
+        if width_hz < least_hz:
+            raise ValueError(
+                f"sensor.band: got {band.low_hz:g} to {band.high_hz:g} Hz with samples_per_period auto; "
+                f"accepted is {least_hz:.2g} Hz wide or more, for a period of {LONGEST_S:g} s at most"
+            )
     fewest = max(
         int((lines_wanted(band) / share - 1) * sample_rate_hz / (band.high_hz - band.low_hz))
         for band in bands

@@ -98,11 +98,16 @@ def read_run(path: Path) -> RunContent:
     ValueError
         If it is no run.
     """
+    try:
+        listed = sorted((Path(path) / RECORDING).iterdir())
+    except OSError as error:
+        raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
+    names = {
+        f"{RECORDING}/{file.name}": file for file in listed if file.suffix not in (".yaml", ".part")
+    }
+    # after the names: each has its point in the plan and its line before
     run = read_plan(path)
-    folder = run.path / RECORDING
-    paths = [file for file in sorted(folder.iterdir()) if file.suffix not in (".yaml", ".part")]
-    names = {f"{RECORDING}/{file.name}": file for file in paths}
-    entries = read_entries(run.path)  # after the names: each has its line before
+    entries = read_entries(run.path)
     problems, files, results = _missing(run.path, entries), [], []
     scene = entries.get(SCENE)
     if scene is not None and (damage := scene.damage(run.path / SCENE)):
@@ -142,14 +147,15 @@ def _checked(
 ) -> tuple[FileContent | None, PointResult | None, str]:
     """What a file holds, its result, and what is wrong with it."""
     try:
-        damage = "" if entry is None else entry.damage(path)
-        if entry is None or not damage and entry.result is None:
+        if entry is not None and (damage := entry.damage(path)):
+            return None, None, f"{path.name}: {damage}"
+        result = None if entry is None else entry.result
+        if entry is None or result is None:
             return *_read_file(path, len(run.points)), ""
+        match = _POINT.fullmatch(path.name)
+        return entry.content, None if match is None else _named(result, match, len(run.points)), ""
     except (OSError, ValueError) as error:
         return None, None, str(error)
-    if damage:
-        return None, None, f"{path.name}: {damage}"
-    return entry.content, entry.result if _POINT.fullmatch(path.name) else None, ""
 
 
 def _in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
@@ -195,7 +201,12 @@ def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None
     found = [from_message(message) for _, _, message in read_messages(path, f"/{TOPIC}")]
     if len(found) != 1:
         raise ValueError(f"{path.name}: {len(found)} results, expected one")
-    named = (int(match[1]), int(match[2]))
-    if (found[0].index, found[0].attempt) != named or found[0].index >= points:
-        raise ValueError(f"{path.name}: holds point and attempt {found[0].index, found[0].attempt}")
-    return content, found[0]
+    return content, _named(found[0], match, points)
+
+
+def _named(result: PointResult, match: re.Match[str], points: int) -> PointResult:
+    """The result, which must be that of its file's name."""
+    own = (result.index, result.attempt)
+    if own != (int(match[1]), int(match[2])) or result.index >= points:
+        raise ValueError(f"{match[0]}: holds point and attempt {own}")
+    return result

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from typing import Any
 
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from rosbags.serde import SerdeError
 
 from tactile_resonance.files import write_whole
 from tactile_resonance.scan.messages import definition_and_hash, message_types
@@ -29,6 +31,7 @@ from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
 
 INDEX = "index.jsonl"
 _PART_BYTES = 1 << 20
+_NAME = re.compile(r"(?:recording/)?([\w-]{1,200}\.(?:mcap|yaml))")
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,15 @@ class Entry:
 
     @property
     def result(self) -> PointResult | None:
-        """Of the message; None where there is none, or its definition is not that of today."""
+        """Of the message; None where there is none that can be read by the definition of today."""
         topics = self.content.topics if self.content else ()
         today = definition_and_hash(TYPE)[1]
         if not any((topic.type_name, topic.type_hash) == (TYPE, today) for topic in topics):
             return None
-        return from_message(message_types().deserialize_cdr(self.message, TYPE))
+        try:
+            return from_message(message_types().deserialize_cdr(self.message, TYPE))
+        except (SerdeError, ValueError):
+            return None
 
     def damage(self, path: Path) -> str:
         """What of a file is not as it was when it was finished; empty: nothing."""
@@ -120,7 +126,7 @@ def read_entries(run: Path) -> dict[str, Entry]:
             continue
         try:
             entry = _entry(json.loads(text))
-        except (ValueError, TypeError, KeyError):  # fields of another version
+        except (ValueError, TypeError, KeyError, AttributeError):  # of another version, or anyone's
             continue
         entries.pop(entry.name, None)
         entries[entry.name] = entry
@@ -141,12 +147,22 @@ def _line(entry: Entry) -> bytes:
 
 
 def _entry(fields: Mapping[str, Any]) -> Entry:
+    match = _NAME.fullmatch(fields["name"])
+    if match is None:
+        raise ValueError(f"name: {fields['name']!r}")
     content = None
     if "content" in fields:
-        name, start_ns, end_ns, topics = fields["content"]
-        content = FileContent(name, start_ns, end_ns, tuple(_topic(*topic) for topic in topics))
+        _, start_ns, end_ns, topics = fields["content"]
+        times_ns = _whole(start_ns), _whole(end_ns)
+        content = FileContent(match[1], *times_ns, tuple(_topic(*topic) for topic in topics))
     message = base64.b64decode(fields.get("point_result", ""))
-    return Entry(fields["name"], fields["size"], fields["crc32"], content, message)
+    return Entry(fields["name"], _whole(fields["size"]), _whole(fields["crc32"]), content, message)
+
+
+def _whole(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 1 << 64:
+        raise ValueError(f"no whole number: {value!r}")
+    return value
 
 
 def _qos_text(qos: Qos | None) -> str:
@@ -155,5 +171,7 @@ def _qos_text(qos: Qos | None) -> str:
 
 @cache
 def _topic(name: str, type_name: str, type_hash: str, qos: str, count: int) -> TopicContent:
+    if not all(isinstance(text, str) for text in (name, type_name, type_hash)):
+        raise TypeError("topic: no texts")
     offered = next(iter(parse_qos(json.loads(qos))), None)
-    return topic_content(name, type_name, type_hash, offered, count)
+    return topic_content(name, type_name, type_hash, offered, _whole(count))

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run knows when one of its files is damaged, and its index never stands in the way."""
 
+import base64
+import json
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +127,59 @@ def test_half_a_first_line_does_not_swallow_the_next(tmp_path):
         record_point(again, 0)
     found = read_run(run)
     assert (len(found.files), found.unchecked) == (4, 3)  # the new one is checked
+
+
+JUNK = (None, -1, 2**70, 0.5, True, "x", "a" * 5000, "../../x.mcap", [], [1], {}, {"name": 1})
+
+
+def lines_of(run):
+    """JSON of an index."""
+    return [json.loads(line.partition(b" ")[2]) for line in (run / INDEX).read_bytes().splitlines()]
+
+
+def places(value, way=()):
+    """Ways to all that JSON holds."""
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, each in items:
+        yield (*way, key)
+        if isinstance(each, (dict, list)):
+            yield from places(each, (*way, key))
+
+
+def write_lines(run, lines):
+    texts = [json.dumps(line).encode() for line in lines]
+    (run / INDEX).write_bytes(b"".join(b"%08x %s\n" % (zlib.crc32(t), t) for t in texts))
+
+
+def test_an_index_that_anyone_wrote_with_good_checksums_stops_nobody(tmp_path):
+    """What a line says wrongly is a problem by name, or its file is read in its place."""
+    run = recorded(tmp_path / "run", 1)
+    lines, whole = lines_of(run), read_run(run)
+    for way in places(lines):
+        for junk in JUNK:
+            changed = json.loads(json.dumps(lines))
+            at = changed
+            for key in way[:-1]:
+                at = at[key]
+            at[way[-1]] = junk
+            write_lines(run, changed)
+            found = read_run(run)
+            assert len(found.results) == 1 or found.problems
+            assert len(list(recorded_results(found))) == len(found.files)
+    cdr = base64.b64decode(lines[-1]["point_result"])
+    for cut in (0, 1, len(cdr) // 2, len(cdr) - 1):
+        lines[-1]["point_result"] = base64.b64encode(cdr[:cut]).decode()
+        write_lines(run, lines)
+        assert_all_same(read_run(run).results, whole.results)
+
+
+def test_a_result_of_another_point_in_the_index_is_named(tmp_path):
+    run = recorded(tmp_path / "run", 2)
+    lines = lines_of(run)
+    lines[-1]["point_result"] = lines[-2]["point_result"]
+    write_lines(run, lines)
+    (problem,) = read_run(run).problems
+    assert problem == "point-00001-00.mcap: holds point and attempt (0, 0)"
 
 
 def test_checksum_is_that_of_other_tools(tmp_path):
