@@ -139,6 +139,10 @@ class SensorUse:
         check_within(self, samples_per_period=(4, 10**8))
         low, high = self.band_low_hz, self.band_high_hz
         require(high > low, "band_high_hz", high, f"above band_low_hz = {low:g}")
+        needed = self.bands[0].residual_terms
+        accepted = f"a narrower band with samples_per_period auto: residual terms {needed} of up to 20"
+        if self.residual_terms is None:
+            require(needed <= 20, "band_low_hz, band_high_hz", [low, high], accepted)
         for band in self.bands:
             require(band.order in range(21), "order", band.order, "0 (the data choose) to 20")
             terms = band.residual_terms

@@ -117,6 +117,22 @@ def test_a_scene_that_leaves_it_to_the_plan():
     assert given.blocks == BlockLimits(2, 4)
 
 
+@pytest.mark.parametrize("width_hz", [1.0, 1e-3, 1e-9])
+def test_a_band_too_narrow_for_a_period_is_refused_at_once(width_hz):
+    scene = read_scan_scene(SCENE)
+    use = replace(scene.sensor, band_high_hz=200.0 + width_hz)
+    with pytest.raises(
+        ValueError, match=r"^sensor.band: got 200 to .* with samples_per_period auto"
+    ):
+        design_measurement(replace(scene, sensor=replace(use, residual_terms=15)))
+
+
+def test_a_band_too_wide_for_residual_terms_is_named():
+    scene = read_scan_scene(SCENE)
+    with pytest.raises(ValueError, match=r"^band_low_hz, band_high_hz: got \[50.0, 620.0\]"):
+        replace(scene.sensor, band_low_hz=50.0)
+
+
 def test_what_the_scene_says_stays():
     scene = read_scan_scene(SCENE)
     usual = replace(scene, sensor=replace(scene.sensor, samples_per_period=20_000))
@@ -155,7 +171,7 @@ def test_the_plan_says_who_chose_and_which_hum_it_cannot_tell():
         ({"samples_per_period": 2e4}, "samples_per_period: got 20000.0; accepted is an integer"),
         (
             {"samples_per_period": "auto", "band_low_hz": 20.0, "band_high_hz": 9000.0},
-            "residual_terms: got .*; accepted is 1 to 20",
+            "accepted is a narrower band with samples_per_period auto: residual terms 208 of up to 20",
         ),
     ],
 )
