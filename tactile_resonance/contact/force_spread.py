@@ -22,6 +22,9 @@ SHORT_S = 0.02
 LEAST_SHORT = 8
 """Fewer of them say nothing about a spread."""
 
+SHORTEST_S = LEAST_SHORT * SHORT_S
+"""Of an interval whose spread can be known [s]."""
+
 LEAST_KNOWN = 0.8
 """Of the blocks of a measurement, in time, whose spread must be known."""
 

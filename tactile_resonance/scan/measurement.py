@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from tactile_resonance.contact.force_spread import SHORTEST_S
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Separate
@@ -119,9 +120,17 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     distortion = Output.DISTORTION in outputs
     share = ODD_RANDOM_SHARE if distortion else 1.0
     samples, margin = use.samples_per_period, MARGIN_LINES
+    least_s = (
+        0.0 if scene.gate is None else SHORTEST_S
+    )  # a gate judges how the force of a block moved
     if samples is None:
-        samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share), 0
+        samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share, least_s), 0
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
+    if block_s < least_s:
+        raise ValueError(
+            f"sensor.samples_per_period: got {samples}, {block_s:.3g} s; accepted with a gate is {least_s:g} s "
+            "or more: of less it is not known how the force moved"
+        )
     blocks = scene.blocks or _default_blocks(scene, block_s)
     narrow = not distortion and Output.FRF not in outputs
     stretches_hz = _stretches(use.bands, margin * spacing_hz, top_hz) if narrow else whole_hz

@@ -73,7 +73,9 @@ def lines_wanted(band: PoleBand) -> int:
     return math.ceil(coefficients / 2) + FREE_LINES
 
 
-def shortest_samples(bands: Sequence[PoleBand], sample_rate_hz: float, share: float = 1.0) -> int:
+def shortest_samples(
+    bands: Sequence[PoleBand], sample_rate_hz: float, share: float = 1.0, least_s: float = 0.0
+) -> int:
     """Samples of the shortest period with enough lines in each band, and away from the mains where that can be.
 
     Parameters
@@ -82,6 +84,8 @@ def shortest_samples(bands: Sequence[PoleBand], sample_rate_hz: float, share: fl
     sample_rate_hz : float
     share : float
         Of the lines that are excited.
+    least_s : float
+        Of the period.
 
     Raises
     ------
@@ -100,6 +104,7 @@ def shortest_samples(bands: Sequence[PoleBand], sample_rate_hz: float, share: fl
         int((lines_wanted(band) / share - 1) * sample_rate_hz / (band.high_hz - band.low_hz))
         for band in bands
     )
+    fewest = max(fewest, math.ceil(least_s * sample_rate_hz))
     while not _enough(bands, sample_rate_hz / fewest, share):
         fewest += 1
     tried = [

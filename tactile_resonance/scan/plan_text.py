@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_resonance.contact.force_spread import SHORTEST_S
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.measurement import MeasurementDesign, design_measurement
@@ -116,10 +117,11 @@ def _period(plan: Plan) -> str:
     design = plan.measurement
     if plan.scene.sensor.samples_per_period is not None:
         return "as the scene says"
+    gated = f", and at least {SHORTEST_S:g} s for the gate"
     needed = max(design.bands, key=lambda band: lines_wanted(band) / (band.high_hz - band.low_hz))
     return (
         f"the shortest with {lines_wanted(needed)} lines from {needed.low_hz:g} to {needed.high_hz:g} Hz, as "
-        "many as one block takes for its model and noise"
+        f"many as one block takes for its model and noise{'' if plan.scene.gate is None else gated}"
     )
 
 

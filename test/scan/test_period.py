@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.force_spread import spread_of
 from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
@@ -25,7 +26,7 @@ from tactile_resonance.scan.period import (
 )
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_rows
-from tactile_resonance.scan.scene import Output, parse_scan_scene, read_scan_scene
+from tactile_resonance.scan.scene import Gate, Output, parse_scan_scene, read_scan_scene
 
 SCENE = share_path("config/scenes/two_gelatines.yaml")
 
@@ -131,6 +132,21 @@ def test_a_band_too_wide_for_residual_terms_is_named():
     scene = read_scan_scene(SCENE)
     with pytest.raises(ValueError, match=r"^band_low_hz, band_high_hz: got \[50.0, 620.0\]"):
         replace(scene.sensor, band_low_hz=50.0)
+
+
+def test_a_gate_takes_blocks_whose_force_has_a_spread():
+    """`force_spread` knows none of less than 0.15 s: every point would fail."""
+    scene = replace(read_scan_scene(SCENE), gate=Gate(1e-3))
+    design = design_measurement(scene)
+    assert 0.16 <= design.block_s <= LONGER * 0.16
+    time_s = np.arange(0.0, design.block_s, 2e-3)
+    assert np.isfinite(spread_of(time_s, np.full(time_s.size, 0.01), design.block_s).rms_n)
+    assert dict(plan_rows(make_plan(scene)))["period"].endswith("at least 0.16 s for the gate")
+    short = replace(scene, sensor=replace(scene.sensor, samples_per_period=5000))
+    with pytest.raises(
+        ValueError, match=r"samples_per_period: got 5000, 0.1 s; accepted with a gate"
+    ):
+        design_measurement(short)
 
 
 def test_what_the_scene_says_stays():
