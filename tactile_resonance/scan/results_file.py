@@ -51,7 +51,7 @@ class ResultsFile:
             Of all points, by index, with this one.
         """
         wider = len(result.further) > self._further or len(result.distortion) > self._distortion
-        if wider or result.index <= self._last:
+        if wider or result.index <= self._last or not self._path.exists():
             self._write(latest)
             return
         with self._path.open("a", encoding="utf-8", newline="") as file:

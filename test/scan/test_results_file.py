@@ -25,6 +25,14 @@ def test_a_file_that_grows_is_the_table_of_the_latest_attempts(tmp_path):
         assert (tmp_path / "results.csv").read_text() == as_csv(in_order)
 
 
+def test_a_file_that_is_taken_away_in_mid_scan_comes_back_whole(tmp_path):
+    grown, both = ResultsFile(tmp_path), [result(0), result(1)]
+    grown.add(both[0], both[:1])
+    (tmp_path / "results.csv").unlink()
+    grown.add(both[1], both)
+    assert (tmp_path / "results.csv").read_text() == as_csv(both)
+
+
 def test_a_text_is_no_formula_and_a_number_stays_one():
     given = replace(result(0), reason="=1+1", label="@x", notes="-1", f0_hz=-1.5)
     head, row = csv.reader(as_csv([given]).splitlines())
