@@ -291,19 +291,25 @@ def _one_by_one(case: Case, asked: Adaptive | None, whole_s: float, short_s: flo
 
 
 def _draw(found: Mapping[str, tuple[Scanned, Scanned]]) -> Figure:
-    """Time of each scan, exhaustive and planned: vibration, and the rest."""
-    figure = new_figure(10, 5)
-    figure.suptitle(f"time of a scan ({SIMULATED})")
-    axes = figure.subplots()
-    for k, of in enumerate(zip(*found.values(), strict=True)):
-        at = np.arange(len(of)) + 0.4 * (k - 0.5)
-        vibration_s = np.array([each.hands.vibration_s for each in of])
-        rest_s = np.array([each.hands.time_s for each in of]) - vibration_s
-        name = ("exhaustive", "planned")[k]
-        axes.bar(at, vibration_s, 0.38, color=f"C{k}", label=f"{name}: vibration")
-        label = f"{name}: touches and ways"
-        axes.bar(at, rest_s, 0.38, bottom=vibration_s, color=f"C{k}", alpha=0.4, label=label)
-    axes.set_xticks(range(len(found)), [name.replace(", ", ",\n") for name in found], rotation=20)
-    axes.set(ylabel="time [s]", yscale="log")
-    axes.legend()
+    """Vibration of a touch, touches and time of each scan, exhaustive and planned."""
+    figure = new_figure(13, 5)
+    figure.suptitle(f"what a scan takes ({SIMULATED})")
+    panels = {
+        "vibration of a touch [ms]": lambda hands: 1e3 * hands.vibration_s / hands.touches,
+        "touches": lambda hands: hands.touches,
+        "time of the scan [s]": lambda hands: hands.time_s,
+    }
+    for axes, (label, value) in zip(
+        figure.subplots(1, 3, sharey=True), panels.items(), strict=True
+    ):
+        for k, (name, of) in enumerate(
+            zip(("exhaustive", "planned"), zip(*found.values(), strict=True), strict=True)
+        ):
+            values = [value(each.hands) for each in of]
+            bars = axes.barh(np.arange(len(of)) + 0.4 * (k - 0.5), values, 0.38, label=name)
+            axes.bar_label(bars, fmt="%.3g", padding=3, fontsize=8)
+        axes.set(xlabel=label, xscale="log", xlim=(1, 3e4 if "ms" in label else 3e3))
+    figure.axes[0].set_yticks(range(len(found)), list(found))
+    figure.axes[0].invert_yaxis()
+    figure.axes[2].legend(loc="lower right")
     return figure
