@@ -84,12 +84,12 @@ class Plan:
             return 0
         return sum(map(is_along, self.first_points, self.first_points[1:]))
 
-    @property
+    @cached_property
     def shortest_s(self) -> float:
         """With the fewest points and blocks [s]."""
         return self.duration_s(self.measurement.blocks.least, len(self.first_points))
 
-    @property
+    @cached_property
     def longest_s(self) -> float:
         """With the most [s]."""
         return self.duration_s(self.measurement.blocks.most)
