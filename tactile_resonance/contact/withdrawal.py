@@ -14,13 +14,14 @@ import math
 from statistics import mean, stdev
 
 from tactile_resonance.contact.envelope import Place
-from tactile_resonance.contact.free_motion import FreeMotion
+from tactile_resonance.contact.free_motion import STILL_M_S, FreeMotion
 from tactile_resonance.contact.goal import Move, State, failed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M
+from tactile_resonance.contact.vectors import dot
 
 BLIND_CAUSES = frozenset({Cause.FORCE_STALE, Cause.FORCE_SOURCE})
 """After these, and after a bad force, the source is not believed: the tip is drawn back by position alone."""
@@ -116,7 +117,8 @@ class Withdrawal:
         force_n = watch.force_n[2]
         self._smooth_n += (force_n - self._smooth_n) * -math.expm1(-p.period_s / SMOOTH_S)
         clear_m = self._free.clear_m
-        if self._step is None and clear_m - place.height_m >= ARRIVED_M:
+        coasts = dot(self._free.path.normal, arm.velocity[:3]) > STILL_M_S
+        if self._step is None and (clear_m - place.height_m >= ARRIVED_M or coasts):
             most_m_s = self._speed(place.height_m) if believed else p.retract_speed_m_s
             if most_m_s is None:
                 return self._held(place.height_m)
