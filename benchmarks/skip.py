@@ -172,7 +172,7 @@ def _cases(quick: bool) -> dict[str, Case]:
 
 
 def _brain() -> Content:
-    """Three tissues side by side; white matter and tumour are to be told apart."""
+    """Three tissues side by side; each pole is to be known to 50 mHz."""
     places = {"cortex": (-0.03, 0.0), "white": (0.0, 0.0), "tumour": (0.03, 0.0)}
     offsets = [[0.003 * k, 0.003 * j] for k, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return {

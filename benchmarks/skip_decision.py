@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long two tissues must be vibrated to be told apart, how often that goes wrong, what ellipses are worth.
+"""Vibration until two tissues are distinguished, errors of that decision, coverage of the ellipses.
 
 All of it on the simulated bench with its ten modes, from rest, block by block until the decision, of the period
 that the plan chooses, by the code that frf_node, poles_node and scan_node run: `tools/run.sh python -m
@@ -55,7 +55,7 @@ FORCE_STD_N = 1.5e-4
 AGES_S = (0.3, 2.0)
 """Of the contact when the first block begins: anywhere between."""
 CLOSE_PERCENT = 0.06
-"""Between two gelatines [% w/w] that noise alone keeps from being told apart after one block."""
+"""Between two gelatines [% w/w] that one block seldom distinguishes, for its noise alone."""
 STOP_STD_HZ = 0.02
 """Of f0, that ends a measurement for its precision."""
 TISSUES = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver", "tumour")

@@ -16,7 +16,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.hands import Check, Measured, Touch
+from tactile_resonance.scan.hands import Check, Measured, PointFailed, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.plan import TRAVEL_M_S, make_plan
@@ -100,7 +100,7 @@ class VirtualHands:
 
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
         """Surfaces are known here."""
-        raise NotImplementedError
+        raise PointFailed("find: surfaces are known here")
 
     def measure(
         self,
