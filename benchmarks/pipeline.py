@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the last sample of a block to the poles of all blocks so far, stage by stage.
 
-The nodes run as processes of their own on the simulated bench in real time. Stages are told apart by when each
-message was handed to the middleware, which it carries; transport is in the stage of the node that receives.
+The nodes run as processes of their own on the simulated bench in real time. Stages are distinguished by when
+each message was handed to the middleware, which it carries; transport is in the stage of the node that
+receives.
 """
 
 from __future__ import annotations
