@@ -27,6 +27,7 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
+from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 
 FloatArray = npt.NDArray[np.float64]
@@ -115,6 +116,10 @@ class LinesPlan:
         if self.structure.delay:
             return self._fit_dense(data)
         solution = minimise(self.problem, data)
+        if self.structure.order >= SEVERAL_MODES:
+            solution = best_of_split(
+                self.problem, data, self.model_of(solution.theta[:, 0]), solution
+            )
         inverse, condition = likelihood.invert(solution.normal[:, 0, 1])
         theta, cost, converged = solution.theta[:, 0], solution.cost, solution.converged
         residual, parameters = solution.residual[:, 0], 0.5 * inverse

@@ -63,13 +63,23 @@ def significant_modes(
     found[rows] &= ~(distance < limit[:, None])
     if modes > 1:
         for k, row in enumerate(rows):
-            here = there[row]
-            if not found[row].any() and here.sum() > 1:
-                # neighbours nearer than their widths: neither is certain alone, both together are
-                found[row] = here & _significant_together(
-                    residues[row, here], sensitivity[k, here], coefficients[row], int(lines[row])
+            if found[row].any():
+                continue
+            for near in _neighbours(poles[row], there[row]):
+                # nearer than their widths: neither is certain alone, both together are
+                found[row, near] = _significant_together(
+                    residues[row, near], sensitivity[k, near], coefficients[row], int(lines[row])
                 )
     return found
+
+
+def _neighbours(poles: ComplexArray, there: BoolArray) -> list[npt.NDArray[np.int64]]:
+    """Places of two or more poles (k,) each, in ascending order, that are nearer than their widths."""
+    places = np.flatnonzero(there)
+    width = np.abs(poles[places].real)
+    far = np.abs(np.diff(poles[places])) >= width[:-1] + width[1:]
+    groups = np.split(places, np.flatnonzero(far) + 1)
+    return [group for group in groups if group.size > 1]
 
 
 def squared_distance(values: ComplexArray, covariance: FloatArray) -> FloatArray:

@@ -87,6 +87,42 @@ def test_two_modes_a_thousandth_apart(damping_ratio):
     assert_exact(identify_frf(frf(f, g), None, ModelStructure(4, 4)), pair, [damping_ratio] * 2)
 
 
+PAIR_HZ = np.array([250.0, 252.5])  # one half width apart
+
+
+def test_noise_does_not_hide_one_of_two_modes_a_half_width_apart():
+    """20 dB, where the bound of both is .3 Hz: few fits stay where one mode stands for both."""
+    f = np.linspace(220, 290, 121)
+    g = modal(f, PAIR_HZ, [0.01] * 2, [0.02, 0.026])
+    variance = 1e-2 * np.mean(np.abs(g) ** 2)
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((60, f.size, 2)).view(complex)[..., 0] * np.sqrt(variance / 2)
+    given = frf(f, g + noise, variance_noise=np.full((60, f.size), variance), noise_dof=1000)
+    batch = identify_batch(given, None, ModelStructure(4, 4))
+    least = np.sum(np.abs(noise) ** 2, axis=-1) / variance  # what the true poles cost
+    assert np.mean(batch.cost < least) >= 0.9
+    both = batch.has_status(PolesStatus.OK) & batch.significant.all(axis=-1)
+    assert both.sum() >= 30
+    std = np.sqrt(np.diagonal(batch.covariance, axis1=-2, axis2=-1))[both, :, 0]
+    assert np.all(np.abs(batch.f0_hz[both] - PAIR_HZ) < 6 * std)
+
+
+def test_modes_apart_are_significant_each_for_itself():
+    """Six modes under noise as strong as they: none is taken for certain because of the others."""
+    f0_hz = 100 + 20.0 * np.arange(6)
+    f = np.linspace(80, 220, 288)
+    g = modal(f, f0_hz, [0.02] * 6, [0.04] * 6)
+    variance = np.mean(np.abs(g) ** 2)
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((40, f.size, 2)).view(complex)[..., 0] * np.sqrt(variance / 2)
+    given = frf(f, g + noise, variance_noise=np.full((40, f.size), variance), noise_dof=1000)
+    batch = identify_batch(given, None, ModelStructure(12, 12))
+    sure = batch.significant & batch.has_status(PolesStatus.OK)[:, None]
+    std = np.sqrt(batch.covariance[..., 0, 0])
+    far = np.abs(batch.f0_hz[..., None] - f0_hz).min(axis=-1) > 6 * std
+    assert np.sum(sure & far) <= 1
+
+
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
 def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)

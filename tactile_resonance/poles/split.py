@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Another start for models of several modes: the highest peak split in two.
+
+Two modes nearer than their widths look like one. A fit that begins with one of its modes elsewhere stays
+there: the cost has a minimum with a single mode for both, and the other one fits noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.poles.bins import BinData, Problem
+from tactile_resonance.poles.fit import MAX_ITERATIONS, Linearised, Solution, minimise
+from tactile_resonance.poles.model import RationalModel
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+SEVERAL_MODES = 4
+"""Order from which on a model has more than one mode."""
+
+APART = 0.7
+"""Natural frequencies of the two, from that of the one, over its half width."""
+
+
+def best_of_split(
+    problem: Problem,
+    data: BinData,
+    model: RationalModel,
+    solution: Solution,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Solution:
+    """The solution, or that from a start with its highest peak split, whichever costs less.
+
+    Parameters
+    ----------
+    problem : Problem
+    data : BinData
+    model : RationalModel
+        Of the solution, one a point.
+    solution : Solution
+        Of a denominator of order 4 or more.
+    max_iterations : int
+    """
+    start, there = _split_starts(problem, data, model)
+    rows = np.flatnonzero(there)
+    if not rows.size:
+        return solution
+    again = minimise(problem, data.rows(rows), start[rows], max_iterations)
+    better = again.converged & (
+        ~solution.converged[rows] | (again.cost < solution.cost[rows] * (1 - 1e-9))
+    )
+    best = Solution(*(getattr(solution, f.name).copy() for f in fields(Solution)))
+    for name in (f.name for f in fields(Solution)):
+        getattr(best, name)[rows[better]] = getattr(again, name)[better]
+    return best
+
+
+@np.errstate(all="ignore")
+def _split_starts(
+    problem: Problem, data: BinData, model: RationalModel
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """(points, M, n) coefficients, and for which points there are such."""
+    a, b, own = problem.sizes
+    shared, records = a + b, data.records
+    poles = model.poles_rad_s()  # (points, a)
+    start = np.full((len(poles), records, shared + own), np.nan)
+    for k, of_point in enumerate(poles):
+        above = of_point[of_point.imag > 0]
+        if above.size < 2:
+            continue
+        height = np.abs(model.at((k,)).residues(above)) / np.abs(above.real)
+        if not np.isfinite(height).all():
+            continue
+        highest, least = above[np.argmax(height)], above[np.argmin(height)]
+        step = 1j * APART * abs(highest.real)
+        kept = [p for p in of_point if p.imag <= 0 or p not in (highest, least)]
+        kept = [p for p in kept if np.conj(p) not in (highest, least)]
+        pair = np.array([highest + step, highest - step])
+        roots = model.variable.of_s(np.concatenate([kept, pair, pair.conj()]))
+        if roots.size != a:
+            continue
+        start[k] = _coefficients(problem, data.rows(slice(k, k + 1)), model, roots)
+    return start, np.isfinite(start).all(axis=(1, 2))
+
+
+def _coefficients(
+    problem: Problem, data: BinData, model: RationalModel, roots: ComplexArray
+) -> FloatArray:
+    """(M, n) with these roots of A, and the B and C that fit best."""
+    a, b, own = problem.sizes
+    shared, records = a + b, data.records
+    basis, hessenberg = problem.denominator, model.denominator_basis.hessenberg
+    x = hessenberg[0, 0] + hessenberg[1, 0] * basis[:, 1]  # (K,) of the bins: x p_0 of the basis
+    values = np.prod(x[:, None] - roots, axis=-1)
+    values /= np.linalg.norm(values)
+    denominator = np.linalg.lstsq(
+        np.concatenate([basis.real, basis.imag]), np.concatenate([values.real, values.imag]), rcond=None
+    )[0]
+    theta = np.zeros(shared + records * own)
+    theta[:a] = denominator[:-1] / denominator[-1]
+    linear = Linearised.of(problem, data, theta)
+    weight = 1 / np.sqrt(linear.variance)[..., None]
+    columns = (linear.slope[..., a:] * weight).reshape(-1, theta.size - a)
+    error = (linear.error[..., None] * weight).ravel()
+    rows = np.concatenate([columns.real, columns.imag])
+    found = np.linalg.lstsq(rows, np.concatenate([error.real, error.imag]), rcond=None)[0]
+    out = np.empty((records, shared + own))
+    out[:, :a], out[:, a:shared] = theta[:a], found[:b]
+    out[:, shared:] = found[b:].reshape(records, own)
+    return out
