@@ -3,7 +3,7 @@
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test load jazzy lint setup lock clean
+.PHONY: help demo test load bench jazzy lint setup lock clean
 
 help: ## Show this list
 	@echo "make TARGET [ARGS='...'] [PYTHON=python3.x]"
@@ -17,6 +17,10 @@ test: setup ## Run all tests; ARGS go to pytest (--cov: with coverage)
 
 load: setup ## Run the demonstration beside other work and on the wall clock; refuse where a result differs
 	@tools/run.sh tactile_resonance benchmark load $(ARGS)
+
+bench: setup ## Run the quick form of every benchmark into build/benchmarks, and renew docs/benchmarks/README.md
+	@tools/run.sh tactile_resonance benchmark --quick --output build/benchmarks $(ARGS)
+	@tools/run.sh tactile_resonance benchmark overview
 
 jazzy: export TACTILE_ROS = jazzy
 jazzy: ## Set up ROS 2 Jazzy beside it; run the nodes' tests and a scan of two points on it

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First contact told by the resonance and by the load cell, on the same approaches; simulated.
+"""First contact detected by the resonance and by the load cell, on the same approaches; simulated.
 
 The beam comes down on tissue at a constant speed while it is driven at one line near its resonance. The
 contact changes in steps of 2 ms; between them the response is exact, and the state is carried over.
