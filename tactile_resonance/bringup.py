@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.fields import numbers, read_text, require
+from tactile_resonance.fields import cut, numbers, read_text, require
 from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.simulation.plant.defaults import HOST, STALLS_S, TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
@@ -105,7 +105,7 @@ def read_parameter_file(path: str | Path) -> dict[str, Parameters]:
         for name, parameters in _sections(loader, loader.get_single_node(), ""):
             sections.setdefault(name, {}).update(parameters)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"params_file: {path}: {error}") from error
+        raise ValueError(f"params_file: {path}: {cut(str(error))}") from error
     return sections
 
 

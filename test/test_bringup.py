@@ -312,8 +312,9 @@ def test_the_file_is_heard_as_by_rclpy(tmp_path, name):
 def test_what_is_no_parameter_file_is_refused_by_name(tmp_path, text):
     path = tmp_path / "file.yaml"
     path.write_text(text)
-    with pytest.raises(ValueError, match=f"params_file: {path}: "):
+    with pytest.raises(ValueError, match=f"params_file: {path}: ") as error:
         read_parameter_file(path)
+    assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="params_file: absent.yaml: "):
         read_parameter_file("absent.yaml")
 

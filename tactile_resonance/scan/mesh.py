@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,13 +125,22 @@ def read_stl(path: Path) -> FloatArray:
     except ImportError as error:
         need = "trimesh, which reads STL: pip install trimesh"
         raise ValueError(f"file: got {path.name!r}; accepted with {need}") from error
+    log = logging.getLogger("trimesh")
     try:
+        log.addFilter(_nothing)  # with a damaged file it writes tracebacks to stderr
         mesh = trimesh.load_mesh(path, file_type="stl", process=False)
     except Exception as error:  # whatever its readers meet in a damaged file
         raise ValueError(f"file: {path} cannot be read as STL ({cut(str(error))})") from error
+    finally:
+        log.removeFilter(_nothing)
     corners = np.asarray(mesh.triangles, float)
     require(len(corners) > 0, "file", str(path), "STL, binary or text, with a triangle or more")
     return corners
+
+
+def _nothing(_: logging.LogRecord) -> bool:
+    """Of a filter: no record passes."""
+    return False
 
 
 def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:

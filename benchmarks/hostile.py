@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile inputs to all readers: each is read, or refused in one line, within five seconds.
+
+Inputs are whole examples, changed at random: bits, bytes, numbers, pieces left out, doubled or taken from
+elsewhere. An input whose answer is new becomes an example too, so that what was reached is gone on from.
+An answer is wrong if it is an exception that is neither ``ValueError`` nor ``OSError``, or of more than one
+line, if it takes too long, needs more memory than allowed, or ends the process.
+"""
+
+from __future__ import annotations
+
+import mmap
+import multiprocessing
+import os
+import re
+import resource
+import signal
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.hostile_targets import Target, targets
+
+INPUTS, QUICK_INPUTS = 1_000_000, 5_000
+WITHIN_S = 5.0
+MEMORY_BYTES = 6 << 30
+TOO_LONG, REPEATS = f"no answer within {WITHIN_S:g} s", 2
+LONGEST_LINE = 1200
+LONGEST_INPUT = 1 << 16
+MOST_EXAMPLES = 300
+SEED = 1
+NUMBERS = tuple(b"0 -1 1e999 nan .inf -.inf 010 1:30 1e-320 null true".split()) + (b"9" * 40,)
+PIECES = (
+    *(b": ", b"- ", b"[", b"]", b"{", b"}", b"&a ", b"*a", b"!!python/object:os.system", b"\n", b"\t", b"\0"),
+    *(b"\xff\xfe", b"<<: ", b'"', b"%YAML 1.1\n", b"---\n", b"PK\x03\x04", b"\x89MCAP0\r\n", b"=1+1"),
+    *(b",", b";"),
+)
+
+
+class TooLong(BaseException):
+    """An answer did not come in time; no reader can take it for an error of its own."""
+
+
+@dataclass
+class Answers:
+    """Of one reader.
+
+    Attributes
+    ----------
+    name : str
+    inputs, accepted : int
+    longest_s : float
+    kinds : set of str
+        Answers without their numbers and names.
+    wrong : dict of str to bytes
+        Wrong answers, and an input of each.
+    """
+
+    name: str
+    inputs: int = 0
+    accepted: int = 0
+    longest_s: float = 0.0
+    kinds: set[str] = field(default_factory=set)
+    wrong: dict[str, bytes] = field(default_factory=dict)
+
+
+def changed(data: bytes, examples: list[bytes], rng: np.random.Generator) -> bytes:
+    """An example with one to four changes."""
+    content = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        at = int(rng.integers(len(content) + 1))
+        length = int(min(rng.geometric(0.1), len(content)))
+        kind = int(rng.integers(9))
+        if kind == 0 and content:
+            content[at % len(content)] ^= 1 << int(rng.integers(8))
+        elif kind == 1 and content:
+            content[at % len(content)] = int(rng.integers(256))
+        elif kind == 2:
+            del content[at : at + length]
+        elif kind == 3:
+            content[at:at] = content[at : at + length] * int(rng.integers(1, 4))
+        elif kind == 4:
+            other = examples[int(rng.integers(len(examples)))]
+            begin = int(rng.integers(len(other) + 1))
+            content[at : at + length] = other[begin : begin + length]
+        elif kind == 5:
+            content[at:at] = PIECES[int(rng.integers(len(PIECES)))]
+        elif kind == 6:
+            numbers = list(re.finditer(rb"-?\d[\d.e+-]*", bytes(content[:4096])))
+            if numbers:
+                found = numbers[int(rng.integers(len(numbers)))]
+                content[found.start() : found.end()] = NUMBERS[int(rng.integers(len(NUMBERS)))]
+        elif kind == 7:
+            number = int(rng.choice([0, 1, 0x7FFFFFFF, 0xFFFFFFFF]))
+            content[at : at + 4] = number.to_bytes(4, "little")
+        else:
+            del content[at:]
+    return bytes(content[:LONGEST_INPUT])
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Raise `TooLong` in what takes longer."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def answer(target: Target, data: bytes) -> tuple[str, bool]:
+    """What a reader answers, and whether it may."""
+    try:
+        with within(WITHIN_S):
+            target.read(data)
+    except (ValueError, OSError) as error:
+        text = str(error)
+        if "\n" in text:
+            return f"{type(error).__name__} of several lines: {text[:100]!r}", False
+        if len(text) > LONGEST_LINE:
+            return f"{type(error).__name__} of more than {LONGEST_LINE} characters: {text[:100]}", False
+        return f"{type(error).__name__}: {text}", True
+    except TooLong:
+        return TOO_LONG, False
+    except BaseException as error:  # all that no caller expects
+        return f"{type(error).__name__}: {str(error)[:200]}", False
+    return "", True
+
+
+def kind_of(text: str) -> str:
+    """An answer without its numbers and names."""
+    text = re.sub(r"'[^']*'|\"[^\"]*\"|got .*?;", "...", text)
+    return re.sub(r"[-+.\d]+(e[-+]?\d+)?", "0", text)[:100]
+
+
+def tried(target: Target, inputs: int, seed: int, last: mmap.mmap) -> Answers:
+    """Try a reader; the newest input stands in `last`, where it outlives this process."""
+    rng, found = np.random.default_rng(seed), Answers(target.name)
+    examples = list(target.seeds)
+    for _ in range(inputs):
+        data = changed(examples[int(rng.integers(len(examples)))], examples, rng)
+        last[:8] = len(data).to_bytes(8, "little")
+        last[8 : 8 + len(data)] = data
+        begun_s = time.perf_counter()
+        text, right = answer(target, data)
+        for _ in range(REPEATS if text == TOO_LONG else 0):  # the machine may be busy
+            if text == TOO_LONG:
+                text, right = answer(target, data)
+        found.longest_s = max(found.longest_s, time.perf_counter() - begun_s)
+        found.inputs += 1
+        found.accepted += not text
+        kind = kind_of(text)
+        if not right:
+            found.wrong.setdefault(kind, data)
+        elif kind not in found.kinds:
+            found.kinds.add(kind)
+            if len(examples) < MOST_EXAMPLES:
+                examples.append(data)
+    return found
+
+
+def _work(name: str, inputs: int, seed: int, newest: Path, answers: Connection) -> None:
+    """One reader, in a process that may end."""
+    warnings.simplefilter("ignore")
+
+    def too_long(*_: object) -> None:
+        raise TooLong
+
+    signal.signal(signal.SIGALRM, too_long)
+    with newest.open("r+b") as file, TemporaryDirectory() as folder:
+        (target,) = (of for of in targets(Path(folder)) if of.name == name)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        answers.send(tried(target, inputs, seed, mmap.mmap(file.fileno(), 0)))
+
+
+def _tried_apart(name: str, inputs: int, seed: int) -> Answers:
+    """A reader in a process of its own; where that ends, the input it had."""
+    context = multiprocessing.get_context("spawn")
+    with TemporaryDirectory() as folder:
+        newest = Path(folder) / "newest"
+        newest.write_bytes(bytes(8 + LONGEST_INPUT))
+        mine, its = context.Pipe(duplex=False)
+        process = context.Process(target=_work, args=(name, inputs, seed, newest, its))
+        process.start()
+        its.close()
+        try:
+            found = mine.recv()
+        except EOFError:
+            process.join()
+            data = newest.read_bytes()
+            data = data[8 : 8 + int.from_bytes(data[:8], "little")]
+            return Answers(name, wrong={f"the process ended with {process.exitcode}": data})
+        process.join()
+        return found
+
+
+def run(output: Path, quick: bool) -> str:
+    """Try all readers, write ``hostile.md`` and inputs with a wrong answer into `output`; return the page."""
+    inputs = QUICK_INPUTS if quick else INPUTS
+    with TemporaryDirectory() as folder:
+        jobs = [(of.name, max(20, round(of.share * inputs)), SEED) for of in targets(Path(folder))]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # each waits for a process
+        done = list(pool.map(lambda job: _tried_apart(*job), jobs))
+    for of in done:
+        for k, data in enumerate(of.wrong.values()):
+            name = re.sub(r"\W+", "-", of.name)
+            (output / f"hostile-{name}-{k}.bin").write_bytes(data)
+    text = _page(done)
+    (output / "hostile.md").write_text(text, encoding="utf-8")
+    return text
+
+
+def _page(done: Sequence[Answers]) -> str:
+    wrong = sum(len(of.wrong) for of in done)
+    assert __doc__ is not None
+    about = " ".join(__doc__.split("\n\n", 1)[1].split())
+    lines = [
+        "# Hostile inputs",
+        "",
+        f"`tools/run.sh tactile_resonance benchmark hostile`. {about} Memory: {MEMORY_BYTES >> 30} GiB.",
+        "",
+        f"{sum(of.inputs for of in done)} inputs, {sum(of.accepted for of in done)} accepted. "
+        f"**Wrong answers: {wrong}.**",
+        "",
+        "| reader | inputs | accepted | kinds of refusals | longest [s] | wrong |",
+        "|---|---:|---:|---:|---:|---:|",
+        *(
+            f"| {of.name} | {of.inputs} | {of.accepted} | {len(of.kinds - {''})} | {of.longest_s:.2f} | "
+            f"{len(of.wrong)} |"
+            for of in done
+        ),
+        "",
+    ]
+    lines += [f"- {of.name}: {kind}" for of in done for kind in of.wrong]
+    return "\n".join(lines).rstrip() + "\n"
