@@ -8,7 +8,7 @@ and rounded once to double precision.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import mpmath
 import numpy as np
@@ -19,6 +19,7 @@ from tactile_resonance.poles.structure import ModelStructure
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
+Modes = tuple[tuple[float, float, float], ...]
 DIGITS = 50
 FEEDTHROUGH = 0.1
 
@@ -46,7 +47,7 @@ class Cell:
 
     family: str
     row: str
-    modes: tuple[tuple[float, float, float], ...]
+    modes: Modes
     frequency_hz: FloatArray
     snr_db: float
     structure: ModelStructure
@@ -58,15 +59,10 @@ class Cell:
         """(modes, 2) natural frequencies [Hz] and damping ratios."""
         return np.array([mode[:2] for mode in self.modes])
 
-    @cached_property
+    @property
     def unscaled(self) -> ComplexArray:
         """(F,) without noise, rounded once."""
-        with mpmath.workdps(DIGITS):
-            total = [mpmath.mpc(FEEDTHROUGH)] * self.frequency_hz.size
-            for f0, zeta, gain in self.modes:
-                mode = self._mode(mpmath.mpf(f0), mpmath.mpf(zeta), gain)
-                total = [a + b for a, b in zip(total, mode, strict=True)]
-            return np.array([complex(value) for value in total])
+        return _rounded(self.modes, self.frequency_hz.tobytes(), self.structure.sample_rate_hz)
 
     @property
     def response(self) -> ComplexArray:
@@ -110,33 +106,54 @@ class Cell:
         np.fill_diagonal(apart, np.inf)
         return np.asarray(apart.min(axis=-1))
 
-    def _mode(self, f0: mpmath.mpf, zeta: mpmath.mpf, gain: float) -> list[mpmath.mpc]:
-        """Of one mode at the lines."""
-        w0 = 2 * mpmath.pi * f0
-        rate_hz = self.structure.sample_rate_hz
-        if rate_hz is None:
-            lines = [mpmath.mpc(0, mpmath.mpf(float(f)) / f0) for f in self.frequency_hz]  # s / w0
-            return [2 * gain * zeta / (x**2 + 2 * zeta * x + 1) for x in lines]
-        pole = mpmath.exp(w0 * mpmath.mpc(-zeta, mpmath.sqrt(1 - zeta**2)) / rate_hz)
-        height = gain * (1 - abs(pole)) * abs(1 - pole**2)
-        turns = [mpmath.expjpi(-2 * mpmath.mpf(float(f)) / rate_hz) for f in self.frequency_hz]
-        return [height / ((1 - pole * q) * (1 - mpmath.conj(pole) * q)) for q in turns]  # q = 1/z
-
     def _derivatives(self, f0_hz: float, damping_ratio: float, gain: float) -> ComplexArray:
         """(F, 4) by f0, damping ratio, and the two coefficients of the mode's numerator."""
-        with mpmath.workdps(DIGITS):
-            f0, zeta = mpmath.mpf(f0_hz), mpmath.mpf(damping_ratio)
-            step = mpmath.mpf(10) ** (-DIGITS // 3)
-            columns = []
-            for df, dz in ((step * f0, 0), (0, step * zeta)):
-                up, down = self._mode(f0 + df, zeta + dz, gain), self._mode(f0 - df, zeta - dz, gain)
-                columns.append([complex((a - b) / (2 * (df + dz))) for a, b in zip(up, down, strict=True)])
-            mode = np.array([complex(value) for value in self._mode(f0, zeta, gain)])
         rate_hz = self.structure.sample_rate_hz
-        x = 1j * self.frequency_hz / f0_hz
-        if rate_hz is not None:
-            x = np.exp(-2j * np.pi * self.frequency_hz / rate_hz)
-        return np.stack([*map(np.array, columns), mode, x * mode], axis=-1)
+        if rate_hz is None:
+            x = 1j * self.frequency_hz / f0_hz  # s / w0
+            mode = 1 / (x**2 + 2 * damping_ratio * x + 1)
+            by_f0 = mode**2 * (2 * x**2 + 2 * damping_ratio * x) / f0_hz
+            by_damping = -2 * x * mode**2
+            height = 2 * gain * damping_ratio
+        else:
+            w0, under = 2 * np.pi * f0_hz, np.sqrt(1 - damping_ratio**2)
+            root = w0 * (-damping_ratio + 1j * under)
+            pole, x = np.exp(root / rate_hz), np.exp(-2j * np.pi * self.frequency_hz / rate_hz)  # 1 / z
+            first, second = 1 / (1 - pole * x), 1 / (1 - np.conj(pole) * x)
+            mode = first * second
+            by_f0, by_damping = (
+                mode * x * (pole * of * first + np.conj(pole * of) * second) / rate_hz
+                for of in (root / f0_hz, w0 * (-1 - 1j * damping_ratio / under))
+            )
+            height = gain * (1 - abs(pole)) * abs(1 - pole**2)
+        return height * np.stack([by_f0, by_damping, mode, x * mode], axis=-1)
+
+
+@lru_cache(maxsize=8)
+def _rounded(modes: Modes, frequency_hz: bytes, rate_hz: float | None) -> ComplexArray:
+    """(F,) sum of modes and feed-through at lines, to `DIGITS` digits, rounded once."""
+    with mpmath.workdps(DIGITS):
+        values = []
+        two_pi = 2 * mpmath.pi
+        of_modes = []
+        for f0, zeta, gain in modes:
+            w0, z = two_pi * mpmath.mpf(f0), mpmath.mpf(zeta)
+            pole = mpmath.mpf(0)
+            if rate_hz is not None:
+                pole = mpmath.exp(w0 * mpmath.mpc(-z, mpmath.sqrt(1 - z**2)) / rate_hz)
+            of_modes.append((mpmath.mpf(f0), z, gain, pole))
+        for line in np.frombuffer(frequency_hz):
+            total, f = mpmath.mpc(FEEDTHROUGH), mpmath.mpf(float(line))
+            for f0, z, gain, pole in of_modes:
+                if rate_hz is None:
+                    x = mpmath.mpc(0, f / f0)  # s / w0
+                    total += 2 * gain * z / (x**2 + 2 * z * x + 1)
+                else:
+                    q = mpmath.expjpi(-2 * f / rate_hz)  # 1 / z
+                    height = gain * (1 - abs(pole)) * abs(1 - pole**2)
+                    total += height / ((1 - pole * q) * (1 - mpmath.conj(pole) * q))
+            values.append(complex(total))
+    return np.array(values)
 
 
 BARE = ModelStructure(2, 2)

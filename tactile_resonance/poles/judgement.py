@@ -150,6 +150,13 @@ def assemble(
         covariance[hopeless] = total[hopeless] = np.nan
     quantities = pole_quantities(model, band_hz, covariance, total)
     quantities["total_covariance"] += judged.systematic
+    lost = judged.level_known & ~hopeless & _lost_to_rounding(quantities["covariance"])
+    if lost.any():
+        conditioned &= ~lost
+        undetermined |= lost
+        covariance, total = covariance.copy(), total.copy()
+        for matrix in (covariance, total, quantities["covariance"], quantities["total_covariance"]):
+            matrix[lost] = np.nan
     if undetermined.any():
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
@@ -199,3 +206,12 @@ def assemble(
         method=method,
         remark=batch(judged.remark),
     )
+
+
+def _lost_to_rounding(covariance: FloatArray) -> npt.NDArray[np.bool_]:
+    """(batch,) where a variance of a mode's covariance (batch, k, 2, 2) is not above 0.
+
+    A mode beside its own zero leaves the normal matrix all but singular.
+    """
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return np.asarray((variances <= 0).any(axis=(-2, -1)))

@@ -123,6 +123,23 @@ def test_modes_apart_are_significant_each_for_itself():
     assert np.sum(sure & far) <= 1
 
 
+def test_a_covariance_lost_to_rounding_is_none():
+    """A mode that its own zero all but cancels leaves the normal matrix singular to double precision."""
+    f = np.linspace(200, 300, 81)
+    g = modal(f, [240.0, 262.0], [0.02, 0.02], [0.04, 4e-12])
+    variance = 1e-14 * np.mean(np.abs(g) ** 2)
+    rng = np.random.default_rng(7)
+    noise = rng.standard_normal((400, f.size, 2)).view(complex)[..., 0] * np.sqrt(variance / 2)
+    sampled = variance * rng.gamma(14, 1 / 14, (400, f.size))
+    given = frf(f, g + noise, variance_noise=sampled, noise_dof=14)
+    batch = identify_batch(given, None, ModelStructure(4, 4))
+    ok = batch.has_status(PolesStatus.OK)
+    assert ok.sum() > 300
+    variances = np.diagonal(batch.covariance, axis1=-2, axis2=-1)
+    assert np.all(variances[batch.significant & ok[:, None]] > 0)
+    assert np.all(np.isnan(batch.f0_hz[batch.has_status(PolesStatus.ILL_CONDITIONED)]))
+
+
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
 def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)
