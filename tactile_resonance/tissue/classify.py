@@ -88,19 +88,42 @@ def class_from_samples(name: str, estimates: npt.ArrayLike, prior: float = 1.0) 
     estimates : (n, 2) float
         f0 [Hz] and damping ratio of n points of this tissue, n at least 4; their scatter holds the noise
         of those measurements too, which is on the safe side.
-
-    Notes
-    -----
-    The next member then follows Student's distribution with n - 2 degrees of freedom about the mean and
-    the scale (n^2 - 1) / (n (n - 2)) S, S the sample covariance (Geisser, Predictive Inference, 1993,
-    section 9.1).
     """
     x = np.asarray(estimates, float)
     good = x.ndim == 2 and x.shape[1] == 2 and len(x) >= 4 and bool(np.all(np.isfinite(x)))
     require(good, "estimates", x.shape, "shape (n, 2) with n at least 4, finite")
     n = len(x)
-    scale = (n**2 - 1) / (n * (n - 2)) * np.cov(x.T)
-    return TissueClass(name, x.mean(axis=0), scale, n - 2.0, prior)
+    return predictive_class(name, x.mean(axis=0), (1 + 1 / n) * np.cov(x.T), n - 1.0, prior)
+
+
+def predictive_class(
+    name: str,
+    mean: FloatArray,
+    covariance: FloatArray,
+    degrees_of_freedom: float,
+    prior: float = 1.0,
+) -> TissueClass:
+    """Class whose next member is predicted from an estimated covariance.
+
+    Parameters
+    ----------
+    mean : (2,) float
+    covariance : (2, 2) float
+        Estimated, of the next member about the mean; it includes the uncertainty of the mean.
+    degrees_of_freedom : float
+        Of that estimate, above 1; infinite where it is known.
+
+    Notes
+    -----
+    With nu degrees of freedom the squared distance of the next member is Hotelling's T^2: the member follows
+    Student's distribution with nu - 1 degrees of freedom about the mean and the scale nu / (nu - 1) times the
+    covariance (two dimensions; Geisser, Predictive Inference, 1993, section 9.1).
+    """
+    nu = degrees_of_freedom
+    require(nu > 1, "degrees_of_freedom", nu, "a number above 1")
+    if np.isinf(nu):
+        return TissueClass(name, mean, covariance, prior=prior)
+    return TissueClass(name, mean, covariance * nu / (nu - 1), nu - 1, prior)
 
 
 def classify(

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the poles of one tissue scatter, by source, and the class that follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.fields import require
+from tactile_resonance.tissue.classify import TissueClass, predictive_class
+from tactile_resonance.tissue.nested import NestedMeans, nested_means
+
+FloatArray = npt.NDArray[np.float64]
+Texts = npt.NDArray[np.str_]
+LEVELS = ("preparation", "position", "repetition")
+"""Sources of spread, outermost first: figure 9 of arXiv 1805.00682, without its periods."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePoints:
+    """Measured poles whose tissue is known, at the nominal force and age of contact.
+
+    Attributes
+    ----------
+    estimate : (n, 2) float
+        f0 [Hz] and damping ratio.
+    covariance : (n, 2, 2) float
+        For tissue: of the measurement, with what force and age add.
+    measured : (n, 2, 2) float
+        Of the measurement alone.
+    tissue, preparation, position, run : (n,) str
+        Preparations of different tissues are different, as positions of different preparations are.
+        Measurements at one position are its repetitions.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+    measured: FloatArray
+    tissue: Texts
+    preparation: Texts
+    position: Texts
+    run: Texts
+
+    def __post_init__(self) -> None:
+        n = len(self.estimate)
+        shapes = {"estimate": (n, 2), "covariance": (n, 2, 2), "measured": (n, 2, 2)}
+        for item in fields(self):
+            array, shape = getattr(self, item.name), shapes.get(item.name, (n,))
+            good = array.shape == shape and (
+                item.name not in shapes or bool(np.all(np.isfinite(array)))
+            )
+            require(good, item.name, array.shape, f"shape {shape}, finite")
+
+    def where(self, chosen: npt.NDArray[np.bool_]) -> ReferencePoints:
+        """Those chosen."""
+        return ReferencePoints(*(getattr(self, item.name)[chosen] for item in fields(self)))
+
+    def of(self, tissue: str) -> ReferencePoints:
+        """Those of one tissue."""
+        return self.where(self.tissue == tissue)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Spread from one source.
+
+    Attributes
+    ----------
+    name : str
+    covariance : (2, 2) float
+        Of f0 [Hz] and damping ratio; NaN where it is not determined.
+    degrees_of_freedom : int
+        Of the scatter from which it was taken; 0: not determined.
+    holds : tuple of str
+        Sources within that are not determined alone, and are part of this one.
+    """
+
+    name: str
+    covariance: FloatArray
+    degrees_of_freedom: int = 0
+    holds: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class TissueSpread:
+    """What the reference points of one tissue say of it.
+
+    Attributes
+    ----------
+    name : str
+    points : int
+    mean : (2,) float
+        f0 [Hz] and damping ratio.
+    covariance : (2, 2) float
+        Of the next point's pole about the mean, without the noise of its measurement: all sources that are
+        determined, and the uncertainty of the mean.
+    degrees_of_freedom : float
+        Of that covariance together with the mean noise of the points.
+    sources : tuple of Source
+        By `LEVELS`.
+    noise, force : (2, 2) float
+        Means over the points: covariance of a measurement, and what force and age of contact add to it.
+    """
+
+    name: str
+    points: int
+    mean: FloatArray
+    covariance: FloatArray
+    degrees_of_freedom: float
+    sources: tuple[Source, ...]
+    noise: FloatArray
+    force: FloatArray
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Sources that the next point has and `covariance` does not."""
+        held = {name for source in self.sources for name in source.holds}
+        return tuple(
+            s.name for s in self.sources if not s.degrees_of_freedom and s.name not in held
+        )
+
+    def as_class(self, prior: float = 1.0) -> TissueClass:
+        """The class, with the predictive distribution of so few samples.
+
+        Raises
+        ------
+        ValueError
+            If the degrees of freedom are 1 or fewer.
+        """
+        accepted = "more than 1: more preparations, or spreads pooled over tissues"
+        good = self.degrees_of_freedom > 1
+        require(good, f"{self.name}: degrees_of_freedom", self.degrees_of_freedom, accepted)
+        return predictive_class(
+            self.name, self.mean, self.covariance, self.degrees_of_freedom, prior
+        )
+
+
+def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSpread, ...]:
+    """Mean and sources of spread of each tissue, in the order of their first points.
+
+    Parameters
+    ----------
+    points : ReferencePoints
+    pool : bool
+        Tissues scatter alike: spreads are estimated from all together, means of each.
+
+    Raises
+    ------
+    ValueError
+        If there is no point, or no two of one tissue.
+
+    Notes
+    -----
+    The mean squares M_i of the nested levels have the expectation
+
+        E M_i = S_i + sum over inner levels j of a_ij S_j + sum over points k of b_ik C_k
+
+    with the spread S_i of each source and the known covariance C_k of each point, which are taken off from
+    inside to outside. A remainder that is not positive has its negative part set to 0. A source of which each
+    group has one member only cannot be told from the next outer one, and is part of it; the outermost one is then
+    not determined at all. The mean squares follow Wishart's distribution about, so that a sum of t_i M_i beside
+    known covariances has 4 / V degrees of freedom (Satterthwaite), V the sum of 2 t_i^2 tr((Q^-1 M_i)^2) / dof_i
+    and Q the covariance of the next measurement: for Wishart's distribution itself that is exact.
+    """
+    names = list(dict.fromkeys(points.tissue.tolist()))
+    require(bool(names), "points", 0, "one reference point or more")
+    if pool:
+        return _spreads(points, names)
+    return tuple(spread for name in names for spread in _spreads(points.of(name), [name]))
+
+
+def _spreads(points: ReferencePoints, names: Sequence[str]) -> tuple[TissueSpread, ...]:
+    """Of tissues that share their spreads."""
+    columns = (points.tissue, points.preparation, points.position)
+    # tissues in the order of `names`
+    tissue = np.array([names.index(name) for name in columns[0].tolist()])
+    labels = [tissue, *(np.unique(column, return_inverse=True)[1] for column in columns[1:])]
+    found = nested_means(points.estimate, np.stack(labels, axis=1), LEVELS)
+    known = any(level.dof for level in found.levels)
+    require(known, f"points of {', '.join(names)}", len(points.tissue), "two of one tissue or more")
+    squares, sources, parts = _sources(found, points.covariance)
+    spread = np.array([np.nan_to_num(source.covariance) for source in sources])
+    noise, covariance = points.measured.mean(axis=0), points.covariance.mean(axis=0)
+    made = []
+    for k, name in enumerate(names):
+        weights = 1 + found.mean_holds[k]  # of each source in the next point less the mean
+        own = tissue == k
+        of_mean = np.einsum("k,kij->ij", found.weight[own] ** 2, points.covariance[own])
+        total = np.einsum("l,lij->ij", weights, spread) + of_mean
+        degrees = _degrees_of_freedom(weights @ parts, squares, found, total + covariance)
+        count, mean = int(own.sum()), found.mean[k]
+        force = covariance - noise
+        made.append(TissueSpread(name, count, mean, total, degrees, sources, noise, force))
+    return tuple(made)
+
+
+def _sources(
+    found: NestedMeans, covariance: FloatArray
+) -> tuple[FloatArray, tuple[Source, ...], FloatArray]:
+    """Mean squares (L, 2, 2), sources, and by how much of each mean square each source is made of (L, L)."""
+    count = len(found.levels)
+    squares, spread, parts = (
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2, 2)),
+        np.zeros((count,) * 2),
+    )
+    sources: list[Source] = []
+    held: list[str] = []
+    for i in reversed(range(count)):
+        level = found.levels[i]
+        if not level.dof:
+            held.insert(0, level.name)
+            sources.insert(0, Source(level.name, np.full((2, 2), np.nan)))
+            continue
+        squares[i] = level.deviations.T @ level.deviations / level.dof
+        parts[i, i] = 1
+        rest = squares[i] - np.einsum("k,kij->ij", level.holds_noise, covariance)
+        for j in range(i + 1, count):
+            rest = rest - level.holds[j] * spread[j]
+            parts[i] -= level.holds[j] * parts[j]
+        spread[i] = not_negative(rest, squares[i])
+        sources.insert(0, Source(level.name, spread[i], level.dof, tuple(held)))
+        held = []
+    return squares, tuple(sources), parts
+
+
+def _degrees_of_freedom(
+    weights: FloatArray, squares: FloatArray, found: NestedMeans, total: FloatArray
+) -> float:
+    """Of a sum of mean squares with these weights, beside what is known."""
+    variance = 0.0
+    for weight, square, level in zip(weights, squares, found.levels, strict=True):
+        if level.dof:
+            ratio = np.linalg.solve(total, square)
+            variance += 2 * weight**2 * float(np.trace(ratio @ ratio)) / level.dof
+    return 4 / variance if variance > 0 else float("inf")
+
+
+def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:
+    """The nearest matrix without negative eigenvalues, in units of the diagonal of `scale`."""
+    unit = np.sqrt(np.maximum(np.diag(scale), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    return (vectors * np.maximum(values, 0)) @ vectors.T * np.outer(unit, unit)
