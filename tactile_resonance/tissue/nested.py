@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nested groups of unequal size: how means scatter within each level, and what that scatter holds.
 
-Each preparation has its positions, each position its repetitions, and so on. The analysis is that of unweighted
-means: at each level a member counts by the mean of its own members, however many they are. In balanced data this
-is the analysis of variance (Searle, Casella and McCulloch, Variance Components, 1992, chapters 3 and 5); in
-others expectations stay exact, and nothing rests on a distribution.
+Each preparation has its positions, each position its repetitions, and so on. The analysis is that of
+unweighted means: at each level a member counts by the mean of its own members, however many they are. In
+balanced data this is the analysis of variance (Searle, Casella and McCulloch, Variance Components, 1992,
+chapters 3 and 5); in others expectations stay exact, and nothing rests on a distribution.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading from configuration: tissue classes, and the contact to which they refer."""
+"""Tissue classes, and the contact to which they refer, from and to files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,14 @@ from tactile_resonance.fields import (
     read_yaml,
     require,
 )
-from tactile_resonance.tissue.classify import TissueClass, class_from_samples
+from tactile_resonance.strict_yaml import dump_yaml
+from tactile_resonance.tissue.classify import TissueClass, class_from_samples, predictive_class
 from tactile_resonance.tissue.nominal_contact import (
     ForceSensitivity,
     NominalContact,
     sensitivity_of_preloads,
 )
+from tactile_resonance.tissue.spread import LEVELS, Source, TissueSpread
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -66,9 +69,11 @@ class _Class(_Point):
     """Part of a file: a class by its mean and spread."""
 
     prior: float = 1.0
+    degrees_of_freedom: float = math.inf
 
     def named(self, name: str) -> TissueClass:
-        return TissueClass(name, self.estimate, self.covariance, prior=self.prior)
+        degrees = self.degrees_of_freedom
+        return predictive_class(name, self.estimate, self.covariance, degrees, self.prior)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +85,29 @@ class _Samples:
 
     def named(self, name: str) -> TissueClass:
         return class_from_samples(name, self.points, self.prior)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """Part of a file: the spread of a class from one source."""
+
+    f0_std_hz: float
+    damping_ratio_std: float
+    correlation: float = 0.0
+    degrees_of_freedom: int
+    holds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "f0_std_hz", "damping_ratio_std")
+        check_within(self, correlation=(-1, 1))
+        require(
+            self.degrees_of_freedom > 0, "degrees_of_freedom", self.degrees_of_freedom, "above 0"
+        )
+
+    def named(self, name: str) -> Source:
+        std = self.f0_std_hz, self.damping_ratio_std
+        covariance = _covariance(*std, self.correlation)
+        return Source(name, covariance, self.degrees_of_freedom, self.holds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +159,9 @@ def read_classes(path: Path) -> tuple[tuple[TissueClass, ...], NominalContact | 
 def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:
     """Classes of a mapping from name to mean and spread, or to measured points.
 
-    Each is ``{f0_hz, damping_ratio, f0_std_hz, damping_ratio_std}`` with ``correlation`` (0) and ``prior``
-    (1) at will, or ``{points: [[f0_hz, damping_ratio], ...]}`` of four points or more.
+    Each is ``{f0_hz, damping_ratio, f0_std_hz, damping_ratio_std}`` with ``correlation`` (0), ``prior`` (1)
+    and, where the deviations are estimated, their ``degrees_of_freedom`` at will, or
+    ``{points: [[f0_hz, damping_ratio], ...]}`` of four points or more.
 
     Raises
     ------
@@ -175,6 +204,89 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
     else:
         sensitivity = build(read_dataclass(_Sensitivity, how, where).sensitivity, where)
     return read_dataclass(NominalContact, rest, where, sensitivity=sensitivity)
+
+
+def read_sources(path: Path) -> dict[str, tuple[Source, ...]]:
+    """Section ``spread`` of a file that `library_text` made: sources of spread that are determined, by tissue.
+
+    Raises
+    ------
+    ValueError
+        If it is not there, or a field is missing or wrong.
+    """
+    where = f"{Path(path).name}: spread"
+    entries = read(dict[str, dict[str, _Source]], read_yaml(Path(path)).get("spread"), where)
+    for tissue, sources in entries.items():
+        known_keys(sources, set(LEVELS), join(where, tissue))
+    return {
+        tissue: tuple(source.named(name) for name, source in sources.items())
+        for tissue, sources in entries.items()
+    }
+
+
+def library_text(
+    spreads: Sequence[TissueSpread], nominal: NominalContact | None, comment: Sequence[str]
+) -> str:
+    """File that scenes name under ``tissue_classes``, and pole_map_node under ``classes_file``.
+
+    Parameters
+    ----------
+    spreads : sequence of TissueSpread
+    nominal : NominalContact or None
+        To which they refer.
+    comment : sequence of str
+        For people, one line each, at the top.
+
+    Raises
+    ------
+    ValueError
+        If a tissue has too few points for a class.
+    """
+    classes, sources = {}, {}
+    for spread in spreads:
+        spread.as_class()
+        mean = {"f0_hz": _rounded(spread.mean[0]), "damping_ratio": _rounded(spread.mean[1])}
+        degrees = spread.degrees_of_freedom
+        degrees = {} if math.isinf(degrees) else {"degrees_of_freedom": round(float(degrees), 2)}
+        classes[spread.name] = {**mean, **_entry(spread.covariance), **degrees}
+        sources[spread.name] = {
+            source.name: {
+                **_entry(source.covariance),
+                "degrees_of_freedom": source.degrees_of_freedom,
+                "holds": list(source.holds),
+            }
+            for source in spread.sources
+            if source.degrees_of_freedom
+        }
+    content: dict[str, Any] = {"tissue_classes": classes}
+    if nominal is not None:
+        own = {item.name: getattr(nominal, item.name) for item in fields(nominal)}
+        slope = own.pop("sensitivity")
+        per_n = {"f0_hz_per_n": slope.per_n[0], "damping_ratio_per_n": slope.per_n[1]}
+        std = {name + "_per_n": value for name, value in _entry(slope.covariance).items()}
+        std["correlation"] = std.pop("correlation_per_n")
+        own |= {key: float(value) for key, value in {**per_n, **std}.items()}
+        content["nominal_contact"] = {k: v for k, v in own.items() if not math.isnan(v)}
+    content["spread"] = sources
+    head = ["SPDX-License-Identifier: Apache-2.0", *comment]
+    return "".join(f"# {line}\n" for line in head) + dump_yaml(content)
+
+
+def _entry(covariance: FloatArray) -> dict[str, float]:
+    """Standard deviations and correlation, as `_covariance` takes them."""
+    std = np.sqrt(np.diag(covariance))
+    product = float(np.prod(std))
+    correlation = float(covariance[0, 1]) / product if product > 0 else 0.0
+    return {
+        "f0_std_hz": _rounded(std[0]),
+        "damping_ratio_std": _rounded(std[1]),
+        "correlation": min(1.0, max(-1.0, round(correlation, 6))),
+    }
+
+
+def _rounded(value: float) -> float:
+    """To eight digits."""
+    return float(f"{value:.8g}")
 
 
 def _between(preloads: tuple[_Preload, _Preload], nominal_n: float) -> ForceSensitivity:

@@ -98,7 +98,7 @@ class TissueSpread:
         Of the next point's pole about the mean, without the noise of its measurement: all sources that are
         determined, and the uncertainty of the mean.
     degrees_of_freedom : float
-        Of that covariance together with the mean noise of the points.
+        Of that covariance together with the mean noise of the points; 0 where no source is determined.
     sources : tuple of Source
         By `LEVELS`.
     noise, force : (2, 2) float
@@ -122,6 +122,11 @@ class TissueSpread:
             s.name for s in self.sources if not s.degrees_of_freedom and s.name not in held
         )
 
+    @property
+    def usable(self) -> bool:
+        """Whether there are points enough for a class."""
+        return self.degrees_of_freedom > 1
+
     def as_class(self, prior: float = 1.0) -> TissueClass:
         """The class, with the predictive distribution of so few samples.
 
@@ -131,8 +136,8 @@ class TissueSpread:
             If the degrees of freedom are 1 or fewer.
         """
         accepted = "more than 1: more preparations, or spreads pooled over tissues"
-        good = self.degrees_of_freedom > 1
-        require(good, f"{self.name}: degrees_of_freedom", self.degrees_of_freedom, accepted)
+        degrees = self.degrees_of_freedom
+        require(self.usable, f"{self.name}: degrees_of_freedom", degrees, accepted)
         return predictive_class(
             self.name, self.mean, self.covariance, self.degrees_of_freedom, prior
         )
@@ -150,7 +155,7 @@ def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSprea
     Raises
     ------
     ValueError
-        If there is no point, or no two of one tissue.
+        If there is no point.
 
     Notes
     -----
@@ -159,11 +164,12 @@ def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSprea
         E M_i = S_i + sum over inner levels j of a_ij S_j + sum over points k of b_ik C_k
 
     with the spread S_i of each source and the known covariance C_k of each point, which are taken off from
-    inside to outside. A remainder that is not positive has its negative part set to 0. A source of which each
-    group has one member only cannot be told from the next outer one, and is part of it; the outermost one is then
-    not determined at all. The mean squares follow Wishart's distribution about, so that a sum of t_i M_i beside
-    known covariances has 4 / V degrees of freedom (Satterthwaite), V the sum of 2 t_i^2 tr((Q^-1 M_i)^2) / dof_i
-    and Q the covariance of the next measurement: for Wishart's distribution itself that is exact.
+    inside to outside. A remainder that is not positive has its negative part set to 0. A source of which
+    each group has one member only cannot be told from the next outer one, and is part of it; the outermost
+    one is then not determined at all. The mean squares follow Wishart's distribution about, so that a sum of
+    t_i M_i beside known covariances has 4 / V degrees of freedom (Satterthwaite), V the sum of
+    2 t_i^2 tr((Q^-1 M_i)^2) / dof_i and Q the covariance of the next measurement: for Wishart's distribution
+    itself that is exact.
     """
     names = list(dict.fromkeys(points.tissue.tolist()))
     require(bool(names), "points", 0, "one reference point or more")
@@ -179,8 +185,6 @@ def _spreads(points: ReferencePoints, names: Sequence[str]) -> tuple[TissueSprea
     tissue = np.array([names.index(name) for name in columns[0].tolist()])
     labels = [tissue, *(np.unique(column, return_inverse=True)[1] for column in columns[1:])]
     found = nested_means(points.estimate, np.stack(labels, axis=1), LEVELS)
-    known = any(level.dof for level in found.levels)
-    require(known, f"points of {', '.join(names)}", len(points.tissue), "two of one tissue or more")
     squares, sources, parts = _sources(found, points.covariance)
     spread = np.array([np.nan_to_num(source.covariance) for source in sources])
     noise, covariance = points.measured.mean(axis=0), points.covariance.mean(axis=0)
@@ -231,12 +235,14 @@ def _degrees_of_freedom(
     weights: FloatArray, squares: FloatArray, found: NestedMeans, total: FloatArray
 ) -> float:
     """Of a sum of mean squares with these weights, beside what is known."""
+    if not any(level.dof for level in found.levels):
+        return 0.0
     variance = 0.0
     for weight, square, level in zip(weights, squares, found.levels, strict=True):
         if level.dof:
             ratio = np.linalg.solve(total, square)
             variance += 2 * weight**2 * float(np.trace(ratio @ ratio)) / level.dof
-    return 4 / variance if variance > 0 else float("inf")
+    return float(4 / variance) if variance > 0 else float("inf")
 
 
 def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:

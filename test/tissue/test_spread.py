@@ -4,52 +4,11 @@
 import numpy as np
 import pytest
 from scipy import stats
+from tissue.reference_points import NOISE, SOURCES, drawn, joined
 
 from tactile_resonance.tissue.classify import classify
 from tactile_resonance.tissue.nested import nested_means
-from tactile_resonance.tissue.spread import LEVELS, ReferencePoints, not_negative, spreads_of
-
-NOISE = np.array([[0.02**2, 0.5 * 0.02 * 1e-4], [0.5 * 0.02 * 1e-4, 1e-4**2]])
-
-
-def covariance(f0_std_hz, damping_std, correlation):
-    std = np.array([f0_std_hz, damping_std])
-    return np.outer(std, std) * [[1, correlation], [correlation, 1]]
-
-
-SOURCES = {
-    "preparation": covariance(0.4, 4e-4, 0.9),
-    "position": covariance(0.2, 3e-4, 0.8),
-    "repetition": covariance(0.05, 1e-4, 0.2),
-}
-
-
-def drawn(rng, sizes, sources=SOURCES, noise=NOISE, mean=(254.0, 0.0336), tissue="gel"):
-    """Points of `sizes` = positions of each preparation, each a tuple of repetitions."""
-    rows = []
-    for i, positions in enumerate(sizes):
-        casting = mean + rng.multivariate_normal(np.zeros(2), sources["preparation"])
-        for j, repetitions in enumerate(positions):
-            place = casting + rng.multivariate_normal(np.zeros(2), sources["position"])
-            for _ in range(repetitions):
-                each = sources["repetition"] + noise
-                rows.append((i, j, place + rng.multivariate_normal(np.zeros(2), each)))
-    n = len(rows)
-    preparation = np.array([f"{tissue}{i}" for i, _, _ in rows])
-    return ReferencePoints(
-        np.array([x for _, _, x in rows]),
-        np.broadcast_to(noise, (n, 2, 2)).copy(),
-        np.broadcast_to(noise / 2, (n, 2, 2)).copy(),
-        np.full(n, tissue),
-        preparation,
-        np.array([f"{j}" for _, j, _ in rows]),
-        preparation,
-    )
-
-
-def joined(*parts):
-    names = ("estimate", "covariance", "measured", "tissue", "preparation", "position", "run")
-    return ReferencePoints(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+from tactile_resonance.tissue.spread import LEVELS, not_negative, spreads_of
 
 
 def test_balanced_data_give_the_classical_analysis_of_variance():
@@ -142,8 +101,7 @@ def test_one_preparation_leaves_the_spread_of_preparations_undetermined():
 
 
 def test_known_noise_is_taken_off():
-    """Points that scatter by their noise alone have no spread: nine in ten of their sources are within a
-    tenth of the noise, where 1000 repetitions tell it."""
+    """Points that scatter by their noise alone have no spread beyond a tenth of it."""
     rng, zero = np.random.default_rng(5), dict.fromkeys(LEVELS, np.zeros((2, 2)))
     (spread,) = spreads_of(drawn(rng, [(5,) * 5] * 50, zero))
     for source in spread.sources:
@@ -183,8 +141,10 @@ def test_degrees_of_freedom_of_single_measurements_are_those_of_their_scatter():
 
 def test_refusals():
     points = drawn(np.random.default_rng(8), [(1,)])
-    with pytest.raises(ValueError, match="points of gel: got 1; accepted is two"):
-        spreads_of(points)
+    (one,) = spreads_of(points)
+    assert one.degrees_of_freedom == 0
+    with pytest.raises(ValueError, match="gel: degrees_of_freedom: got 0"):
+        one.as_class()
     (two,) = spreads_of(drawn(np.random.default_rng(8), [(1,), (1,)], noise=np.zeros((2, 2))))
     with pytest.raises(ValueError, match="gel: degrees_of_freedom: .*more than 1: more prep"):
         two.as_class()

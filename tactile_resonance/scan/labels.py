@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of runs whose tissue is known: labels from a file or by place, poles at the nominal contact."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from tactile_resonance.fields import read_text, require
+from tactile_resonance.scan.point_result import PointKind, PointResult
+from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import read_run_scene
+from tactile_resonance.tissue.classify import UNKNOWN
+from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
+from tactile_resonance.tissue.spread import ReferencePoints
+
+PLACE_M = 1e-4
+"""Points of one preparation that are nearer than this, in x and y, are repetitions at one position."""
+_COLUMNS = ("run", "index", "tissue", "preparation", "position")
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is known of a point; empty: the preparation is that of the run, the position that of its place."""
+
+    tissue: str
+    preparation: str = ""
+    position: str = ""
+
+
+LabelOf = Callable[[RunContent, PointResult], Label | None]
+"""Label of a point; None where its tissue is not known."""
+
+
+def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
+    """Labels of a CSV file.
+
+    Its columns are ``tissue`` and, at will, ``run`` (name of the folder; may be left out for a single run),
+    ``index`` (that of ``results.csv``; empty: all points of the run), ``preparation`` and ``position``. A row
+    with an index comes before one for the whole run.
+
+    Raises
+    ------
+    ValueError
+        If a column is unknown, a tissue or a run is missing, or two rows are of one point.
+    """
+    reader = csv.DictReader(io.StringIO(read_text(path)), skipinitialspace=True)
+    columns = reader.fieldnames or []
+    for name in columns:
+        require(name in _COLUMNS, f"{path.name}: column", name, f"one of {', '.join(_COLUMNS)}")
+    require("tissue" in columns, f"{path.name}: columns", columns, "tissue among them")
+    names = [run.path.resolve().name for run in runs]
+    labels: dict[tuple[str, int | None], Label] = {}
+    for number, row in enumerate(reader, start=2):
+        where = f"{path.name}, line {number}: "
+        values = {key: (row.get(key) or "").strip() for key in _COLUMNS}
+        if not values["run"] and len(names) == 1:
+            values["run"] = names[0]
+        require(values["run"] in names, f"{where}run", values["run"], f"one of {', '.join(names)}")
+        index = values["index"]
+        require(not index or index.isdecimal(), f"{where}index", index, "that of results.csv")
+        tissue = values["tissue"]
+        require(bool(tissue) and tissue != UNKNOWN, f"{where}tissue", tissue, "a name")
+        key = values["run"], int(index) if index else None
+        require(key not in labels, f"{where}index", index, "one row for each point")
+        labels[key] = Label(tissue, values["preparation"], values["position"])
+
+    def of(run: RunContent, result: PointResult) -> Label | None:
+        name = run.path.resolve().name
+        return labels.get((name, result.index)) or labels.get((name, None))
+
+    return of
+
+
+def nominal_of(runs: Sequence[RunContent]) -> NominalContact | None:
+    """The nominal contact of the runs' scenes.
+
+    Raises
+    ------
+    ValueError
+        If they differ, or a scene cannot be read.
+    """
+    found = [read_run_scene(run.path / "scene.yaml").nominal_contact for run in runs]
+    texts = [_as_text(nominal) for nominal in found]
+    for run, text in zip(runs, texts, strict=True):
+        accepted = f"that of {runs[0].path.name}; give one for all with --nominal FILE"
+        require(text == texts[0], f"{run.path.name}: nominal_contact", text or "none", accepted)
+    return found[0]
+
+
+def reference_points(
+    runs: Sequence[RunContent], label_of: LabelOf, nominal: NominalContact | None
+) -> tuple[ReferencePoints, Counter[str]]:
+    """Latest attempts at the labelled points, at the nominal contact, and why others are left out.
+
+    Raises
+    ------
+    ValueError
+        If two runs have one name, or no point is left.
+    """
+    names = [run.path.resolve().name for run in runs]
+    require(len(set(names)) == len(names), "runs", names, "folders of different names")
+    rows, left_out = [], Counter[str]()
+    for run, name in zip(runs, names, strict=True):
+        for result in run.latest:
+            label = label_of(run, result)
+            if result.kind is not PointKind.TISSUE:
+                continue
+            if label is None:
+                left_out["no label"] += 1
+                continue
+            at = referred(result, nominal)
+            if isinstance(at, str):
+                left_out[at] += 1
+                continue
+            place = ", ".join(f"{round(each / PLACE_M)}" for each in result.position_m[:2])
+            preparation = label.preparation or name
+            rows.append((*at, label.tissue, preparation, label.position or place, name))
+    require(bool(rows), "points", dict(left_out), "one labelled point with poles or more")
+    return ReferencePoints(*(np.array(column) for column in zip(*rows, strict=True))), left_out
+
+
+def referred(
+    result: PointResult, nominal: NominalContact | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | str:
+    """Pole (2,) at the nominal contact, its covariance for tissue, and as measured; why there is none."""
+    own = result.covariance
+    if result.failed or not (np.all(np.isfinite(result.estimate)) and np.all(np.isfinite(own))):
+        return "no pole with a covariance"
+    load = ContactLoad(result.force_n, result.force_std_n, result.contact_age_s)
+    at = refer_to_nominal(result.estimate, own, load, nominal)
+    return at.note if np.isnan(at.compared).any() else (at.compared, at.covariance, own)
+
+
+def _as_text(nominal: NominalContact | None) -> str:
+    """Equal for equal ones."""
+    if nominal is None:
+        return ""
+    values = {item.name: getattr(nominal, item.name) for item in fields(nominal)}
+    slope = values.pop("sensitivity")
+    return str([*values.items(), slope.per_n.tolist(), slope.covariance.tolist()])

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Classes on trial: calls of points whose tissue is known, by classes that do not rest on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from tactile_resonance.fields import require
+from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
+from tactile_resonance.tissue.spread import ReferencePoints, Texts, spreads_of
+
+FloatArray = npt.NDArray[np.float64]
+EDGES = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.99, 1.0)
+"""Of the bins of stated probability in a reliability diagram."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Calls beside the truth.
+
+    Attributes
+    ----------
+    tissue : (n,) str
+        The truth.
+    called : (n,) str
+        `UNKNOWN` where none of the classes was called.
+    known : (n,) bool
+        Whether the true tissue was among the classes.
+    probability : (n,) float
+        Of the most probable class, given that it is one of them, also where `UNKNOWN` was called.
+    likely : (n,) str
+        That class.
+    preparation : (n,) str
+        Points of one are not independent.
+    """
+
+    tissue: Texts
+    called: Texts
+    known: npt.NDArray[np.bool_]
+    probability: FloatArray
+    likely: Texts
+    preparation: Texts
+
+    def where(self, chosen: npt.NDArray[np.bool_]) -> Trial:
+        """Those points alone."""
+        return Trial(*(getattr(self, item.name)[chosen] for item in fields(self)))
+
+    def share(self, which: npt.NDArray[np.bool_]) -> Share:
+        """How many of the points are `which` (n,)."""
+        groups = np.unique(self.preparation).size
+        return Share(int(np.sum(which)), len(which), groups)
+
+
+@dataclass(frozen=True)
+class Share:
+    """Points out of points, which come from so many independent groups."""
+
+    count: int
+    of: int
+    groups: int
+
+    def limits(self, confidence: float = 0.95) -> tuple[float, float]:
+        """Clopper and Pearson's interval, as if each group had been counted once.
+
+        That is right where points of a group share their fate, and wide where they do not.
+        """
+        if not self.of:
+            return 0.0, 1.0
+        scaled = self.count * self.groups / self.of
+        low, high = (1 - confidence) / 2, (1 + confidence) / 2
+        first = stats.beta.ppf(low, scaled, self.groups - scaled + 1) if scaled > 0 else 0.0
+        second = (
+            stats.beta.ppf(high, scaled + 1, self.groups - scaled) if self.count < self.of else 1.0
+        )
+        return float(first), float(second)
+
+    def __str__(self) -> str:
+        low, high = self.limits()
+        share = f"{self.count / self.of:.2%}" if self.of else "-"
+        return f"{self.count} of {self.of} ({share}, {low:.2%} to {high:.2%})"
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """Calls of about one stated probability.
+
+    Attributes
+    ----------
+    stated, right : float
+        Mean stated probability, and the part of the points that were of the class.
+    points, groups : int
+        Groups are those of `Share`.
+    low, high : float
+        Between which `right` is expected if the stated probabilities hold, in all bins together.
+    """
+
+    stated: float
+    right: float
+    points: int
+    groups: int
+    low: float
+    high: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether `right` is within."""
+        return self.low <= self.right <= self.high
+
+
+def call_points(
+    points: ReferencePoints, classes: Sequence[TissueClass], unknown_level: float
+) -> Trial:
+    """Call each point by classes."""
+    calls = [
+        classify(x, c, classes, unknown_level)
+        for x, c in zip(points.estimate, points.covariance, strict=True)
+    ]
+    likely = [max(call.probabilities, key=lambda name: call.probabilities[name]) for call in calls]
+    return Trial(
+        points.tissue,
+        np.array([call.name for call in calls]),
+        np.isin(points.tissue, [each.name for each in classes]),
+        np.array([call.probabilities[name] for call, name in zip(calls, likely, strict=True)]),
+        np.array(likely),
+        np.array([f"{t}, {p}" for t, p in zip(points.tissue, points.preparation, strict=True)]),
+    )
+
+
+def leave_out(
+    points: ReferencePoints,
+    by: Literal["run", "preparation", "tissue"],
+    pool: bool,
+    unknown_level: float,
+) -> Trial:
+    """Call the points of each group by classes of all others.
+
+    Groups are runs, preparations, or whole tissues, which ought then to be called `UNKNOWN`. With runs a
+    preparation that is in several of them is left out of all. A class with too few others is not made; where
+    none is left the points are not called.
+
+    Raises
+    ------
+    ValueError
+        If there is only one group, or no point could be called.
+    """
+    key = getattr(points, by)
+    if by == "preparation":  # of a tissue
+        key = np.array([f"{t}, {p}" for t, p in zip(points.tissue, key, strict=True)])
+    groups = np.unique(key)
+    require(len(groups) > 1, f"{by}s", groups.tolist(), "two or more, to leave one out")
+    trials = []
+    for group in groups:
+        left = key == group
+        casts = {*zip(points.tissue[left], points.preparation[left], strict=True)}
+        same = [pair in casts for pair in zip(points.tissue, points.preparation, strict=True)]
+        rest = ~(left | np.array(same))
+        if not rest.any():
+            continue
+        classes = [s.as_class() for s in spreads_of(points.where(rest), pool) if s.usable]
+        if classes:
+            trials.append(call_points(points.where(left), classes, unknown_level))
+    require(bool(trials), f"{by}s", groups.tolist(), "so many that classes remain without one")
+    joined = ([getattr(t, item.name) for t in trials] for item in fields(Trial))
+    return Trial(*(np.concatenate(each) for each in joined))
+
+
+def reliability(trial: Trial, confidence: float = 0.95) -> tuple[ReliabilityBin, ...]:
+    """How often calls are right, by their stated probability, of points of known classes that were called.
+
+    The expected interval is that of a binomial with the stated probability, one draw for each group, and holds
+    for all bins together with this confidence (Bonferroni).
+    """
+    counted = trial.where(trial.known & (trial.called != UNKNOWN))
+    right, made = counted.likely == counted.tissue, []
+    which = np.digitize(counted.probability, EDGES[1:-1], right=False)
+    inside = [which == k for k in range(len(EDGES) - 1)]
+    beyond = (1 - confidence) / max(1, sum(bool(each.any()) for each in inside))
+    for chosen in inside:
+        if not chosen.any():
+            continue
+        stated = float(counted.probability[chosen].mean())
+        groups = np.unique(counted.preparation[chosen]).size
+        low, high = stats.binom.interval(1 - beyond, groups, stated)
+        share = float(right[chosen].mean())
+        made.append(
+            ReliabilityBin(
+                stated, share, int(chosen.sum()), groups, float(low) / groups, float(high) / groups
+            )
+        )
+    return tuple(made)
