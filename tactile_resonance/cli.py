@@ -82,6 +82,7 @@ def _parser() -> OneLineParser:
         compile,
         figures,
         plan,
+        references,
         reidentify,
         report,
         scan,
@@ -96,7 +97,7 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(plan, scan, analyze, reidentify, report, figures, benchmark),
+        *(plan, scan, analyze, reidentify, references, report, figures, benchmark),
         *(calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
     ):
         command.add_parser(commands)

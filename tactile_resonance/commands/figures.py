@@ -98,8 +98,10 @@ def _distortion(output: Path) -> None:
 
 
 def _variance(output: Path) -> None:
+    import numpy as np
+
     from tactile_resonance.frf.spectra import Spectrum
-    from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
+    from tactile_resonance.frf.variance_analysis import analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.report.variance_figure import draw_variance
     from tactile_resonance.simulation.sensor.experiments import repeated_records
@@ -109,8 +111,10 @@ def _variance(output: Path) -> None:
     g = lines[..., 0, :, :] / lines[..., 1, :, :]
     frequency_hz = harmonics * rate_hz / u.shape[-1]
     inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
-    whole = analyse_variance(g, frequency_hz, axes=PAPER_AXES)
-    band = analyse_variance(g[..., inside], frequency_hz[inside], axes=PAPER_AXES)
+    places = np.indices(g.shape[:-1]).reshape(g.ndim - 1, -1)
+    groups, g = np.stack([0 * places[0], *places[:-1]], axis=1), g.reshape(-1, frequency_hz.size)
+    whole = analyse_variance(g, frequency_hz, groups)
+    band = analyse_variance(g[:, inside], frequency_hz[inside], groups)
     for source in reversed(band.sources):
         print(
             f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {BAND_HZ[0]:g}-"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the scatter of FRFs comes from: periods, repetitions, positions, preparations.
 
-The analysis is that of a balanced nested experiment: each preparation has its positions, each
-position its repetitions, each repetition its periods.
+Each preparation has its positions, each position its repetitions, each repetition its periods: as many of each
+as there are.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import require
 from tactile_resonance.frf.distortion import decibel
+from tactile_resonance.frf.nested import nested_means
 from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
 PAPER_AXES = ("preparation", "position", "repetition", "period")
@@ -27,19 +29,16 @@ class VarianceSource:
     Attributes
     ----------
     name : str
-    size : int
-        How many members each group has.
     dof : int
-        Degrees of freedom: ``(size - 1)`` times the number of groups.
+        Degrees of freedom: members less groups.
     variance : (F,) float or None
-        Sample variance over this axis of the means over all inner axes, averaged over all outer
-        ones. It *holds* what is left of the inner scatter. None if the size is 1.
+        Sample variance of the means of the members about that of their group. It *holds* what is
+        left of the inner scatter. None without degrees of freedom.
     mean_power : (F,) float
-        ``|G|^2`` of the mean over everything.
+        ``|G|^2`` of the mean over everything, averaged over the outermost groups.
     """
 
     name: str
-    size: int
     dof: int
     variance: FloatArray | None
     mean_power: FloatArray
@@ -62,10 +61,10 @@ class VarianceAnalysis:
     Attributes
     ----------
     frequency_hz : (F,) float
-    mean : (F,) complex
-        Mean FRF over everything.
+    mean : (G, F) complex
+        Mean FRF of each outermost group.
     sources : tuple of VarianceSource
-        Outermost first, as the axes were given.
+        Outermost first, as the levels were given.
     """
 
     frequency_hz: FloatArray
@@ -88,29 +87,36 @@ class VarianceAnalysis:
 
 
 def analyse_variance(
-    g: npt.ArrayLike, frequency_hz: npt.ArrayLike, *, axes: Sequence[str] = PAPER_AXES
+    g: npt.ArrayLike,
+    frequency_hz: npt.ArrayLike,
+    groups: npt.ArrayLike,
+    names: Sequence[str] = PAPER_AXES,
 ) -> VarianceAnalysis:
-    """Sample variance of FRFs over each of several nested axes.
+    """Sample variance of FRFs over each of several nested levels.
 
     Parameters
     ----------
-    g : (A1, ..., An, F) complex
-        FRFs; leading axes outermost first, e.g. preparations, positions, repetitions, periods.
+    g : (n, F) complex
+        FRFs, e.g. of single periods.
     frequency_hz : (F,) float
-    axes : sequence of str
-        A name per leading axis.
+    groups : (n, L) int
+        Labels of the groups, outermost first, as `nested_means` takes them: for the paper's figure
+        those of everything, preparation, position and repetition. Different outermost groups, such as
+        tissues, are not compared.
+    names : sequence of str
+        What varies within the groups of each column.
 
     Raises
     ------
     ValueError
-        If shapes and names do not fit, or an FRF is missing (not finite): the analysis needs as
-        many members in every group.
+        If shapes do not fit, or an FRF is missing (not finite).
 
     Notes
     -----
-    With independent sources of variances v_1 (outermost) ... v_n and sizes A_i the expected sample
-    variance over axis i is ``v_i + v_(i+1)/A_(i+1) + ... + v_n/(A_(i+1) ... A_n)``: averaging an
-    inner source reduces it, but does not remove it. Nothing is subtracted from `variance`.
+    With independent sources of variances v_1 (outermost) ... v_n and, in balanced data, A_i members in
+    each group the expected sample variance of level i is
+    ``v_i + v_(i+1)/A_(i+1) + ... + v_n/(A_(i+1) ... A_n)``: averaging an inner source reduces it, but
+    does not remove it. Nothing is subtracted from `variance`.
 
     References
     ----------
@@ -120,32 +126,18 @@ def analyse_variance(
     """
     g = np.asarray(g, complex)
     frequency = np.asarray(frequency_hz, float)
-    if g.ndim != len(axes) + 1 or g.shape[-1:] != frequency.shape or g.size == 0:
-        raise ValueError(
-            f"g: shape {g.shape}, expected {len(axes)} leading axes ({', '.join(axes)}) and "
-            f"{frequency.size} lines"
+    good = g.ndim == 2 and g.shape[1:] == frequency.shape
+    require(good, "g", g.shape, f"(n, {frequency.size}): an FRF in each row")
+    require(bool(np.all(np.isfinite(g))), "g", "some that are not finite", "complete FRFs")
+    found = nested_means(g, groups, names)
+    power = np.mean(np.abs(found.mean) ** 2, axis=0)
+    sources = tuple(
+        VarianceSource(
+            level.name,
+            level.dof,
+            np.sum(np.abs(level.deviations) ** 2, axis=0) / level.dof if level.dof else None,
+            power,
         )
-    if not np.all(np.isfinite(g)):
-        raise ValueError("g: an FRF is not finite, expected a complete one in every place")
-    mean = g.mean(axis=tuple(range(g.ndim - 1)))
-    power = np.abs(mean) ** 2
-    sources: list[VarianceSource] = []
-    group_means = g  # means over all axes inside the present one
-    for axis in reversed(range(len(axes))):
-        size = g.shape[axis]
-        variance = None
-        if size > 1:
-            # |x - mean|^2 / (size - 1), averaged over the outer axes
-            scatter = np.var(group_means, axis=axis, ddof=1)
-            variance = scatter.reshape(-1, frequency.size).mean(axis=0)
-        groups = int(np.prod(g.shape[:axis]))
-        source = VarianceSource(
-            name=axes[axis],
-            size=size,
-            dof=(size - 1) * groups,
-            variance=variance,
-            mean_power=power,
-        )
-        sources.insert(0, source)
-        group_means = group_means.mean(axis=axis)
-    return VarianceAnalysis(frequency, mean, tuple(sources))
+        for level in found.levels
+    )
+    return VarianceAnalysis(frequency, found.mean, sources)

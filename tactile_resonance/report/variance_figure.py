@@ -16,9 +16,8 @@ def draw_variance(
     """Mean FRF and the standard deviation over each source, in dB; the legend speaks of the band."""
     figure = new_figure(10, 6)
     axes = figure.subplots()
-    axes.semilogx(
-        analysis.frequency_hz, decibel(np.abs(analysis.mean) ** 2), "k-", lw=1, label="mean |G|"
-    )
+    power = np.mean(np.abs(analysis.mean) ** 2, axis=0)
+    axes.semilogx(analysis.frequency_hz, decibel(power), "k-", lw=1, label="mean |G|")
     for k, source in enumerate(reversed(analysis.sources)):
         if source.variance is None:
             continue

@@ -23,11 +23,10 @@ import numpy.typing as npt
 from tactile_resonance.frf.band_bins import BandBins, band_bins
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.recording.store_recording import recording_of
 from tactile_resonance.rows_file import Rows, RowsWriter
 from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.recorded import measurements_of_file
-from tactile_resonance.scan.run_content import RECORDING, file_of, read_run
+from tactile_resonance.scan.recorded import recording_of_point
+from tactile_resonance.scan.run_content import RECORDING, read_run
 
 NAME = "bins.npz"
 FORMAT = "tactile_resonance bins 1"
@@ -139,15 +138,8 @@ def bins_of_point(
 ) -> tuple[BinsKind, npt.NDArray] | str:
     """Kind and row (1,) of a point of a run, from its records; why there is none as text."""
     name = f"point {result.index}"
-    if not result.measurement_id:
-        return f"{name}: {result.outcome.name.lower()}, nothing was measured"
     try:
-        for measurement in measurements_of_file(file_of(run, result)):
-            if measurement.measurement_id == result.measurement_id:
-                recording = recording_of(measurement)
-                break
-        else:
-            return f"{name}: no record of measurement {result.measurement_id}"
+        recording = recording_of_point(run, result)
         record, harmonics = Spectrum.of(recording.u, recording.y), recording.excited_harmonics
         rate_hz = recording.sample_rate_hz
         if harmonics is None:

@@ -13,7 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.fields import read_text, require
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.scan.point_result import PointKind, PointResult
+from tactile_resonance.scan.recorded import recording_of_point
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import read_run_scene
 from tactile_resonance.tissue.classify import UNKNOWN
@@ -119,9 +122,8 @@ def reference_points(
             if isinstance(at, str):
                 left_out[at] += 1
                 continue
-            place = ", ".join(f"{round(each / PLACE_M)}" for each in result.position_m[:2])
-            preparation = label.preparation or name
-            rows.append((*at, label.tissue, preparation, label.position or place, name))
+            casting, place = _preparation(label, name), _position(label, result)
+            rows.append((*at, float(result.blocks), label.tissue, casting, place, name))
     require(bool(rows), "points", dict(left_out), "one labelled point with poles or more")
     return ReferencePoints(*(np.array(column) for column in zip(*rows, strict=True))), left_out
 
@@ -136,6 +138,70 @@ def referred(
     load = ContactLoad(result.force_n, result.force_std_n, result.contact_age_s)
     at = refer_to_nominal(result.estimate, own, load, nominal)
     return at.note if np.isnan(at.compared).any() else (at.compared, at.covariance, own)
+
+
+def labelled_frfs(
+    runs: Sequence[RunContent], label_of: LabelOf
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[str]]:
+    """FRFs of the single periods of labelled points, for the paper's figure 9.
+
+    The first period of each realisation is not settled, and is left out.
+
+    Returns
+    -------
+    g : (n, F) complex
+    frequency_hz : (F,) float
+        Lines that all of them have; points with others than the first are left out.
+    groups : (n, 4) int
+        Tissue, preparation, position and repetition of each.
+    left_out : Counter
+        Points by reason.
+
+    Raises
+    ------
+    ValueError
+        If no point is left.
+    """
+    g, groups, left_out = [], [], Counter[str]()
+    frequency_hz: np.ndarray = np.empty(0)
+    for run in runs:
+        name = run.path.resolve().name
+        for result in run.latest:
+            label = label_of(run, result)
+            if label is None or result.kind is not PointKind.TISSUE:
+                continue
+            try:
+                recording = recording_of_point(run.path, result)
+                spectrum = Spectrum.of(recording.u[:, 1:], recording.y[:, 1:])
+            except ValueError as error:
+                left_out[str(error)] += 1
+                continue
+            harmonics = recording.excited_harmonics
+            if harmonics is None:
+                harmonics = find_excited_harmonics(spectrum)
+            lines_hz = harmonics * recording.resolution_hz
+            if not frequency_hz.size:
+                frequency_hz = lines_hz
+            if not np.array_equal(lines_hz, frequency_hz):
+                left_out["excited on other lines than the first point"] += 1
+                continue
+            sensed, driven = np.moveaxis(spectrum.by_period[..., harmonics], -3, 0)
+            periods = (sensed / driven).reshape(-1, lines_hz.size)
+            casting, place = _preparation(label, name), _position(label, result)
+            g.append(periods)
+            groups += [(label.tissue, casting, place, f"{name}, {result.index}")] * len(periods)
+    require(bool(g), "points", dict(left_out), "one labelled point of two blocks or more")
+    columns = [np.unique(column, return_inverse=True)[1] for column in zip(*groups, strict=True)]
+    return np.concatenate(g), frequency_hz, np.stack(columns, axis=1), left_out
+
+
+def _preparation(label: Label, run: str) -> str:
+    return label.preparation or run
+
+
+def _position(label: Label, result: PointResult) -> str:
+    place = (f"{round(each / PLACE_M)}" for each in result.position_m[:2])
+    return label.position or ", ".join(place)
 
 
 def _as_text(nominal: NominalContact | None) -> str:

@@ -10,15 +10,18 @@ from pathlib import Path
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.messages import excitation_from_message, record_from_message
+from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, choose
+from tactile_resonance.recording.store_recording import recording_of
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import (
     POLES_TYPE,
     TYPE,
+    PointResult,
     from_message,
     serialised,
 )
-from tactile_resonance.scan.run_content import RECORDING, RunContent, read_run
+from tactile_resonance.scan.run_content import RECORDING, RunContent, file_of, read_run
 from tactile_resonance.scan.run_index import read_entries
 
 EXCITATION = "tactile_resonance/msg/Excitation"
@@ -76,6 +79,23 @@ def _read(entry: StoredEntry) -> StoredMeasurement:
     raise ValueError(
         f"measurement_id: {entry.measurement_id}, {entry.path.name} has no record of it"
     )
+
+
+def recording_of_point(run: Path, result: PointResult) -> Recording:
+    """Record of one attempt at a point of a run.
+
+    Raises
+    ------
+    ValueError
+        If nothing was measured, or its record is not there or damaged.
+    """
+    key = result.measurement_id
+    if not key:
+        raise ValueError(f"{result.outcome.name.lower()}, nothing was measured")
+    for measurement in measurements_of_file(file_of(run, result)):
+        if measurement.measurement_id == key:
+            return recording_of(measurement)
+    raise ValueError(f"no record of measurement {key}")
 
 
 def recorded_results(run: RunContent) -> Iterator[bytes]:

@@ -246,9 +246,10 @@ def library_text(
     for spread in spreads:
         spread.as_class()
         mean = {"f0_hz": _rounded(spread.mean[0]), "damping_ratio": _rounded(spread.mean[1])}
-        degrees = spread.degrees_of_freedom
-        degrees = {} if math.isinf(degrees) else {"degrees_of_freedom": round(float(degrees), 2)}
-        classes[spread.name] = {**mean, **_entry(spread.covariance), **degrees}
+        classes[spread.name] = mean | _entry(spread.covariance)
+        if math.isfinite(spread.degrees_of_freedom):
+            degrees = round(float(spread.degrees_of_freedom), 2)
+            classes[spread.name]["degrees_of_freedom"] = degrees
         sources[spread.name] = {
             source.name: {
                 **_entry(source.covariance),

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import require
+from tactile_resonance.frf.nested import NestedMeans, nested_means
 from tactile_resonance.tissue.classify import TissueClass, predictive_class
-from tactile_resonance.tissue.nested import NestedMeans, nested_means
 
 FloatArray = npt.NDArray[np.float64]
 Texts = npt.NDArray[np.str_]
@@ -31,6 +31,8 @@ class ReferencePoints:
         For tissue: of the measurement, with what force and age add.
     measured : (n, 2, 2) float
         Of the measurement alone.
+    blocks : (n,) float
+        Periods of the measurement.
     tissue, preparation, position, run : (n,) str
         Preparations of different tissues are different, as positions of different preparations are.
         Measurements at one position are its repetitions.
@@ -39,6 +41,7 @@ class ReferencePoints:
     estimate: FloatArray
     covariance: FloatArray
     measured: FloatArray
+    blocks: FloatArray
     tissue: Texts
     preparation: Texts
     position: Texts
@@ -101,8 +104,9 @@ class TissueSpread:
         Of that covariance together with the mean noise of the points; 0 where no source is determined.
     sources : tuple of Source
         By `LEVELS`.
-    noise, force : (2, 2) float
-        Means over the points: covariance of a measurement, and what force and age of contact add to it.
+    noise, force, block : (2, 2) float
+        Means over the points: covariance of a measurement; what force and age of contact add to it; that
+        of one block, which is taken for that of the measurement times its blocks.
     """
 
     name: str
@@ -113,6 +117,7 @@ class TissueSpread:
     sources: tuple[Source, ...]
     noise: FloatArray
     force: FloatArray
+    block: FloatArray
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -188,6 +193,7 @@ def _spreads(points: ReferencePoints, names: Sequence[str]) -> tuple[TissueSprea
     squares, sources, parts = _sources(found, points.covariance)
     spread = np.array([np.nan_to_num(source.covariance) for source in sources])
     noise, covariance = points.measured.mean(axis=0), points.covariance.mean(axis=0)
+    block = np.mean(points.measured * points.blocks[:, None, None], axis=0)
     made = []
     for k, name in enumerate(names):
         weights = 1 + found.mean_holds[k]  # of each source in the next point less the mean
@@ -196,8 +202,8 @@ def _spreads(points: ReferencePoints, names: Sequence[str]) -> tuple[TissueSprea
         total = np.einsum("l,lij->ij", weights, spread) + of_mean
         degrees = _degrees_of_freedom(weights @ parts, squares, found, total + covariance)
         count, mean = int(own.sum()), found.mean[k]
-        force = covariance - noise
-        made.append(TissueSpread(name, count, mean, total, degrees, sources, noise, force))
+        known = noise, covariance - noise, block
+        made.append(TissueSpread(name, count, mean, total, degrees, sources, *known))
     return tuple(made)
 
 

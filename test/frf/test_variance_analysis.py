@@ -19,11 +19,18 @@ def nested(rng, sizes, deviations, lines=LINES_HZ.size):
     return g
 
 
+def balanced(g, axes=PAPER_AXES, frequency_hz=LINES_HZ):
+    """Of (A1, ..., An, F) FRFs, outermost first."""
+    index = np.indices(g.shape[:-1]).reshape(g.ndim - 1, -1)
+    groups = np.stack([0 * index[0], *index[:-1]], axis=1)
+    return analyse_variance(g.reshape(-1, g.shape[-1]), frequency_hz, groups, axes)
+
+
 def test_expected_variances_are_those_documented():
     rng = np.random.default_rng(1)
     sizes, deviations = (4, 3, 5, 6), (0.4, 0.2, 0.1, 0.3)
     v = np.array(deviations) ** 2
-    result = analyse_variance(nested(rng, sizes, deviations), LINES_HZ)
+    result = balanced(nested(rng, sizes, deviations))
     expected = {
         "period": v[3],
         "repetition": v[2] + v[3] / 6,
@@ -38,16 +45,15 @@ def test_expected_variances_are_those_documented():
 
 
 def test_degrees_of_freedom_and_order():
-    result = analyse_variance(nested(np.random.default_rng(2), (2, 3, 4, 5), (1,) * 4), LINES_HZ)
+    result = balanced(nested(np.random.default_rng(2), (2, 3, 4, 5), (1,) * 4))
     assert [source.name for source in result.sources] == list(PAPER_AXES)
-    assert [source.size for source in result.sources] == [2, 3, 4, 5]
     assert [source.dof for source in result.sources] == [1, 2 * 2, 6 * 3, 24 * 4]
 
 
 def test_closed_form_levels():
     """Two values 3 +- 0.3 vary by 2 * 0.09 about a mean of 3: -17 dB."""
     g = np.array([3.3, 2.7])[:, None] * np.ones(4)
-    result = analyse_variance(g, np.arange(4.0), axes=["repetition"])
+    result = balanced(g, ["repetition"], np.arange(4.0))
     source = result.source("repetition")
     assert np.allclose(source.variance, 0.18)
     assert source.rms_level_db == pytest.approx(10 * np.log10(0.02))
@@ -59,7 +65,7 @@ def test_scatter_goes_to_where_it_arises():
     for level, name in enumerate(PAPER_AXES):
         deviations = np.zeros(4)
         deviations[level] = 0.1
-        result = analyse_variance(nested(rng, (3, 3, 3, 3), deviations), LINES_HZ)
+        result = balanced(nested(rng, (3, 3, 3, 3), deviations))
         for other in result.sources[level + 1 :]:
             assert np.max(other.variance) < 1e-20
         for k, other in enumerate(result.sources[:level]):
@@ -71,7 +77,7 @@ def test_scatter_goes_to_where_it_arises():
 
 def test_one_member_has_no_variance():
     g = nested(np.random.default_rng(4), (3, 1, 2), (1, 0, 1))
-    result = analyse_variance(g, LINES_HZ, axes=["position", "repetition", "period"])
+    result = balanced(g, ["position", "repetition", "period"])
     repetition = result.source("repetition")
     assert repetition.variance is None
     assert np.isnan(repetition.rms_level_db)
@@ -79,17 +85,33 @@ def test_one_member_has_no_variance():
     assert result.source("position").variance is not None
 
 
+def test_groups_of_any_size_and_tissues_that_are_not_compared():
+    """Two tissues 3 apart, of one and two preparations: their difference is no scatter."""
+    rng = np.random.default_rng(6)
+    groups = np.array([[0, 0], [0, 0], [1, 1], [1, 1], [1, 1], [1, 2]])
+    tissue = 3.0 * groups[:, :1]
+    scatter = rng.standard_normal((6, 4000, 2)) @ [1, 1j] * 0.1 / np.sqrt(2)
+    result = analyse_variance(tissue + scatter, np.arange(4000.0), groups, ["preparation", "period"])
+    preparation, period = result.sources
+    assert (preparation.dof, period.dof) == (1, 3)
+    assert np.mean(period.variance) == pytest.approx(0.01, rel=4 / np.sqrt(3 * 4000))
+    # of the means of three and of one
+    expected = 0.01 * (1 / 3 + 1) / 2
+    assert np.mean(preparation.variance) == pytest.approx(expected, rel=4 / np.sqrt(4000))
+    np.testing.assert_allclose(np.mean(preparation.mean_power), 4.5, rtol=0.01)
+
+
 def test_refusals():
-    g = np.ones((2, 3, 4), complex)
-    with pytest.raises(ValueError, match=r"g: shape \(2, 3, 4\), expected 4 leading axes"):
-        analyse_variance(g, np.arange(4.0))
-    with pytest.raises(ValueError, match="and 5 lines"):
-        analyse_variance(g, np.arange(5.0), axes=["a", "b"])
-    g[1, 2, 3] = np.nan
+    g, groups = np.ones((3, 4), complex), np.zeros((3, 1), int)
+    with pytest.raises(ValueError, match=r"g: got \(3, 4\); accepted is \(n, 5\)"):
+        analyse_variance(g, np.arange(5.0), groups, ["a"])
+    with pytest.raises(ValueError, match=r"groups: got \(3, 1\); accepted is \(3, 2\)"):
+        analyse_variance(g, np.arange(4.0), groups, ["a", "b"])
+    with pytest.raises(ValueError, match="name: 'c', accepted are a"):
+        analyse_variance(g, np.arange(4.0), groups, ["a"]).source("c")
+    g[1, 2] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        analyse_variance(g, np.arange(4.0), axes=["a", "b"])
-    with pytest.raises(ValueError, match="name: 'c', accepted are a, b"):
-        analyse_variance(np.ones((2, 3, 4)), np.arange(4.0), axes=["a", "b"]).source("c")
+        analyse_variance(g, np.arange(4.0), groups, ["a"])
 
 
 def test_rms_level_weighs_lines_by_their_response():
@@ -97,6 +119,6 @@ def test_rms_level_weighs_lines_by_their_response():
     rng = np.random.default_rng(5)
     scatter = rng.standard_normal((40, 2)) + 1j * rng.standard_normal((40, 2))
     g = np.array([1.0, 1e-6]) + 0.01 / np.sqrt(2) * scatter
-    source = analyse_variance(g, [1.0, 2.0], axes=("period",)).sources[0]
+    source = balanced(g, ["period"], [1.0, 2.0]).sources[0]
     # relative std of a variance of 39 complex degrees of freedom: 0.16, two lines
     assert source.rms_level_db == pytest.approx(10 * np.log10(1e-4 / 0.5), abs=2)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reference points drawn from known spreads."""
 
+from dataclasses import fields
+
 import numpy as np
 
 from tactile_resonance.tissue.spread import ReferencePoints
@@ -36,6 +38,7 @@ def drawn(rng, sizes, sources=SOURCES, noise=NOISE, mean=(254.0, 0.0336), tissue
         np.array([x for _, _, x in rows]),
         np.broadcast_to(noise, (n, 2, 2)).copy(),
         np.broadcast_to(noise / 2, (n, 2, 2)).copy(),
+        np.full(n, 2.0),
         np.full(n, tissue),
         preparation,
         np.array([f"{j}" for _, j, _ in rows]),
@@ -44,5 +47,5 @@ def drawn(rng, sizes, sources=SOURCES, noise=NOISE, mean=(254.0, 0.0336), tissue
 
 
 def joined(*parts):
-    names = ("estimate", "covariance", "measured", "tissue", "preparation", "position", "run")
+    names = [item.name for item in fields(ReferencePoints)]
     return ReferencePoints(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))

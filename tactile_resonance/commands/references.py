@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance references`: tissue classes from runs, on trial, and the variance by source."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_resonance.files import write_whole
+
+if TYPE_CHECKING:
+    from tactile_resonance.scan.labels import LabelOf
+    from tactile_resonance.scan.point_result import PointResult
+    from tactile_resonance.scan.run_content import RunContent
+    from tactile_resonance.tissue.nominal_contact import NominalContact
+    from tactile_resonance.tissue.spread import TissueSpread
+    from tactile_resonance.tissue.trial import ReliabilityBin, Trial
+
+SCENE = "scene"
+FEW = 8.0
+"""Degrees of freedom: with fewer a class is much wider than its tissue."""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the three commands."""
+    parser = commands.add_parser(
+        "references",
+        help="tissue classes from runs of one's own",
+        description="Tissue classes from runs whose tissues are known (docs/references.md).",
+    )
+    kinds = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    build = kinds.add_parser(
+        "build",
+        help="write a library of classes",
+        description="Separate the spread of poles by repetition, position, preparation and force, write the "
+        "classes that follow as a file for `tissue_classes` of scenes, and try them on points left out.",
+    )
+    _add_runs(build)
+    build.add_argument("--output", type=Path, required=True, metavar="FILE", help="the library")
+    build.add_argument(
+        "--pool",
+        action="store_true",
+        help="tissues scatter alike: estimate spreads from all together (few preparations of each)",
+    )
+    build.add_argument(
+        "--leave",
+        choices=("preparation", "run"),
+        default="preparation",
+        help="what is left out of the classes that call it (default: preparation)",
+    )
+    build.set_defaults(run=_build)
+    check = kinds.add_parser(
+        "check",
+        help="try a library on runs that it does not rest on",
+        description="Call labelled points by a library: errors, points called unknown, and whether the stated "
+        "probabilities hold.",
+    )
+    _add_runs(check)
+    check.add_argument(
+        "--library",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="of `references build`, or any file with tissue_classes",
+    )
+    check.set_defaults(run=_check)
+    for each in (build, check):
+        each.add_argument(
+            "--unknown-level",
+            type=float,
+            default=0.01,
+            metavar="P",
+            help="a point farther from each class than this part of its members is unknown (default: 0.01)",
+        )
+        each.add_argument(
+            "--nominal",
+            type=Path,
+            metavar="FILE",
+            help="with nominal_contact, to which poles are referred (default: that of the runs' scenes; "
+            "of check that of the library)",
+        )
+    variance = kinds.add_parser(
+        "variance",
+        help="variance of the FRF by source",
+        description="Variance of the frequency response over periods, repetitions, positions and preparations "
+        "(figure 9 of arXiv 1805.00682), of the labelled points of runs.",
+    )
+    _add_runs(variance)
+    variance.set_defaults(run=_variance)
+    for each in (build, check, variance):
+        each.add_argument("--figure", type=Path, metavar="FILE", help=".png, .svg or .pdf")
+
+
+def _add_runs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    parser.add_argument(
+        "--labels",
+        required=True,
+        metavar="FILE",
+        help=f"CSV with tissue and at will run, index, preparation, position; or '{SCENE}': the regions of "
+        "each run's scene, of which each is a preparation",
+    )
+
+
+def _build(options: argparse.Namespace) -> int:
+    from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.report.references_figure import draw_references
+    from tactile_resonance.scan.labels import nominal_of, reference_points
+    from tactile_resonance.tissue.references import library_text
+    from tactile_resonance.tissue.spread import spreads_of
+    from tactile_resonance.tissue.step import smallest_steps
+    from tactile_resonance.tissue.trial import leave_out, reliability
+
+    runs = _read_runs(options.runs)
+    nominal = _nominal(options.nominal) if options.nominal else nominal_of(runs)
+    points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
+    spreads = spreads_of(points, options.pool)
+    comment = [
+        f"{len(points.run)} points of {', '.join(dict.fromkeys(points.run.tolist()))}, by tactile_resonance "
+        "references build",
+        *(["simulated, not measured"] if _simulated(runs) else []),
+        *(
+            f"{s.name}: spread of {', '.join(s.undetermined)} not determined"
+            for s in spreads
+            if s.undetermined
+        ),
+    ]
+    write_whole(options.output, library_text(spreads, nominal, comment).encode())
+    for line in (*_left_out(left_out), *(line for s in spreads for line in _spread_lines(s))):
+        print(line)
+    if nominal is None:
+        print("warning: no nominal_contact: force and age of contact are part of the spread")
+    trial = None
+    try:
+        trial = leave_out(points, options.leave, options.pool, options.unknown_level)
+    except ValueError as error:
+        print(f"not tried: {error}")
+    if trial is not None:
+        print(f"\none {options.leave} left out at a time:")
+        _print_trial(trial, reliability(trial), options.unknown_level)
+        if len(spreads) > 1:
+            outside = leave_out(points, "tissue", options.pool, options.unknown_level)
+            for spread in spreads:
+                of = outside.where(outside.tissue == spread.name)
+                print(f"were {spread.name} not in it: {of.share(of.called == 'unknown')} unknown")
+    steps = smallest_steps(spreads)
+    for step in steps:
+        outer = list(step.one_block)[-1]
+        print(
+            f"smallest step from {step.from_percent:g} to {step.to_percent:g} %, separated at 99 %: "
+            f"{step.one_block['noise']:.2g} % by noise of one block, {step.one_block[outer]:.2g} % with all "
+            f"sources, {step.limit[outer]:.2g} % without noise"
+        )
+    if options.figure:
+        bins = () if trial is None else reliability(trial)
+        save_figure(
+            draw_references(points, spreads, bins, steps, _simulated(runs)), options.figure
+        )
+    print(f"library in {options.output}: tissue_classes: {options.output.name} in a scene beside it")
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    from tactile_resonance.report.drawing import new_figure, save_figure
+    from tactile_resonance.report.references_figure import draw_reliability
+    from tactile_resonance.scan.labels import reference_points
+    from tactile_resonance.tissue.references import read_classes
+    from tactile_resonance.tissue.trial import call_points, reliability
+
+    runs = _read_runs(options.runs)
+    classes, nominal = read_classes(options.library)
+    if options.nominal:
+        nominal = _nominal(options.nominal)
+    points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
+    trial = call_points(points, classes, options.unknown_level)
+    bins = reliability(trial)
+    print("\n".join(_left_out(left_out)))
+    _print_trial(trial, bins, options.unknown_level)
+    if options.figure:
+        figure = new_figure(6, 5)
+        draw_reliability(figure.subplots(), bins)
+        save_figure(figure, options.figure)
+    return 0
+
+
+def _variance(options: argparse.Namespace) -> int:
+
+    from tactile_resonance.frf.variance_analysis import analyse_variance
+    from tactile_resonance.report.drawing import SIMULATED, save_figure
+    from tactile_resonance.report.variance_figure import draw_variance
+    from tactile_resonance.scan.labels import labelled_frfs
+    from tactile_resonance.scan.reidentify import scene_band
+
+    runs = _read_runs(options.runs)
+    band_hz = scene_band(options.runs[0]).ends_hz
+    g, lines_hz, groups, left_out = labelled_frfs(runs, _labels(options.labels, runs))
+    inside = (lines_hz >= band_hz[0]) & (lines_hz <= band_hz[1])
+    whole = analyse_variance(g, lines_hz, groups)
+    band = analyse_variance(g[:, inside], lines_hz[inside], groups)
+    print("\n".join(_left_out(left_out)))
+    for source in reversed(band.sources):
+        print(
+            f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {band_hz[0]:g}-{band_hz[1]:g} Hz, "
+            f"{source.dof} degrees of freedom"
+            if source.dof
+            else f"over {source.name}: not determined, one of each"
+        )
+    if options.figure:
+        title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
+        save_figure(draw_variance(whole, band, band_hz, title), options.figure)
+    return 0
+
+
+def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
+    from tactile_resonance.front import read_run
+
+    runs = [read_run(path) for path in paths]
+    for run in runs:
+        for problem in run.problems:
+            print(f"{run.path.name}: damaged: {problem}")
+    return runs
+
+
+def _simulated(runs: Sequence[RunContent]) -> bool:
+    return any(result.simulated for run in runs for result in run.latest)
+
+
+def _nominal(path: Path) -> NominalContact | None:
+    from tactile_resonance.fields import read_yaml, require
+    from tactile_resonance.tissue.references import parse_nominal_contact
+
+    nominal = parse_nominal_contact(read_yaml(path), f"{path.name}:")
+    require(nominal is not None, f"{path.name}: nominal_contact", None, "a file with one")
+    return nominal
+
+
+def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:
+    """Of a CSV file, or of the regions of each run's scene."""
+    from tactile_resonance.scan.labels import Label, read_labels
+
+    if given != SCENE:
+        return read_labels(Path(given), runs)
+    from tactile_resonance.simulation.tissue.library import read_tissues
+    from tactile_resonance.simulation.tissue.scene import read_scene
+
+    library = read_tissues()
+    scenes = {run.path: read_scene(library, run.path / "scene.yaml") for run in runs}
+
+    def of(run: RunContent, result: PointResult) -> Label | None:
+        scene = scenes[run.path]
+        index = int(scene.region_index(result.position_m))
+        name = run.path.resolve().name
+        return None if index < 0 else Label(scene.regions[index].name, f"{name}, region {index + 1}")
+
+    return of
+
+
+def _left_out(reasons: Counter[str]) -> list[str]:
+    return [f"left out: {count} points, {reason}" for reason, count in reasons.most_common()]
+
+
+def _spread_lines(spread: TissueSpread) -> list[str]:
+    """One tissue, for people."""
+    import numpy as np
+
+    def std(covariance: np.ndarray) -> str:
+        f0_hz, damping = np.sqrt(np.diag(covariance))
+        return f"{f0_hz:8.4f} Hz  {damping:9.2e}"
+
+    lines = [
+        f"{spread.name}: {spread.points} points, f0 {spread.mean[0]:.3f} Hz, damping ratio "
+        f"{spread.mean[1]:.5f}",
+        f"  {'noise':<12} {std(spread.noise)}  of a measurement",
+        f"  {'force, age':<12} {std(spread.force)}  what they add to it",
+    ]
+    held = {name: source.name for source in spread.sources for name in source.holds}
+    for source in reversed(spread.sources):
+        degrees = source.degrees_of_freedom
+        if degrees:
+            text = f"{std(source.covariance)}  {degrees} degrees of freedom"
+        elif source.name in held:
+            text = f"part of that of {held[source.name]}s, one each"
+        else:
+            text = f"not determined: one {source.name}"
+        lines.append(f"  {source.name:<12} {text}")
+    degrees_text = f"{spread.degrees_of_freedom:.1f} degrees of freedom"
+    lines.append(f"  {'next point':<12} {std(spread.covariance)}  {degrees_text}, without its noise")
+    for name in spread.undetermined:
+        lines.append(
+            f"  warning: the class does not hold for another {name}, whose spread is not determined"
+        )
+    if spread.degrees_of_freedom < FEW:
+        lines.append("  warning: few degrees of freedom make a wide class: more preparations, or --pool")
+    return lines
+
+
+def _print_trial(trial: Trial, bins: Sequence[ReliabilityBin], unknown_level: float) -> None:
+    import numpy as np
+
+    known = trial.where(trial.known)
+    right = known.called == known.tissue
+    unknown = known.called == "unknown"
+    print("points in their preparations; 95 % limits, as if each preparation counted once")
+    print(f"called right: {known.share(right)}")
+    print(f"called another: {known.share(~right & ~unknown)}")
+    print(f"unknown though known: {known.share(unknown)}; {unknown_level:.2%} or less is stated")
+    outside = trial.where(~trial.known)
+    for name in np.unique(outside.tissue):
+        of = outside.where(outside.tissue == name)
+        print(f"{name}, not in the library: {of.share(of.called == 'unknown')} unknown")
+    for each in bins:
+        print(
+            f"stated {each.stated:7.2%}, right {each.right:7.2%} of {each.points} points, "
+            f"{each.low:.2%} to {each.high:.2%} expected{'' if each.holds else ': does not hold'}"
+        )

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of references: poles with their classes, spread by source, reliability, smallest step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
+from tactile_resonance.tissue.spread import ReferencePoints, TissueSpread
+from tactile_resonance.tissue.step import SmallestStep
+from tactile_resonance.tissue.trial import ReliabilityBin
+
+PAPER_STEP_PERCENT = 2.0
+"""Gelatines that the paper's sensor separates and surgeons' fingers do not (arXiv 1805.00682)."""
+
+
+def draw_references(
+    points: ReferencePoints,
+    spreads: Sequence[TissueSpread],
+    bins: Sequence[ReliabilityBin],
+    steps: Sequence[SmallestStep],
+    simulated: bool,
+) -> Figure:
+    """All four panels."""
+    figure = new_figure(13, 9)
+    (poles, sources), (calls, step) = figure.subplots(2, 2)
+    figure.suptitle("References" + (f", {SIMULATED}" if simulated else ""))
+    _draw_poles(poles, points, spreads)
+    _draw_sources(sources, spreads)
+    draw_reliability(calls, bins)
+    draw_steps(step, steps)
+    return figure
+
+
+def draw_reliability(axes: Axes, bins: Sequence[ReliabilityBin]) -> None:
+    """How often calls were right, over the stated probability."""
+    axes.plot([0, 1], [0, 1], color="0.6", lw=1, label="as stated")
+    axes.set(
+        xlabel="stated probability", ylabel="part that is right", title="Calls", xlim=(0.3, 1.01)
+    )
+    axes.set_ylim(-0.02, 1.05)
+    if not bins:
+        axes.text(0.5, 0.5, "not tried", transform=axes.transAxes, ha="center")
+        return
+    stated, right = ([getattr(each, name) for each in bins] for name in ("stated", "right"))
+    middle = np.array([(each.low + each.high) / 2 for each in bins])
+    half = np.array([(each.high - each.low) / 2 for each in bins])
+    axes.errorbar(
+        stated, middle, half, fmt="none", color="C0", alpha=0.35, lw=7, label="expected in 95 %"
+    )
+    axes.plot(stated, right, "ko", ms=4, label="found")
+    for each in bins:
+        axes.annotate(
+            f"{each.points}",
+            (each.stated, each.right),
+            textcoords="offset points",
+            xytext=(8, -10),
+            fontsize=7,
+        )
+    axes.legend(loc="upper left", fontsize="small", title="figures: points")
+    axes.grid(alpha=0.3)
+
+
+def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
+    """Steps by what scatters, after one block and without noise, against those of paper and finger."""
+    axes.set(ylabel="smallest step [% w/w]", title="Separated at 99 %")
+    if not steps:
+        axes.text(0.5, 0.5, "names hold no concentrations", transform=axes.transAxes, ha="center")
+        return
+    names = list(steps[0].one_block)
+    for k, step in enumerate(steps):
+        of = f"{step.from_percent:g} to {step.to_percent:g} %"
+        x = np.arange(len(names)) + 0.12 * (k - (len(steps) - 1) / 2)
+        for values, marker, which in ((step.one_block, "o", "one block"), (step.limit, "_", "limit")):
+            y = [values[name] or np.nan for name in names]
+            axes.plot(x, y, marker, color=f"C{k}", ms=7, label=f"{of}, {which}")
+    axes.axhline(PAPER_STEP_PERCENT, color="k", lw=1)
+    axes.text(
+        len(names) - 0.5,
+        PAPER_STEP_PERCENT,
+        "the paper's sensor: 2 %; a surgeon's finger: more",
+        ha="right",
+        va="bottom",
+        fontsize=8,
+    )
+    axes.set_xticks(range(len(names)), [names[0], *(f"+ {name}" for name in names[1:])], fontsize=8)
+    axes.set(yscale="log", xlim=(-0.5, len(names) - 0.5))
+    axes.legend(fontsize=7, loc="lower right")
+    axes.grid(alpha=0.3, which="both", axis="y")
+
+
+def _draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpread]) -> None:
+    for k, spread in enumerate(spreads):
+        own = points.of(spread.name)
+        axes.plot(*own.estimate.T, ".", ms=3, color=f"C{k}", label=spread.name)
+        draw_ellipse(axes, spread.mean, spread.covariance + spread.noise, color=f"C{k}", lw=1)
+    axes.set(xlabel="f0 [Hz]", ylabel="damping ratio", title="Poles, and where 95 % are, if Gaussian")
+    axes.legend(fontsize="small")
+    axes.grid(alpha=0.3)
+
+
+def _draw_sources(axes: Axes, spreads: Sequence[TissueSpread]) -> None:
+    """Standard deviations of f0, each tissue a group of bars."""
+    names = ["noise", "force", *(source.name for source in reversed(spreads[0].sources))]
+    for k, name in enumerate(names):
+        covariances = [
+            getattr(s, name)
+            if k < 2
+            else next(source.covariance for source in s.sources if source.name == name)
+            for s in spreads
+        ]
+        std = [np.sqrt(each[0, 0]) for each in covariances]
+        x = np.arange(len(spreads)) + 0.16 * (k - (len(names) - 1) / 2)
+        axes.bar(x, np.where(np.array(std) > 0, std, np.nan), 0.15, label=name)
+    axes.set_xticks(range(len(spreads)), [s.name for s in spreads], fontsize=8)
+    axes.set(yscale="log", ylabel="standard deviation of f0 [Hz]", title="Spread by source")
+    axes.legend(fontsize="small")
+    axes.grid(alpha=0.3, axis="y")
