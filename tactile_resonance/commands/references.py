@@ -128,9 +128,9 @@ def _build(options: argparse.Namespace) -> int:
             if s.undetermined
         ),
     ]
-    write_whole(options.output, library_text(spreads, nominal, comment).encode())
     for line in (*_left_out(left_out), *(line for s in spreads for line in _spread_lines(s))):
         print(line)
+    write_whole(options.output, library_text(spreads, nominal, comment).encode())
     if nominal is None:
         print("warning: no nominal_contact: force and age of contact are part of the spread")
     trial = None
@@ -156,10 +156,10 @@ def _build(options: argparse.Namespace) -> int:
         )
     if options.figure:
         bins = () if trial is None else reliability(trial)
-        save_figure(
-            draw_references(points, spreads, bins, steps, _simulated(runs)), options.figure
-        )
-    print(f"library in {options.output}: tissue_classes: {options.output.name} in a scene beside it")
+        save_figure(draw_references(points, spreads, bins, steps, _simulated(runs)), options.figure)
+    print(
+        f"library in {options.output}: tissue_classes: {options.output.name} in a scene beside it"
+    )
     return 0
 
 
@@ -253,7 +253,9 @@ def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:
         scene = scenes[run.path]
         index = int(scene.region_index(result.position_m))
         name = run.path.resolve().name
-        return None if index < 0 else Label(scene.regions[index].name, f"{name}, region {index + 1}")
+        return (
+            None if index < 0 else Label(scene.regions[index].name, f"{name}, region {index + 1}")
+        )
 
     return of
 
@@ -287,13 +289,17 @@ def _spread_lines(spread: TissueSpread) -> list[str]:
             text = f"not determined: one {source.name}"
         lines.append(f"  {source.name:<12} {text}")
     degrees_text = f"{spread.degrees_of_freedom:.1f} degrees of freedom"
-    lines.append(f"  {'next point':<12} {std(spread.covariance)}  {degrees_text}, without its noise")
+    lines.append(
+        f"  {'next point':<12} {std(spread.covariance)}  {degrees_text}, without its noise"
+    )
     for name in spread.undetermined:
         lines.append(
             f"  warning: the class does not hold for another {name}, whose spread is not determined"
         )
     if spread.degrees_of_freedom < FEW:
-        lines.append("  warning: few degrees of freedom make a wide class: more preparations, or --pool")
+        lines.append(
+            "  warning: few degrees of freedom make a wide class: more preparations, or --pool"
+        )
     return lines
 
 

@@ -75,21 +75,19 @@ def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
     for k, step in enumerate(steps):
         of = f"{step.from_percent:g} to {step.to_percent:g} %"
         x = np.arange(len(names)) + 0.12 * (k - (len(steps) - 1) / 2)
-        for values, marker, which in ((step.one_block, "o", "one block"), (step.limit, "_", "limit")):
+        for values, marker, which in (
+            (step.one_block, "o", "one block"),
+            (step.limit, "_", "limit"),
+        ):
             y = [values[name] or np.nan for name in names]
             axes.plot(x, y, marker, color=f"C{k}", ms=7, label=f"{of}, {which}")
     axes.axhline(PAPER_STEP_PERCENT, color="k", lw=1)
-    axes.text(
-        len(names) - 0.5,
-        PAPER_STEP_PERCENT,
-        "the paper's sensor: 2 %; a surgeon's finger: more",
-        ha="right",
-        va="bottom",
-        fontsize=8,
-    )
+    told = f" the paper's sensor separates {PAPER_STEP_PERCENT:g} %, a surgeon's finger does not"
+    axes.text(-0.5, PAPER_STEP_PERCENT, told, va="bottom", fontsize=8)
     axes.set_xticks(range(len(names)), [names[0], *(f"+ {name}" for name in names[1:])], fontsize=8)
     axes.set(yscale="log", xlim=(-0.5, len(names) - 0.5))
-    axes.legend(fontsize=7, loc="lower right")
+    axes.set_ylim(top=max(axes.get_ylim()[1], 3 * PAPER_STEP_PERCENT))
+    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(0, 0.6), ncols=2)
     axes.grid(alpha=0.3, which="both", axis="y")
 
 
@@ -98,7 +96,9 @@ def _draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpr
         own = points.of(spread.name)
         axes.plot(*own.estimate.T, ".", ms=3, color=f"C{k}", label=spread.name)
         draw_ellipse(axes, spread.mean, spread.covariance + spread.noise, color=f"C{k}", lw=1)
-    axes.set(xlabel="f0 [Hz]", ylabel="damping ratio", title="Poles, and where 95 % are, if Gaussian")
+    axes.set(
+        xlabel="f0 [Hz]", ylabel="damping ratio", title="Poles, and where 95 % are, if Gaussian"
+    )
     axes.legend(fontsize="small")
     axes.grid(alpha=0.3)
 
@@ -118,5 +118,6 @@ def _draw_sources(axes: Axes, spreads: Sequence[TissueSpread]) -> None:
         axes.bar(x, np.where(np.array(std) > 0, std, np.nan), 0.15, label=name)
     axes.set_xticks(range(len(spreads)), [s.name for s in spreads], fontsize=8)
     axes.set(yscale="log", ylabel="standard deviation of f0 [Hz]", title="Spread by source")
-    axes.legend(fontsize="small")
+    axes.set_ylim(top=3 * axes.get_ylim()[1])
+    axes.legend(fontsize="small", ncols=len(names), loc="upper center")
     axes.grid(alpha=0.3, axis="y")

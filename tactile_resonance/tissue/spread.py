@@ -171,10 +171,12 @@ def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSprea
     with the spread S_i of each source and the known covariance C_k of each point, which are taken off from
     inside to outside. A remainder that is not positive has its negative part set to 0. A source of which
     each group has one member only cannot be told from the next outer one, and is part of it; the outermost
-    one is then not determined at all. The mean squares follow Wishart's distribution about, so that a sum of
-    t_i M_i beside known covariances has 4 / V degrees of freedom (Satterthwaite), V the sum of
-    2 t_i^2 tr((Q^-1 M_i)^2) / dof_i and Q the covariance of the next measurement: for Wishart's distribution
-    itself that is exact.
+    one is then not determined at all. The mean squares M_i follow Wishart's distribution about, with n_i
+    degrees of freedom. A sum of t_i M_i beside known covariances then has tr(W) / tr(V W)
+    (Satterthwaite), with W the sum of (t_i R_i)^2, V that of (t_i R_i)^2 / n_i and R_i the mean square in units
+    of the covariance of the next measurement: a direction counts by how much of it is estimated. For one mean
+    square alone that is exact; simulated, classes of few preparations are up to three times as rarely wrong as
+    they state.
     """
     names = list(dict.fromkeys(points.tissue.tolist()))
     require(bool(names), "points", 0, "one reference point or more")
@@ -243,12 +245,15 @@ def _degrees_of_freedom(
     """Of a sum of mean squares with these weights, beside what is known."""
     if not any(level.dof for level in found.levels):
         return 0.0
-    variance = 0.0
+    variance, estimated = np.zeros((2, 2)), np.zeros((2, 2))
+    whiten = np.linalg.inv(np.linalg.cholesky(total))
     for weight, square, level in zip(weights, squares, found.levels, strict=True):
         if level.dof:
-            ratio = np.linalg.solve(total, square)
-            variance += 2 * weight**2 * float(np.trace(ratio @ ratio)) / level.dof
-    return float(4 / variance) if variance > 0 else float("inf")
+            share = weight * whiten @ square @ whiten.T
+            estimated += share @ share
+            variance += share @ share / level.dof
+    known = float(np.trace(variance @ estimated))
+    return float(np.trace(estimated)) / known if known > 0 else float("inf")
 
 
 def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:

@@ -141,8 +141,8 @@ def leave_out(
     """Call the points of each group by classes of all others.
 
     Groups are runs, preparations, or whole tissues, which ought then to be called `UNKNOWN`. With runs a
-    preparation that is in several of them is left out of all. A class with too few others is not made; where
-    none is left the points are not called.
+    preparation that is in several of them is left out of all. A class with too few others is not made, and
+    its points are not called.
 
     Raises
     ------
@@ -163,7 +163,9 @@ def leave_out(
         if not rest.any():
             continue
         classes = [s.as_class() for s in spreads_of(points.where(rest), pool) if s.usable]
-        if classes:
+        if by != "tissue":
+            left &= np.isin(points.tissue, [each.name for each in classes])
+        if classes and left.any():
             trials.append(call_points(points.where(left), classes, unknown_level))
     require(bool(trials), f"{by}s", groups.tolist(), "so many that classes remain without one")
     joined = ([getattr(t, item.name) for t in trials] for item in fields(Trial))

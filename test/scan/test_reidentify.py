@@ -18,77 +18,15 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
-from tactile_resonance.multisine import design_multisine
 from tactile_resonance.rows_file import Rows, RowsWriter
 from tactile_resonance.scan import reidentify as module
-from tactile_resonance.scan.messages import make_message, to_cdr
-from tactile_resonance.scan.recorded import EXCITATION, RECORD
+from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from run_tables import START_NS, plan, result
+from run_tables import START_NS, measurement, plan, result
 
-N, RATE_HZ, PERIODS = 2000, 5000.0, 4
 SCENE = "name: x\nsensor: {band_low_hz: 210.0, band_high_hz: 290.0}\n"
-
-
-def measurement(key, realisations=1, modes=((250.0, 0.02),), hum_v=0.0):
-    """Messages of one measurement: topic, type, message."""
-    rng = np.random.default_rng(key)
-    for m in range(realisations):
-        played = design_multisine(
-            sample_rate_hz=RATE_HZ,
-            samples_per_period=N,
-            band_hz=(150.0, 350.0),
-            periods=PERIODS,
-            realisations=realisations,
-            realisation=m,
-            seed=key,
-        )
-        arrays = {name: getattr(played, name) for name in ("harmonics", "amplitude_v", "phase_rad")}
-        arrays["harmonics"] = arrays["harmonics"].astype(np.uint32)
-        yield (
-            "/excitation",
-            EXCITATION,
-            make_message(
-                EXCITATION,
-                measurement_id=key,
-                grid=1,
-                realisation=m,
-                realisations=realisations,
-                periods=PERIODS,
-                sample_rate_hz=RATE_HZ,
-                samples_per_period=N,
-                seed=key,
-                **arrays,
-            ),
-        )
-        s = 2j * np.pi * np.fft.rfftfreq(N, 1 / RATE_HZ)
-        g = 0.1
-        for f0_hz, zeta in modes:
-            w0 = 2 * np.pi * f0_hz
-            g = g + 2 * zeta * w0**2 / (s**2 + 2 * zeta * w0 * s + w0**2)
-        u = np.tile(played.period(), PERIODS)
-        y = np.tile(np.fft.irfft(g * np.fft.rfft(played.period()), N), PERIODS)
-        y = y + 1e-3 * rng.standard_normal(y.size)
-        y = y + hum_v * np.cos(2 * np.pi * 251.4 * np.arange(y.size) / RATE_HZ)
-        for block in range(PERIODS):
-            here = slice(block * N, (block + 1) * N)
-            yield (
-                "/record",
-                RECORD,
-                make_message(
-                    RECORD,
-                    measurement_id=key,
-                    realisation=m,
-                    block_index=block,
-                    sample_rate_hz=RATE_HZ,
-                    samples_per_period=N,
-                    actuator_v=u[here],
-                    sensor_v=y[here],
-                    final=block == PERIODS - 1 and m == realisations - 1,
-                ),
-            )
 
 
 def make_run(folder, measurements, scene=SCENE):

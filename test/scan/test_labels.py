@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""References from runs, by the command: labels, library, trial, figures, and what is refused."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.cli import main
+from tactile_resonance.front import read_run
+from tactile_resonance.scan.labels import (
+    PLACE_M,
+    labelled_frfs,
+    nominal_of,
+    read_labels,
+    reference_points,
+)
+from tactile_resonance.scan.messages import to_cdr
+from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.scene import read_scan_scene
+from tactile_resonance.tissue.references import read_classes
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from run_tables import START_NS, measurement, plan, result
+
+SCENE = """
+force_n: 0.01
+positions: {list: [[0.0, 0.0]]}
+regions:
+  - {name: gel 10 %, gelatine_percent: 10.0, box: {low_m: [-0.01, -0.01], high_m: [0.0071, 0.01]}}
+  - {name: gel 12 %, gelatine_percent: 12.0, box: {low_m: [0.0071, -0.01], high_m: [0.1, 0.01]}}
+"""
+NOMINAL = Path("config/scenes/two_gelatines.yaml")
+MEANS = np.array([[254.0, 0.0336], [256.5, 0.0361]])
+STD = np.array([0.3, 3e-4])
+
+
+def make_run(folder, rng, points=8, scene=SCENE, periods_of=(), **values):
+    """Points 2 mm apart, two at each place, the first half of one tissue, its casting that of the run."""
+    castings = MEANS + STD * rng.standard_normal((2, 1))
+    with RunDirectory.create(folder, scene, plan(points), {}) as run:
+        for index in range(points):
+            f0_hz, damping = castings[2 * index // points] + 0.1 * STD * rng.standard_normal(2)
+            given = {
+                "x_m": 0.002 * (index - index % 2),
+                "f0_hz": f0_hz,
+                "damping_ratio": damping,
+                "force_n": 0.01,
+                "force_std_n": 1e-5,
+                "contact_age_s": 1.0,
+                "simulated": True,
+            }
+            with run.begin_point(index) as recording:
+                if index in periods_of:
+                    modes = [(f0_hz, damping)]
+                    for k, (topic, name, message) in enumerate(
+                        measurement(100 + index, modes=modes)
+                    ):
+                        recording.write(topic, name, START_NS + k, to_cdr(message))
+                    given["measurement_id"] = 100 + index
+                recording.finish(result(index, recording.attempt, **{**given, **values}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder, rng = tmp_path_factory.mktemp("runs"), np.random.default_rng(1)
+    return [
+        make_run(folder / f"day {k}", rng, periods_of=range(8) if k < 2 else ()) for k in range(6)
+    ]
+
+
+def called(arguments, capsys, status=0):
+    """What the command prints, of errors where it fails."""
+    assert main([str(each) for each in arguments]) == status
+    printed = capsys.readouterr()
+    return printed.err if status else printed.out
+
+
+def test_a_library_of_runs_serves_a_scene(runs, tmp_path, capsys):
+    library, figure = tmp_path / "library.yaml", tmp_path / "library.png"
+    printed = called(
+        [
+            *("references", "build", *runs, "--labels", "scene", "--nominal", NOMINAL),
+            *("--output", library, "--figure", figure),
+        ],
+        capsys,
+    )
+    assert "gel 10 %: 24 points" in printed
+    assert "preparation" in printed
+    assert "5 degrees of freedom" in printed
+    assert "called right: 4" in printed
+    assert "smallest step from 10 to 12 %, separated at 99 %" in printed
+    assert figure.stat().st_size > 40_000
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "force_n: 0.01\npositions: {list: [[0, 0]]}\ntissue_classes: library.yaml\n"
+        "precision: {separate: [gel 10 %, gel 12 %], probability: 0.99}\n"
+    )
+    read = read_scan_scene(scene)
+    assert [each.name for each in read.tissue_classes] == ["gel 10 %", "gel 12 %"]
+    assert read.nominal_contact.sensitivity.per_n[0] == 266.0
+    for each, mean in zip(read.tissue_classes, MEANS, strict=True):
+        assert np.all(np.abs(each.mean - mean) < 4 * STD / np.sqrt(6))
+        # six castings: twice the deviation, or half, is one in a thousand
+        assert 0.5 < np.sqrt(each.spread[0, 0]) / STD[0] < 2.5
+
+
+def test_a_library_is_checked_on_another_run(runs, tmp_path, capsys):
+    library = tmp_path / "library.yaml"
+    called(
+        [
+            "references",
+            "build",
+            *runs[:5],
+            "--labels",
+            "scene",
+            "--nominal",
+            NOMINAL,
+            "--output",
+            library,
+        ],
+        capsys,
+    )
+    labels = tmp_path / "labels.csv"
+    # the first four are no longer what they are said to be
+    labels.write_text(
+        "index,tissue\n" + "".join(f"{k},gel {10 + 2 * (k > 3)} %\n" for k in range(7))
+    )
+    figure = tmp_path / "check.svg"
+    check = ["references", "check", runs[5], "--library", library, "--labels", labels]
+    printed = called([*check, "--figure", figure], capsys)
+    assert "left out: 1 points, no label" in printed
+    assert "called right: 7 of 7" in printed
+    assert figure.read_text().startswith("<?xml")
+    labels.write_text("tissue\nliver\n")
+    printed = called(check, capsys)
+    assert "liver, not in the library: 0 of 8" in printed
+
+
+def test_one_preparation_is_declared(runs, tmp_path, capsys):
+    library = tmp_path / "library.yaml"
+    build = [
+        "references",
+        "build",
+        runs[0],
+        "--labels",
+        "scene",
+        "--nominal",
+        NOMINAL,
+        "--output",
+        library,
+    ]
+    printed = called(build, capsys)
+    assert "preparation  not determined: one preparation" in printed
+    assert "does not hold for another preparation" in printed
+    assert "not tried: preparations" in printed
+    assert "gel 12 %: spread of preparation not determined" in library.read_text()
+    labels = tmp_path / "labels.csv"
+    labels.write_text("index,tissue\n0,gel\n")
+    build[build.index("scene")] = labels
+    message = called(build, capsys, status=1)
+    assert "gel: degrees_of_freedom: got 0.0" in message
+    assert "more preparations, or spreads pooled" in message
+
+
+def test_variance_by_source_of_runs(runs, tmp_path, capsys):
+    figure = tmp_path / "variance.png"
+    printed = called(
+        ["references", "variance", *runs[:2], "--labels", "scene", "--figure", figure], capsys
+    )
+    lines = [line for line in printed.splitlines() if line.startswith("over ")]
+    assert [line.split(":")[0] for line in lines] == [
+        f"over {name}" for name in ("period", "repetition", "position", "preparation")
+    ]
+    # two tissues of two castings, four places, two repetitions, three settled periods of each
+    assert [int(line.split(", ")[1].split()[0]) for line in lines] == [32, 8, 4, 2]
+    level_db = [float(line.split()[2]) for line in lines]
+    assert level_db[0] < level_db[1] < level_db[3]
+    assert figure.stat().st_size > 20_000
+
+
+def test_labels_of_points_places_and_what_is_left_out(tmp_path):
+    rng = np.random.default_rng(2)
+    run = make_run(tmp_path / "one", rng, 4)
+    bad = make_run(tmp_path / "two", rng, 2, force_n=-0.001)
+    contents = [read_run(path) for path in (run, bad)]
+    path = tmp_path / "labels.csv"
+    path.write_text(
+        "run, index, tissue, preparation\none, , gel, dish 1\none, 3, fat, \ntwo, , gel, dish 1\n"
+    )
+    _, nominal = read_classes(NOMINAL)
+    points, left_out = reference_points(contents, read_labels(path, contents), nominal)
+    assert points.tissue.tolist() == ["gel"] * 3 + ["fat"]
+    assert points.preparation.tolist() == ["dish 1"] * 3 + ["one"]
+    assert points.position.tolist() == ["0, 0"] * 2 + [f"{round(0.004 / PLACE_M)}, 0"] * 2
+    assert left_out == {"the force is -1 mN: the tip was not pressed on": 2}
+    # what force and age add is beside what was measured
+    assert np.all(points.covariance[:, 0, 0] > points.measured[:, 0, 0])
+    assert nominal_of(contents) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("index\n0\n", "columns: got .'index'.; accepted is tissue among them"),
+        ("tissue,batch\ngel,1\n", "column: got 'batch'; accepted is one of run, index, tissue"),
+        ("run,tissue\nthree,gel\n", "line 2: run: got 'three'; accepted is one of one"),
+        ("index,tissue\n-1,gel\n", "line 2: index: got '-1'"),
+        ("index,tissue\n0,unknown\n", "line 2: tissue: got 'unknown'"),
+        ("index,tissue\n0,gel\n0,gel\n", "line 3: index: got '0'; accepted is one row"),
+    ],
+)
+def test_wrong_labels_are_refused(tmp_path, text, message):
+    contents = [read_run(make_run(tmp_path / "one", np.random.default_rng(3), 2))]
+    path = tmp_path / "labels.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_labels(path, contents)
+
+
+def test_refusals(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    run = make_run(tmp_path / "one", rng, 2)
+    with_classes = SCENE + NOMINAL.read_text().partition("tissue_classes:")[2].join(
+        ["tissue_classes:", ""]
+    )
+    other = make_run(tmp_path / "two", rng, 2, with_classes)
+    contents = [read_run(path) for path in (run, other)]
+    with pytest.raises(ValueError, match="two: nominal_contact: .*give one for all with --nominal"):
+        nominal_of(contents)
+    label_of = read_labels_of_all(tmp_path, contents)
+    with pytest.raises(ValueError, match="runs: .*folders of different names"):
+        reference_points([contents[0], contents[0]], label_of, None)
+    with pytest.raises(ValueError, match="points: .*one labelled point with poles"):
+        reference_points(contents, lambda run, result: None, None)
+    with pytest.raises(ValueError, match="nothing was measured.*one labelled point of two blocks"):
+        labelled_frfs(contents, label_of)
+    arguments = ["references", "build", run, "--labels", "scene", "--output", tmp_path / "x.yaml"]
+    empty = tmp_path / "empty.yaml"
+    empty.write_text("name: x\n")
+    message = called([*arguments, "--nominal", empty], capsys, status=1)
+    assert "empty.yaml: nominal_contact: got None" in message
+
+
+def read_labels_of_all(folder, contents):
+    path = folder / "all.csv"
+    path.write_text("run,tissue\n" + "".join(f"{run.path.name},gel\n" for run in contents))
+    return read_labels(path, contents)
