@@ -157,6 +157,7 @@ def run_job(job: Job) -> int:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
     parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
+    parameters["pole_map_node"]["unknown_level"] = content.unknown_level
     if content.adaptive is not None and isinstance(content.adaptive.wanted, WantedBoundary):
         ends = content.adaptive.wanted.level_set
         finite = [end if math.isfinite(end) else 0.0 for end in (ends.low, ends.high)]

@@ -76,6 +76,7 @@ def measured_result(
         poles,
         measured.origin,
         scene.tissue_classes,
+        scene.unknown_level,
         nominal=scene.nominal_contact,
         age_s=measured.contact_age_s,
     )

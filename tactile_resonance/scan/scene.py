@@ -239,6 +239,8 @@ class ScanScene:
         A measurement during which the force moved more is repeated; None: none is.
     tissue_classes : tuple of TissueClass
         Tissues that a point may be called; empty: none is called.
+    unknown_level : float
+        A pole farther from every class than this part of the class's members is of none: see `classify`.
     nominal_contact : NominalContact or None
         Force and age of contact to which the classes refer, and how poles change beside them; None: not known.
     on_failure : OnFailure
@@ -265,6 +267,7 @@ class ScanScene:
     blocks: BlockLimits | None = None
     gate: Gate | None = None
     tissue_classes: tuple[TissueClass, ...] = ()
+    unknown_level: float = 0.01
     nominal_contact: NominalContact | None = None
     on_failure: OnFailure = OnFailure.CONTINUE
     time_limits: TimeLimits = field(default_factory=TimeLimits)
@@ -275,6 +278,8 @@ class ScanScene:
 
     def __post_init__(self) -> None:
         check_above_zero(self, "force_n")
+        level = self.unknown_level
+        require(0 < level < 1, "unknown_level", level, "a number above 0, below 1")
         accepted = f"at most {MOST_FORCE_N:g}; contact control accepts less, by its limits"
         require(self.force_n <= MOST_FORCE_N, "force_n", self.force_n, accepted)
         require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")
