@@ -79,6 +79,7 @@ def _parser() -> OneLineParser:
         benchmark,
         calibrate_table,
         check_robot,
+        compare,
         compile,
         figures,
         plan,
@@ -97,7 +98,7 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(plan, scan, analyze, reidentify, references, report, figures, benchmark),
+        *(plan, scan, analyze, reidentify, references, compare, report, figures, benchmark),
         *(calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
     ):
         command.add_parser(commands)

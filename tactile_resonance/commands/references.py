@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from tactile_resonance.scan.labels import LabelOf
     from tactile_resonance.scan.point_result import PointResult
     from tactile_resonance.scan.run_content import RunContent
-    from tactile_resonance.tissue.nominal_contact import NominalContact
     from tactile_resonance.tissue.spread import TissueSpread
     from tactile_resonance.tissue.trial import ReliabilityBin, Trial
 
@@ -108,14 +107,14 @@ def _add_runs(parser: argparse.ArgumentParser) -> None:
 def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.report.drawing import save_figure
     from tactile_resonance.report.references_figure import draw_references
-    from tactile_resonance.scan.labels import nominal_of, reference_points
+    from tactile_resonance.scan.labels import nominal_of, read_nominal, reference_points
     from tactile_resonance.tissue.references import library_text
     from tactile_resonance.tissue.spread import spreads_of
     from tactile_resonance.tissue.step import smallest_steps
     from tactile_resonance.tissue.trial import leave_out, reliability
 
     runs = _read_runs(options.runs)
-    nominal = _nominal(options.nominal) if options.nominal else nominal_of(runs)
+    nominal = read_nominal(options.nominal) if options.nominal else nominal_of(runs)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     spreads = spreads_of(points, options.pool)
     comment = [
@@ -166,14 +165,14 @@ def _build(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from tactile_resonance.report.drawing import new_figure, save_figure
     from tactile_resonance.report.references_figure import draw_reliability
-    from tactile_resonance.scan.labels import reference_points
+    from tactile_resonance.scan.labels import read_nominal, reference_points
     from tactile_resonance.tissue.references import read_classes
     from tactile_resonance.tissue.trial import call_points, reliability
 
     runs = _read_runs(options.runs)
     classes, nominal = read_classes(options.library)
     if options.nominal:
-        nominal = _nominal(options.nominal)
+        nominal = read_nominal(options.nominal)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     trial = call_points(points, classes, options.unknown_level)
     bins = reliability(trial)
@@ -226,15 +225,6 @@ def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
 
 def _simulated(runs: Sequence[RunContent]) -> bool:
     return any(result.simulated for run in runs for result in run.latest)
-
-
-def _nominal(path: Path) -> NominalContact | None:
-    from tactile_resonance.fields import read_yaml, require
-    from tactile_resonance.tissue.references import parse_nominal_contact
-
-    nominal = parse_nominal_contact(read_yaml(path), f"{path.name}:")
-    require(nominal is not None, f"{path.name}: nominal_contact", None, "a file with one")
-    return nominal
 
 
 def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.fields import read_text, require
+from tactile_resonance.fields import read_text, read_yaml, require
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.scan.point_result import PointKind, PointResult
@@ -21,6 +21,7 @@ from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import read_run_scene
 from tactile_resonance.tissue.classify import UNKNOWN
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
+from tactile_resonance.tissue.references import parse_nominal_contact
 from tactile_resonance.tissue.spread import ReferencePoints
 
 PLACE_M = 1e-4
@@ -79,6 +80,20 @@ def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
         return labels.get((name, result.index)) or labels.get((name, None))
 
     return of
+
+
+def read_nominal(path: Path) -> NominalContact:
+    """Section ``nominal_contact`` of a YAML file, such as a scene or a library.
+
+    Raises
+    ------
+    ValueError
+        If it is not there, or wrong.
+    """
+    nominal = parse_nominal_contact(read_yaml(path), f"{path.name}:")
+    if nominal is None:
+        raise ValueError(f"{path.name}: nominal_contact: got None; accepted is a file with one")
+    return nominal
 
 
 def nominal_of(runs: Sequence[RunContent]) -> NominalContact | None:

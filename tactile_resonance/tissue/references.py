@@ -31,7 +31,7 @@ from tactile_resonance.tissue.nominal_contact import (
     NominalContact,
     sensitivity_of_preloads,
 )
-from tactile_resonance.tissue.spread import LEVELS, Source, TissueSpread
+from tactile_resonance.tissue.spread import LEVELS, SpreadSource, TissueSpread
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -104,10 +104,10 @@ class _Source:
             self.degrees_of_freedom > 0, "degrees_of_freedom", self.degrees_of_freedom, "above 0"
         )
 
-    def named(self, name: str) -> Source:
+    def named(self, name: str) -> SpreadSource:
         std = self.f0_std_hz, self.damping_ratio_std
         covariance = _covariance(*std, self.correlation)
-        return Source(name, covariance, self.degrees_of_freedom, self.holds)
+        return SpreadSource(name, covariance, self.degrees_of_freedom, self.holds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +206,7 @@ def parse_nominal_contact(content: Mapping[str, Any], where: str) -> NominalCont
     return read_dataclass(NominalContact, rest, where, sensitivity=sensitivity)
 
 
-def read_sources(path: Path) -> dict[str, tuple[Source, ...]]:
+def read_sources(path: Path) -> dict[str, tuple[SpreadSource, ...]]:
     """Section ``spread`` of a file that `library_text` made: sources of spread that are determined, by tissue.
 
     Raises

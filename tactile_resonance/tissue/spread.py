@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -67,7 +67,7 @@ class ReferencePoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class SpreadSource:
     """Spread from one source.
 
     Attributes
@@ -102,7 +102,7 @@ class TissueSpread:
         determined, and the uncertainty of the mean.
     degrees_of_freedom : float
         Of that covariance together with the mean noise of the points; 0 where no source is determined.
-    sources : tuple of Source
+    sources : tuple of SpreadSource
         By `LEVELS`.
     noise, force, block : (2, 2) float
         Means over the points: covariance of a measurement; what force and age of contact add to it; that
@@ -114,7 +114,7 @@ class TissueSpread:
     mean: FloatArray
     covariance: FloatArray
     degrees_of_freedom: float
-    sources: tuple[Source, ...]
+    sources: tuple[SpreadSource, ...]
     noise: FloatArray
     force: FloatArray
     block: FloatArray
@@ -211,7 +211,7 @@ def _spreads(points: ReferencePoints, names: Sequence[str]) -> tuple[TissueSprea
 
 def _sources(
     found: NestedMeans, covariance: FloatArray
-) -> tuple[FloatArray, tuple[Source, ...], FloatArray]:
+) -> tuple[FloatArray, tuple[SpreadSource, ...], FloatArray]:
     """Mean squares (L, 2, 2), sources, and by how much of each mean square each source is made of (L, L)."""
     count = len(found.levels)
     squares, spread, parts = (
@@ -219,13 +219,13 @@ def _sources(
         np.zeros((count, 2, 2)),
         np.zeros((count,) * 2),
     )
-    sources: list[Source] = []
+    sources: list[SpreadSource] = []
     held: list[str] = []
     for i in reversed(range(count)):
         level = found.levels[i]
         if not level.dof:
             held.insert(0, level.name)
-            sources.insert(0, Source(level.name, np.full((2, 2), np.nan)))
+            sources.insert(0, SpreadSource(level.name, np.full((2, 2), np.nan)))
             continue
         squares[i] = level.deviations.T @ level.deviations / level.dof
         parts[i, i] = 1
@@ -234,7 +234,7 @@ def _sources(
             rest = rest - level.holds[j] * spread[j]
             parts[i] -= level.holds[j] * parts[j]
         spread[i] = not_negative(rest, squares[i])
-        sources.insert(0, Source(level.name, spread[i], level.dof, tuple(held)))
+        sources.insert(0, SpreadSource(level.name, spread[i], level.dof, tuple(held)))
         held = []
     return squares, tuple(sources), parts
 
@@ -254,6 +254,23 @@ def _degrees_of_freedom(
             variance += share @ share / level.dof
     known = float(np.trace(variance @ estimated))
     return float(np.trace(estimated)) / known if known > 0 else float("inf")
+
+
+def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> FloatArray:
+    """(2, 2) spread of points of one preparation: by position and repetition, mean over the tissues.
+
+    Raises
+    ------
+    ValueError
+        If a tissue has none of both.
+    """
+    found = []
+    for sources in tissues:
+        inner = [s.covariance for s in sources if s.name != LEVELS[0] and s.degrees_of_freedom]
+        accepted = "position or repetition: two points of one preparation or more"
+        require(bool(inner), "spread", [source.name for source in sources], accepted)
+        found.append(np.sum(inner, axis=0))
+    return np.mean(found, axis=0)
 
 
 def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:

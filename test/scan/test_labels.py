@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """References from runs, by the command: labels, library, trial, figures, and what is refused."""
 
+import csv
 import sys
 from pathlib import Path
 
@@ -179,6 +180,27 @@ def test_variance_by_source_of_runs(runs, tmp_path, capsys):
     level_db = [float(line.split()[2]) for line in lines]
     assert level_db[0] < level_db[1] < level_db[3]
     assert figure.stat().st_size > 20_000
+
+
+def test_points_of_a_map_are_compared(runs, tmp_path, capsys):
+    library, output = tmp_path / "library.yaml", tmp_path / "compared"
+    arguments = ["--labels", "scene", "--nominal", NOMINAL, "--output", library]
+    called(["references", "build", *runs, *arguments], capsys)
+    compare = ["compare", runs[0], "--nominal", NOMINAL, "--output", output]
+    printed = called([*compare, "--library", library], capsys)
+    assert "4 of 8 points differ from the rest" in printed
+    assert "16 of 28 pairs differ" in printed
+    assert "2 groups" in printed
+    rows = list(csv.DictReader((tmp_path / "compared.csv").open()))
+    assert [row["group"] for row in rows] == ["1"] * 4 + ["2"] * 4
+    assert {row["pairs_that_differ"] for row in rows} == {"4"}
+    assert len({row["differs"] for row in rows[:4]}) == 1
+    assert (tmp_path / "compared.png").stat().st_size > 40_000
+    # one preparation, one point: nothing is known of the spread within
+    source = "{f0_std_hz: 1, damping_ratio_std: 0.01, degrees_of_freedom: 3}"
+    library.write_text(f"spread: {{gel: {{preparation: {source}}}}}")
+    message = called([*compare, "--library", library], capsys, status=1)
+    assert "spread: got ['preparation']; accepted is position or repetition" in message
 
 
 def test_labels_of_points_places_and_what_is_left_out(tmp_path):

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Statements over a map: rates of false discoveries, groups behind known noise, smallest steps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special, stats
+from scipy.special import logsumexp
+from tissue.reference_points import NOISE, covariance
+
+from tactile_resonance.tissue.clusters import find_clusters
+from tactile_resonance.tissue.differences import differences_from_rest, pairs_that_differ
+from tactile_resonance.tissue.spread import SpreadSource, TissueSpread
+from tactile_resonance.tissue.step import percent_of, smallest_steps
+
+NONE = np.zeros((2, 2))
+MEAN = np.array([254.0, 0.0336])
+STEP = np.array([2.5, 2.5e-3])
+
+
+def points(rng, shifts, spread=NONE, noisy=(1, 1)):
+    """Points at MEAN + shifts (n, 2), with noise of their own between `noisy` times the usual deviation."""
+    factor = rng.uniform(*noisy, len(shifts)) ** 2
+    noise = factor[:, None, None] * NOISE
+    own = np.array([rng.multivariate_normal([0, 0], each + spread) for each in noise])
+    return MEAN + shifts + own, noise
+
+
+def test_false_discoveries_are_as_rare_as_asked_for():
+    """200 maps of 40 points, 10 of them off; the rate is the mean over maps."""
+    rng, rate = np.random.default_rng(1), 0.1
+    spread = covariance(0.1, 2e-4, 0.9)
+    off = np.zeros((40, 2))
+    off[:10, 1] = 6 * 1e-4 * np.linspace(1, 1.5, 10)
+    false, found, pairs_false = [], [], []
+    for _ in range(200):
+        x, noise = points(rng, off, spread)
+        result = differences_from_rest(x, noise, spread, rate)
+        false.append(np.sum(result.differs[10:]) / max(1, np.sum(result.differs)))
+        found.append(np.mean(result.differs[:10]))
+        pairs = pairs_that_differ(x, noise, spread, rate)
+        assert not np.diag(pairs).any()
+        np.testing.assert_array_equal(pairs, pairs.T)
+        pairs_false.append(pairs[10:, 10:].sum() / max(1, pairs.sum()))
+    assert np.mean(false) < rate + 4 * np.std(false) / np.sqrt(200)
+    assert np.mean(found) > 0.9
+    assert np.mean(pairs_false) < rate
+
+
+def test_a_map_of_one_tissue_has_no_points_that_differ_but_as_often_as_asked_for():
+    rng, rate = np.random.default_rng(2), 0.05
+    any_ = [
+        differences_from_rest(
+            *points(rng, np.zeros((25, 2)), noisy=(1, 5)), NONE, rate
+        ).differs.any()
+        for _ in range(600)
+    ]
+    assert np.sum(any_) <= stats.binom.ppf(0.9999, 600, rate)
+    assert np.sum(any_) >= stats.binom.ppf(0.0001, 600, rate / 2)
+
+
+def test_the_rest_is_the_larger_group_wherever_it_lies():
+    rng = np.random.default_rng(3)
+    shifts = np.repeat([[0, 0], [2.5, 2.5e-3], [5, 5e-3]], [10, 12, 9], axis=0)
+    result = differences_from_rest(*points(rng, shifts), NONE)
+    np.testing.assert_array_equal(result.differs, shifts[:, 0] != 2.5)
+    np.testing.assert_allclose(result.rest, MEAN + shifts[12], atol=0.02)
+    x, noise = points(rng, np.zeros((1, 2)))
+    assert not differences_from_rest(x, noise, NONE).differs.any()
+    assert pairs_that_differ(x, noise, NONE).shape == (1, 1)
+
+
+def test_distances_are_those_of_a_point_from_the_mean_of_the_others():
+    x, noise = points(np.random.default_rng(4), np.zeros((3, 2)), noisy=(1, 3))
+    result = differences_from_rest(x, noise, NONE, 1e-9)
+    for k in range(3):
+        others = [j for j in range(3) if j != k]
+        information = sum(np.linalg.inv(noise[j]) for j in others)
+        of_mean = np.linalg.inv(information)
+        off = x[k] - of_mean @ sum(np.linalg.inv(noise[j]) @ x[j] for j in others)
+        squared = off @ np.linalg.solve(noise[k] + of_mean, off)
+        assert result.p[k] == pytest.approx(np.exp(-squared / 2))
+
+
+def test_groups_are_found_without_the_noise_of_their_points():
+    """Three groups of spread less than the noise of the worst points: number, means and spreads."""
+    rng, spread = np.random.default_rng(5), covariance(0.1, 1.2e-4, 0.5)
+    kind = np.repeat([0, 1, 2], [120, 80, 60])
+    x, noise = points(rng, kind[:, None] * STEP, spread, (0.5, 12))
+    found = find_clusters(x, noise)
+    assert len(found.mean) == 3
+    np.testing.assert_allclose(found.weight, [120 / 260, 80 / 260, 60 / 260], atol=0.02)
+    np.testing.assert_allclose(found.mean, MEAN + np.arange(3)[:, None] * STEP, atol=0.08)
+    for each in found.covariance:
+        # 60 points of which a half tell: within a factor of two of the variance
+        assert 0.5 < each[0, 0] / spread[0, 0] < 2
+    assert np.mean(found.of_point == kind) > 0.99
+    np.testing.assert_allclose(found.probability.sum(axis=1), 1)
+
+
+def test_one_tissue_is_one_group():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        assert len(find_clusters(*points(rng, np.zeros((25, 2)), noisy=(1, 8))).mean) == 1
+
+
+def test_likelihood_and_criterion_are_those_of_their_definitions():
+    rng, spread = np.random.default_rng(7), covariance(0.1, 1.2e-4, 0.5)
+    x, noise = points(rng, np.repeat([[0, 0], STEP], [20, 10], axis=0), spread, (1, 4))
+    unit = np.sqrt(np.var(x, axis=0) + np.mean(noise, axis=0).diagonal())
+    for known, parameters in ((None, 11), (spread, 5)):
+        found = find_clusters(x, noise, known)
+        each = [
+            [
+                np.log(w) + stats.multivariate_normal.logpdf(one, m, c + v)
+                for w, m, v in zip(found.weight, found.mean, found.covariance, strict=True)
+            ]
+            for one, c in zip(x, noise, strict=True)
+        ]
+        log_likelihood = float(logsumexp(each, axis=1).sum() + len(x) * np.log(unit).sum())
+        assert found.log_likelihood == pytest.approx(log_likelihood, abs=1e-4)
+        assert found.parameters == parameters
+        assert found.bic[1] == pytest.approx(parameters * np.log(30) - 2 * log_likelihood, abs=1e-3)
+        assert np.argmin(found.bic) == 1
+        if known is not None:
+            np.testing.assert_allclose(found.covariance, [spread] * 2)
+
+
+def tissue(name, mean, **parts):
+    """With covariances of noise, force, block and by source."""
+    sources = tuple(
+        SpreadSource(s, parts.get(s, NONE), 5) for s in ("preparation", "position", "repetition")
+    )
+    known = [parts.get(part, NONE) for part in ("noise", "force", "block")]
+    return TissueSpread(name, 9, np.asarray(mean), NONE, 5.0, sources, *known)
+
+
+def test_the_smallest_step_is_where_both_errors_are_one_in_a_hundred():
+    """Gelatines that much apart, with these spreads, are confused as often as the quantile says."""
+    parts = {
+        "block": NOISE,
+        "force": covariance(0.05, 1e-4, 0.2),
+        "preparation": covariance(0.4, 5e-4, 0.8),
+    }
+    low, high = (
+        tissue("gelatine 10 %", MEAN, **parts),
+        tissue("gelatine 12 %", MEAN + STEP, **parts),
+    )
+    other = replace(low, name="liver")
+    (step,) = smallest_steps([high, other, low], 0.99)
+    assert (step.first, step.from_percent, step.to_percent) == ("gelatine 10 %", 10.0, 12.0)
+    assert list(step.one_block) == ["noise", "force", "repetition", "position", "preparation"]
+    total = NONE
+    for name in step.one_block:
+        total = total + parts.get("block" if name == "noise" else name, NONE)
+        distance = np.sqrt(STEP @ np.linalg.solve(total, STEP)) * step.one_block[name] / 2
+        assert special.ndtr(-distance / 2) == pytest.approx(0.01, rel=1e-6)
+    assert step.limit["noise"] == 0
+    assert step.limit["preparation"] < step.one_block["preparation"]
+    assert smallest_steps([low, other]) == ()
+    assert (percent_of("gel 12.5% w/w"), percent_of("liver")) == (12.5, None)
+
+
+def test_refusals():
+    with pytest.raises(
+        ValueError, match=r"covariances: got \(2, 2\); accepted is shape \(1, 2, 2\)"
+    ):
+        differences_from_rest([MEAN], NOISE, NONE)
+    with pytest.raises(ValueError, match="rate: got 0; accepted is between"):
+        differences_from_rest([MEAN], [NOISE], NONE, 0)
+    with pytest.raises(ValueError, match=r"estimates: got \(0,\); accepted"):
+        find_clusters([], [])
+    with pytest.raises(ValueError, match="most: got 0"):
+        find_clusters([MEAN], [NOISE], most=0)
