@@ -10,7 +10,8 @@ from pathlib import Path
 
 NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot", "twist", "cell"),
-    *("recording", "pipeline", "live", "load", "truth", "skip", "stability", "hostile", "overview"),
+    *("recording", "pipeline", "live", "load", "truth", "skip", "references"),
+    *("stability", "hostile", "overview"),
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""

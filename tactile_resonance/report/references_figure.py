@@ -29,7 +29,7 @@ def draw_references(
     figure = new_figure(13, 9)
     (poles, sources), (calls, step) = figure.subplots(2, 2)
     figure.suptitle("References" + (f", {SIMULATED}" if simulated else ""))
-    _draw_poles(poles, points, spreads)
+    draw_poles(poles, points, spreads)
     _draw_sources(sources, spreads)
     draw_reliability(calls, bins)
     draw_steps(step, steps)
@@ -91,7 +91,8 @@ def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
     axes.grid(alpha=0.3, which="both", axis="y")
 
 
-def _draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpread]) -> None:
+def draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpread]) -> None:
+    """Points, and an ellipse for each tissue."""
     for k, spread in enumerate(spreads):
         own = points.of(spread.name)
         axes.plot(*own.estimate.T, ".", ms=3, color=f"C{k}", label=spread.name)

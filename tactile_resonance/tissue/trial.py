@@ -36,6 +36,8 @@ class Trial:
         Of the most probable class, given that it is one of them, also where `UNKNOWN` was called.
     likely : (n,) str
         That class.
+    tail : (n,) float
+        Below the level `UNKNOWN` is called.
     preparation : (n,) str
         Points of one are not independent.
     """
@@ -45,6 +47,7 @@ class Trial:
     known: npt.NDArray[np.bool_]
     probability: FloatArray
     likely: Texts
+    tail: FloatArray
     preparation: Texts
 
     def where(self, chosen: npt.NDArray[np.bool_]) -> Trial:
@@ -128,6 +131,7 @@ def call_points(
         np.isin(points.tissue, [each.name for each in classes]),
         np.array([call.probabilities[name] for call, name in zip(calls, likely, strict=True)]),
         np.array(likely),
+        np.array([call.tail_probability for call in calls]),
         np.array([f"{t}, {p}" for t, p in zip(points.tissue, points.preparation, strict=True)]),
     )
 

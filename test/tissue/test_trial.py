@@ -45,7 +45,7 @@ def test_classes_of_few_preparations_state_probabilities_and_rates_that_hold():
         )
     every = [
         np.concatenate([getattr(t, name) for t in trials])
-        for name in ("tissue", "called", "known", "probability", "likely", "preparation")
+        for name in ("tissue", "called", "known", "probability", "likely", "tail", "preparation")
     ]
     bins = reliability(type(trials[0])(*every), 0.9999)
     assert len(bins) == 7
