@@ -8,8 +8,12 @@ import csv
 import io
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tactile_resonance.files import write_whole
+
+if TYPE_CHECKING:
+    from tactile_resonance.tissue.nominal_contact import NominalContact
 
 MOST_PAIRED = 1000
 """Points of which all pairs are compared: half a million."""
@@ -56,7 +60,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--nominal",
         type=Path,
         metavar="FILE",
-        help="with nominal_contact (default: that of the runs' scenes)",
+        help="with nominal_contact (default: that of the library, else of the runs' scenes)",
     )
     parser.set_defaults(run=run)
 
@@ -65,6 +69,7 @@ def run(options: argparse.Namespace) -> int:
     """Compare, group, write both files."""
     import numpy as np
 
+    from tactile_resonance.commands.references import print_left_out
     from tactile_resonance.front import read_run
     from tactile_resonance.report.compare_figure import draw_comparison
     from tactile_resonance.report.drawing import save_figure
@@ -72,11 +77,14 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.point_result import PointKind
     from tactile_resonance.tissue.clusters import find_clusters
     from tactile_resonance.tissue.differences import differences_from_rest, pairs_that_differ
-    from tactile_resonance.tissue.references import read_sources
+    from tactile_resonance.tissue.references import read_classes, read_sources
     from tactile_resonance.tissue.spread import within_preparation
 
     runs = [read_run(path) for path in options.runs]
-    nominal = read_nominal(options.nominal) if options.nominal else nominal_of(runs)
+    if options.nominal:
+        nominal: NominalContact | None = read_nominal(options.nominal)
+    else:
+        nominal = read_classes(options.library)[1] if options.library else nominal_of(runs)
     kept, rows, left_out = [], [], Counter[str]()
     for content in runs:
         for result in content.latest:
@@ -98,8 +106,7 @@ def run(options: argparse.Namespace) -> int:
     found = differences_from_rest(x, noise, spread, options.rate)
     groups = find_clusters(x, noise, spread if spread.any() else None, options.most)
     pairs = pairs_that_differ(x, noise, spread, options.rate) if len(x) <= MOST_PAIRED else None
-    for reason, count in left_out.most_common():
-        print(f"left out: {count} points, {reason}")
+    print_left_out(left_out)
     if nominal is None:
         print("warning: no nominal_contact: points that were pressed otherwise differ for that")
     std = np.sqrt(np.diag(spread))

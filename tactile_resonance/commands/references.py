@@ -127,8 +127,9 @@ def _build(options: argparse.Namespace) -> int:
             if s.undetermined
         ),
     ]
-    for line in (*_left_out(left_out), *(line for s in spreads for line in _spread_lines(s))):
-        print(line)
+    print_left_out(left_out)
+    for spread in spreads:
+        print("\n".join(_spread_lines(spread)))
     write_whole(options.output, library_text(spreads, nominal, comment).encode())
     if nominal is None:
         print("warning: no nominal_contact: force and age of contact are part of the spread")
@@ -176,7 +177,7 @@ def _check(options: argparse.Namespace) -> int:
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     trial = call_points(points, classes, options.unknown_level)
     bins = reliability(trial)
-    print("\n".join(_left_out(left_out)))
+    print_left_out(left_out)
     _print_trial(trial, bins, options.unknown_level)
     if options.figure:
         figure = new_figure(6, 5)
@@ -199,7 +200,7 @@ def _variance(options: argparse.Namespace) -> int:
     inside = (lines_hz >= band_hz[0]) & (lines_hz <= band_hz[1])
     whole = analyse_variance(g, lines_hz, groups)
     band = analyse_variance(g[:, inside], lines_hz[inside], groups)
-    print("\n".join(_left_out(left_out)))
+    print_left_out(left_out)
     for source in reversed(band.sources):
         print(
             f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {band_hz[0]:g}-{band_hz[1]:g} Hz, "
@@ -250,8 +251,10 @@ def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:
     return of
 
 
-def _left_out(reasons: Counter[str]) -> list[str]:
-    return [f"left out: {count} points, {reason}" for reason, count in reasons.most_common()]
+def print_left_out(reasons: Counter[str]) -> None:
+    """How many points, and why."""
+    for reason, count in reasons.most_common():
+        print(f"left out: {count} points, {reason}")
 
 
 def _spread_lines(spread: TissueSpread) -> list[str]:

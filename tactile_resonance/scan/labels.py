@@ -25,7 +25,7 @@ from tactile_resonance.tissue.references import parse_nominal_contact
 from tactile_resonance.tissue.spread import ReferencePoints
 
 PLACE_M = 1e-4
-"""Points of one preparation that are nearer than this, in x and y, are repetitions at one position."""
+"""To which places are rounded, in x and y: points of one preparation at one place are repetitions."""
 _COLUMNS = ("run", "index", "tissue", "preparation", "position")
 
 
