@@ -67,9 +67,9 @@ class Count:
     maps : int
     """
 
-    libraries: int = 80
-    outside: int = 800
-    maps: int = 40
+    libraries: int = 40
+    outside: int = 200
+    maps: int = 20
 
 
 QUICK = Count(4, 24, 3)

@@ -113,6 +113,7 @@ def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.step import smallest_steps
     from tactile_resonance.tissue.trial import leave_out, reliability
 
+    _check_level(options.unknown_level)
     runs = _read_runs(options.runs)
     nominal = read_nominal(options.nominal) if options.nominal else nominal_of(runs)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
@@ -133,19 +134,18 @@ def _build(options: argparse.Namespace) -> int:
     write_whole(options.output, library_text(spreads, nominal, comment).encode())
     if nominal is None:
         print("warning: no nominal_contact: force and age of contact are part of the spread")
-    trial = None
+    bins: Sequence[ReliabilityBin] = ()
     try:
         trial = leave_out(points, options.leave, options.pool, options.unknown_level)
-    except ValueError as error:
-        print(f"not tried: {error}")
-    if trial is not None:
+        bins = reliability(trial)
         print(f"\none {options.leave} left out at a time:")
-        _print_trial(trial, reliability(trial), options.unknown_level)
-        if len(spreads) > 1:
-            outside = leave_out(points, "tissue", options.pool, options.unknown_level)
-            for spread in spreads:
-                of = outside.where(outside.tissue == spread.name)
-                print(f"were {spread.name} not in it: {of.share(of.called == 'unknown')} unknown")
+        _print_trial(trial, bins, options.unknown_level)
+        outside = leave_out(points, "tissue", options.pool, options.unknown_level)
+        for name in dict.fromkeys(outside.tissue.tolist()):
+            of = outside.where(outside.tissue == name)
+            print(f"were {name} not in it: {of.share(of.called == 'unknown')} unknown")
+    except ValueError as error:  # too few of something
+        print(f"not tried: {error}")
     steps = smallest_steps(spreads)
     for step in steps:
         outer = list(step.one_block)[-1]
@@ -155,7 +155,6 @@ def _build(options: argparse.Namespace) -> int:
             f"sources, {step.limit[outer]:.2g} % without noise"
         )
     if options.figure:
-        bins = () if trial is None else reliability(trial)
         save_figure(draw_references(points, spreads, bins, steps, _simulated(runs)), options.figure)
     print(
         f"library in {options.output}: tissue_classes: {options.output.name} in a scene beside it"
@@ -170,6 +169,7 @@ def _check(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.references import read_classes
     from tactile_resonance.tissue.trial import call_points, reliability
 
+    _check_level(options.unknown_level)
     runs = _read_runs(options.runs)
     classes, nominal = read_classes(options.library)
     if options.nominal:
@@ -212,6 +212,12 @@ def _variance(options: argparse.Namespace) -> int:
         title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
         save_figure(draw_variance(whole, band, band_hz, title), options.figure)
     return 0
+
+
+def _check_level(level: float) -> None:
+    from tactile_resonance.fields import require
+
+    require(0 < level < 1, "--unknown-level", level, "a number above 0, below 1")
 
 
 def _read_runs(paths: Sequence[Path]) -> list[RunContent]:

@@ -156,10 +156,7 @@ def classify(
     x, noise = np.asarray(estimate, float), np.asarray(covariance, float)
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(noise))):
         return TissueCall(UNKNOWN, float("nan"), {}, float("nan"), "no pole with a covariance")
-    densities, tails = np.transpose([_density_and_tail(x, noise, c) for c in classes])
-    weights = densities + np.log([c.prior for c in classes])
-    posterior = np.exp(weights - weights.max())
-    posterior /= posterior.sum()
+    posterior, tails = posteriors(x, noise, classes)
     probabilities = {name: float(p) for name, p in zip(names, posterior, strict=True)}
     tail = float(tails.max())
     if tail < unknown_level:
@@ -170,26 +167,53 @@ def classify(
     return TissueCall(names[best], float(posterior[best]), probabilities, tail)
 
 
+def posteriors(
+    estimates: FloatArray, noise: FloatArray, classes: Sequence[TissueClass]
+) -> tuple[FloatArray, FloatArray]:
+    """Bayes' rule over K classes, of any points.
+
+    Parameters
+    ----------
+    estimates : (..., 2) float
+        Finite, as their noise.
+    noise : (..., 2, 2) float
+    classes : sequence of TissueClass
+
+    Returns
+    -------
+    probability : (..., K) float
+        Of each class, given that it is one of them.
+    tail : (..., K) float
+        How often a member of each lies as far out.
+    """
+    found = [_density_and_tail(estimates, noise, each) for each in classes]
+    densities, tails = (np.stack(each, axis=-1) for each in zip(*found, strict=True))
+    weights = densities + np.log([each.prior for each in classes])
+    posterior = np.exp(weights - weights.max(axis=-1, keepdims=True))
+    return posterior / posterior.sum(axis=-1, keepdims=True), tails
+
+
 def log_density(estimate: FloatArray, noise: FloatArray, tissue: TissueClass) -> float:
     """Logarithm of the density of an estimate (2,) with noise (2, 2), if it is of this tissue."""
-    return _density_and_tail(estimate, noise, tissue)[0]
+    return float(_density_and_tail(estimate, noise, tissue)[0])
 
 
 def _density_and_tail(
     estimate: FloatArray, noise: FloatArray, tissue: TissueClass
-) -> tuple[float, float]:
-    """Log density, and probability of lying as far out.
+) -> tuple[FloatArray, FloatArray]:
+    """(...) log density, and probability of lying as far out, of (..., 2) with noise (..., 2, 2).
 
     With an estimated spread the sum of Student's and Gaussian deviations is taken as Student's of the
     summed scale: exact where either vanishes.
     """
     scale = tissue.spread + noise
-    unit = np.sqrt(np.diag(scale))
+    unit = np.sqrt(np.diagonal(scale, axis1=-2, axis2=-1))
     require(bool(np.all(unit > 0)), "covariance", noise.tolist(), "above 0 with the spread added")
     standard = (estimate - tissue.mean) / unit
-    correlation = scale / np.outer(unit, unit)
-    distance2 = float(standard @ np.linalg.solve(correlation, standard))
-    log_volume = 0.5 * np.linalg.slogdet(correlation)[1] + float(np.sum(np.log(unit)))
+    correlation = scale / (unit[..., :, None] * unit[..., None, :])
+    solved = np.linalg.solve(correlation, standard[..., None])[..., 0]
+    distance2 = np.sum(standard * solved, axis=-1)
+    log_volume = 0.5 * np.linalg.slogdet(correlation)[1] + np.sum(np.log(unit), axis=-1)
     dof = tissue.degrees_of_freedom
     if np.isinf(dof):
         log_shape, tail = -0.5 * distance2, special.chdtrc(2, distance2)
@@ -199,7 +223,7 @@ def _density_and_tail(
             -(dof + 2) / 2 * np.log1p(distance2 / dof),
             special.fdtrc(2, dof, distance2 / 2),
         )
-    return float(log_shape - log_volume - np.log(2 * np.pi)), float(tail)
+    return np.asarray(log_shape - log_volume - np.log(2 * np.pi)), np.asarray(tail)
 
 
 def _unit(covariance: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from tactile_resonance.fields import require
 
 FloatArray = npt.NDArray[np.float64]
-_STARTS, _ROUNDS, _CONVERGED = 6, 1000, 1e-7
+_STARTS, _ROUNDS, _CONVERGED = 6, 1000, 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from tactile_resonance.fields import (
     check_above_zero,
     check_not_negative,
     check_within,
+    cut,
     join,
     known_keys,
     read,
@@ -270,7 +271,7 @@ def library_text(
         content["nominal_contact"] = {k: v for k, v in own.items() if not math.isnan(v)}
     content["spread"] = sources
     head = ["SPDX-License-Identifier: Apache-2.0", *comment]
-    return "".join(f"# {line}\n" for line in head) + dump_yaml(content)
+    return "".join(f"# {cut(line)}\n" for line in head) + dump_yaml(content)
 
 
 def _entry(covariance: FloatArray) -> dict[str, float]:

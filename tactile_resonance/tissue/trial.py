@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from tactile_resonance.fields import require
-from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify
+from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, posteriors
 from tactile_resonance.tissue.spread import ReferencePoints, Texts, spreads_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -119,19 +119,18 @@ class ReliabilityBin:
 def call_points(
     points: ReferencePoints, classes: Sequence[TissueClass], unknown_level: float
 ) -> Trial:
-    """Call each point by classes."""
-    calls = [
-        classify(x, c, classes, unknown_level)
-        for x, c in zip(points.estimate, points.covariance, strict=True)
-    ]
-    likely = [max(call.probabilities, key=lambda name: call.probabilities[name]) for call in calls]
+    """Call each point by classes, as `classify` does."""
+    require(0 < unknown_level < 1, "unknown_level", unknown_level, "between 0 and 1")
+    names = np.array([each.name for each in classes])
+    probability, tails = posteriors(points.estimate, points.covariance, classes)
+    likely, tail = names[np.argmax(probability, axis=1)], tails.max(axis=1)
     return Trial(
         points.tissue,
-        np.array([call.name for call in calls]),
-        np.isin(points.tissue, [each.name for each in classes]),
-        np.array([call.probabilities[name] for call, name in zip(calls, likely, strict=True)]),
-        np.array(likely),
-        np.array([call.tail_probability for call in calls]),
+        np.where(tail < unknown_level, UNKNOWN, likely),
+        np.isin(points.tissue, names),
+        probability.max(axis=1),
+        likely,
+        tail,
         np.array([f"{t}, {p}" for t, p in zip(points.tissue, points.preparation, strict=True)]),
     )
 

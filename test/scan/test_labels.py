@@ -265,6 +265,8 @@ def test_refusals(tmp_path, capsys):
     empty.write_text("name: x\n")
     message = called([*arguments, "--nominal", empty], capsys, status=1)
     assert "empty.yaml: nominal_contact: got None" in message
+    message = called([*arguments, "--unknown-level", "5"], capsys, status=1)
+    assert "--unknown-level: got 5.0; accepted is a number above 0, below 1" in message
 
 
 def read_labels_of_all(folder, contents):

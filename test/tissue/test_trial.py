@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from tissue.reference_points import drawn, joined
 
-from tactile_resonance.tissue.classify import UNKNOWN
+from tactile_resonance.tissue.classify import UNKNOWN, classify
 from tactile_resonance.tissue.references import (
     library_text,
     parse_classes,
@@ -128,3 +128,16 @@ def test_refusals(tmp_path):
     path.write_text("spread: {gel: {batch: {f0_std_hz: 1, damping_ratio_std: 0}}}")
     with pytest.raises(ValueError, match="library.yaml: spread.gel.batch"):
         read_sources(path)
+
+
+def test_points_are_called_as_one_by_one():
+    rng = np.random.default_rng(7)
+    points = gelatines(rng, [(2, 2)] * 6, 0.4 * STEP, 3)
+    classes = [spread.as_class() for spread in spreads_of(points)]
+    trial = call_points(points, classes, 0.3)
+    assert UNKNOWN in trial.called
+    for k, (x, noise) in enumerate(zip(points.estimate, points.covariance, strict=True)):
+        call = classify(x, noise, classes, 0.3)
+        assert call.name == trial.called[k]
+        assert max(call.probabilities.values()) == pytest.approx(trial.probability[k])
+        assert call.tail_probability == pytest.approx(trial.tail[k])
