@@ -24,6 +24,7 @@ from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.strict_yaml import dump_yaml
+from tactile_resonance.tissue.references import with_library
 
 
 @dataclass(frozen=True)
@@ -132,10 +133,11 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     if len(poses):
         content.pop("surface", None)
         changes["positions"] = {"list": poses[:, :3].tolist()}
-    content = {**content, **changes}
+    named = isinstance(content.get("tissue_classes"), str)
+    content = with_library({**content, **changes}, path)  # a run holds what it was scanned with
     scene = replace(parse_scan_scene(content, path), frame_id=frame_id)
     text = dump_yaml(content)
-    if goal.scene and not changes:
+    if goal.scene and not (changes or named):
         text = path.read_text(encoding="utf-8")
     plan = plan_points(scene, _points(poses, scene.name)) if len(poses) else make_plan(scene)
     return WantedScan(plan, text)

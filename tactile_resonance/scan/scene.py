@@ -26,7 +26,6 @@ from tactile_resonance.fields import (
     known_keys,
     read,
     read_dataclass,
-    read_file_name,
     read_yaml,
     require,
     section,
@@ -50,7 +49,7 @@ from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import (
     parse_classes,
     parse_nominal_contact,
-    read_classes,
+    with_library,
 )
 
 # Of the simulated bench: what lies on its table, and how it moves.
@@ -344,8 +343,9 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     where = f"{path.name}:"
     keys = {item.name for item in fields(ScanScene)} - {"positions_m", "adaptive"} | {"positions"}
     known_keys(content, keys | BENCH_KEYS, where)
+    content = with_library(content, path)
     given: dict[str, Any] = {}
-    given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, path, where)
+    given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, where)
     positions = section(content, "positions", where)
     if "adaptive" in positions:
         require(len(positions) == 1, f"{where} positions", [*positions], "adaptive, or another one")
@@ -374,17 +374,11 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
 
 
 def _read_tissues(
-    content: Mapping[str, Any], path: Path, where: str
+    content: Mapping[str, Any], where: str
 ) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
-    """Classes and the contact to which they refer: given in place, or in a file beside the scene."""
-    classes = content.get("tissue_classes")
-    if isinstance(classes, str):
-        read_file_name(classes, f"{where} tissue_classes")
-        alone = "nominal_contact" not in content
-        accepted = f"none: it belongs to the classes, in {classes}"
-        require(alone, f"{where} nominal_contact", "one", accepted)
-        return read_classes(path.parent / classes)
+    """Classes and the contact to which they refer."""
     nominal = parse_nominal_contact(content, where)
+    classes = content.get("tissue_classes")
     if classes is None:
         accepted = "classes, to which nominal_contact belongs (they are missing)"
         require(nominal is None, f"{where} tissue_classes", None, accepted)

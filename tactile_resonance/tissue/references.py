@@ -22,6 +22,7 @@ from tactile_resonance.fields import (
     known_keys,
     read,
     read_dataclass,
+    read_file_name,
     read_yaml,
     require,
 )
@@ -150,11 +151,39 @@ def read_classes(path: Path) -> tuple[tuple[TissueClass, ...], NominalContact | 
     Raises
     ------
     ValueError
-        If the file or a field of it is wrong.
+        If the file, a field of it, or a library that it names is wrong.
     """
-    content, where = read_yaml(Path(path)), f"{Path(path).name}:"
+    content, where = with_library(read_yaml(Path(path)), Path(path)), f"{Path(path).name}:"
     classes = parse_classes(content.get("tissue_classes"), f"{where} tissue_classes")
     return classes, parse_nominal_contact(content, where)
+
+
+def with_library(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Content of a file, with the classes of another file that it names under ``tissue_classes`` in place.
+
+    Parameters
+    ----------
+    content : mapping
+    path : Path
+        Of the file; the other one lies beside it.
+
+    Raises
+    ------
+    ValueError
+        If the other file is wrong, or there is a ``nominal_contact`` beside its name, which belongs to the
+        classes.
+    """
+    name, where = content.get("tissue_classes"), f"{path.name}:"
+    if not isinstance(name, str):
+        return dict(content)
+    read_file_name(name, f"{where} tissue_classes")
+    alone, accepted = "nominal_contact" not in content, f"none: it belongs to the classes, in {name}"
+    require(alone, f"{where} nominal_contact", "one", accepted)
+    library = read_yaml(path.parent / name)
+    parse_classes(library.get("tissue_classes"), f"{name}: tissue_classes")
+    parse_nominal_contact(library, f"{name}:")
+    sections = ("tissue_classes", "nominal_contact")
+    return {**content, **{key: library[key] for key in sections if key in library}}
 
 
 def parse_classes(content: object, where: str) -> tuple[TissueClass, ...]:

@@ -90,6 +90,19 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
     assert (unset.plan.scene.force_n, unset.plan.scene.precision) == (0.01, Precise(0.05))
 
 
+def test_a_run_holds_the_classes_of_the_library_that_its_scene_names(scene, tmp_path):
+    path = tmp_path / "with_library" / "scene.yaml"
+    path.parent.mkdir()
+    path.write_text(SCENE + "tissue_classes: library.yaml\n")
+    (path.parent / "library.yaml").write_text(
+        "tissue_classes:\n  gel: {f0_hz: 254, damping_ratio: 0.03, f0_std_hz: 1, damping_ratio_std: 1e-3}\n"
+        "spread: {}\n"
+    )
+    wanted = read_goal(ScanGoal(scene=str(path)), FRAMES)
+    for read in (wanted.plan.scene, again(wanted, tmp_path)):
+        assert [each.name for each in read.tissue_classes] == ["gel"]
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -14,6 +14,7 @@ from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.tissue.classify import classify
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
+from tactile_resonance.tissue.references import read_classes
 
 SCENES = sorted(path.name for path in share_path("config/scenes").glob("*.yaml"))
 LEAST = {"force_n": 0.01, "positions": {"list": [[0, 0], [0.01, 0]]}}
@@ -127,6 +128,12 @@ def test_classes_from_a_file_and_from_points(tmp_path):
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(content | {"nominal_contact": NOMINAL}))
     scene = read(tmp_path, tissue_classes="classes.yaml")
     assert (scene.nominal_contact.force_n, scene.nominal_contact.age_s) == (0.02, 3.0)
+    # as pole_map_node reads a scene
+    (same,), nominal = read_classes(tmp_path / "scene.yaml")
+    assert (same.name, same.degrees_of_freedom, nominal.age_s) == ("measured", 2.0, 3.0)
+    (tmp_path / "none.yaml").write_text("name: x\n")
+    with pytest.raises(ValueError, match="none.yaml: tissue_classes: got None"):
+        read(tmp_path, tissue_classes="none.yaml")
     with pytest.raises(
         ValueError, match="nominal_contact: got 'one'; accepted is none: it belongs"
     ):
