@@ -67,6 +67,7 @@ setup(
         "scipy>=1.10,<2",
         "numba>=0.56.4,<0.70",  # from that of Debian 12 on
         "matplotlib>=3.6,<4",
+        "plotly>=5.15,<7",  # of which a report holds plotly.js
         "PyYAML>=6,<7",
         "tqdm>=4.60,<5",
     ],

@@ -31,6 +31,7 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.report.boundary import FILE, boundary_of_run
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
+    from tactile_resonance.report.point_details import details_of, truths_with
     from tactile_resonance.report.point_table import point_table, table_notes
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import (
@@ -40,11 +41,11 @@ def run(options: argparse.Namespace) -> int:
         skipped_lines,
         summary,
     )
-    from tactile_resonance.scan.bench_truth import truths_of
     from tactile_resonance.scan.plan_text import map_names
     from tactile_resonance.scan.run_content import NOT_CHECKED
 
-    truths, boundary = truths_of(content), boundary_of_run(content)
+    details, boundary = details_of(content), boundary_of_run(content)
+    truths = truths_with(content, details)
     pole_maps, pictures = pole_maps_of(content), []
     name = options.run_folder.resolve().name
     for band, pole_map in enumerate(pole_maps):
@@ -53,14 +54,14 @@ def run(options: argparse.Namespace) -> int:
             figure_bytes(draw_pole_map(pole_map, title, None if band else boundary), ".png")
         )
         write_whole(options.run_folder / map_names(band + 1)[-1], pictures[-1])
-    told = [] if boundary is None else boundary.sentences()
-    page = as_page(content, pictures, truths, told)
+    page = as_page(content, pictures, details, truths, boundary)
     write_whole(options.run_folder / "report.html", page.encode())
     if boundary is not None:
         write_whole(options.run_folder / FILE, boundary.as_json().encode())
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
+    told = [] if boundary is None else boundary.sentences()
     told = [*summary(content), *told, *(f"silent record: {line}" for line in silent_lines(content))]
     for line in (*told, *(f"left out: {line}" for line in skipped_lines(content))):
         print(line)

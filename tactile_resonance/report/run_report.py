@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as one page that needs nothing else, and as a table."""
+"""A run as one page that needs nothing else: warnings, what can be looked at by a click, tables."""
 
 from __future__ import annotations
 
 import base64
 import html
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
+from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.drawing import SIMULATED
-from tactile_resonance.report.point_table import table_notes, tissue_of
-from tactile_resonance.scan.bench_truth import PointTruth, deviation
-from tactile_resonance.scan.plan_text import plan_against_outcome
+from tactile_resonance.report.page import page
+from tactile_resonance.report.page_data import map_entry, page_data, point_entry
+from tactile_resonance.report.paper_figures import paper_figures
+from tactile_resonance.report.point_details import PointDetails, lines_each
+from tactile_resonance.report.point_table import repeats_sentence, table_notes
+from tactile_resonance.report.run_tables import Truths
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.point_times import budget_sentence, time_budget
+from tactile_resonance.scan.point_times import budget_sentence
 from tactile_resonance.scan.pole_map import PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
@@ -26,47 +30,17 @@ from tactile_resonance.scan.run_content import NOT_CHECKED, RECORDING, RunConten
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
+from tactile_resonance.tissue.classify import UNKNOWN
 
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem;
-  padding: 0 1rem; color: #222 }
-img { max-width: 100% } table { border-collapse: collapse; font-size: 13px }
-td, th { border-bottom: 1px solid #ddd; padding: .2rem .6rem; text-align: right }
-.wide { overflow-x: auto } td { white-space: nowrap } th { vertical-align: bottom }
-td.text, th.text { text-align: left } tr.failed td { color: #b00 } .mark { color: #b00; font-weight: 600 }
-pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 12px }
-"""
-Truths = Mapping[int, PointTruth]
-Columns = Sequence[tuple[str, Callable[[PointResult], str]]]
-_COLUMNS: Columns = (
-    ("point", lambda r: f"{r.index + 1}" + (f" (attempt {r.attempt + 1})" if r.attempt else "")),
-    ("x [mm]", lambda r: _number(1e3 * r.x_m, 2)),
-    ("y [mm]", lambda r: _number(1e3 * r.y_m, 2)),
-    ("z [mm]", lambda r: _number(1e3 * r.z_m, 2)),
-    ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
-    ("rms of the force, smallest to largest [mN]", lambda r: _spread(r)),
-    ("age of contact [s]", lambda r: _number(r.contact_age_s, 2)),
-    ("measured f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
-    ("measured damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
-    ("nominal f0 [Hz]", lambda r: _with_std(r.nominal_f0_hz, r.nominal_f0_std_hz, 3)),
-    (
-        "nominal damping ratio",
-        lambda r: _with_std(r.nominal_damping_ratio, r.nominal_damping_ratio_std, 5),
-    ),
-    ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
-    ("tissue", tissue_of),
-    ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
-    ("outcome", lambda r: _outcome(r)),
-)
+if TYPE_CHECKING:
+    from tactile_resonance.report.boundary import RunBoundary
+
 # Facts of the run that have a place of their own on the page.
 _SHOWN = {"skipped", "notes", "surface"}
-_AIR_COLUMNS: Columns = (
-    ("point", lambda r: f"{r.index + 1}"),
-    ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
-    ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
-    ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
-)
-_TEXT = {"tissue", "repeats", "outcome", "what", "planned", "came"}
+_CELLS = 60  # of the map between the points, along its longer side
+_MOST_NAMED = 8  # points or files, in a warning
+_SURE = ("ok", "no covariance")  # status of poles that nothing speaks against
+_SIGNIFICANT, _FORCE_SHARE = 4.0, 0.05
 
 
 def pole_maps_of(run: RunContent) -> list[PoleMap]:
@@ -86,57 +60,148 @@ def pole_maps_of(run: RunContent) -> list[PoleMap]:
 
 
 def as_page(
-    run: RunContent, pictures: Sequence[bytes], truths: Truths, boundary: Sequence[str] = ()
+    run: RunContent,
+    pictures: Sequence[bytes],
+    details: Mapping[int, PointDetails],
+    truths: Truths,
+    boundary: RunBoundary | None = None,
 ) -> str:
-    """HTML with the pictures (PNG) in it; nothing is fetched from elsewhere.
+    """HTML that needs nothing else; see `page.page`.
 
     Parameters
     ----------
     run : RunContent
     pictures : sequence of bytes
-        Maps of the bands, in their order.
+        Maps of the bands (PNG), in their order: for paper, and where no script runs.
+    details : mapping of int to PointDetails
+        By point, as far as they are to be in the page.
     truths : mapping of int to PointTruth
         What the simulated bench knew, by point; empty for hardware.
-    boundary : sequence of str
-        What is known of the boundary that was wanted.
+    boundary : RunBoundary, optional
+        That was wanted.
     """
-    name, scene = _scene_name(run), scene_of(run)
-    simulated = any(result.simulated for result in run.latest)
-    health, sentence = sensor_health(run, scene.drift_limits if scene else DriftLimits())
+    name, scene = scene_name(run), scene_of(run)
     measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     notes = run.facts.get("notes") or {"notes": "none"}
     facts = {key: value for key, value in run.facts.items() if key not in _SHOWN}
     sections = {
-        "Plan and outcome": _compared_with_plan(scene, run),
-        "Boundary": _paragraphs(boundary),
-        "Sensor in free air": _paragraphs([sentence], mark=health is not SensorHealth.STEADY),
-        "Silent record": _bullets(silent_lines(run)),
-        "Notes of the session": _bullets([f"{key}: {value}" for key, value in notes.items()]),
-        "Surface, found by touch": _touches(run.facts.get("surface")),
-        "Time": _time_table(measured),
-        "Points": _results(_COLUMNS, run.latest) + _paragraphs(table_notes(run.latest, truths)),
-        f"Against free air{' and the truth of the simulation' if truths else ''}": _results(
-            (*_AIR_COLUMNS, *_truth_columns(truths)), measured
+        "Plan and outcome": tables.plan_table(scene, run),
+        "Boundary": tables.paragraphs([] if boundary is None else boundary.sentences()),
+        "Sensor in free air": tables.paragraphs([_health(run, scene)[1]]),
+        "Silent record": tables.bullets(silent_lines(run)),
+        "Notes of the session": tables.bullets(f"{key}: {value}" for key, value in notes.items()),
+        "Surface, found by touch": tables.touches_table(run.facts.get("surface")),
+        "Time": tables.time_table(measured),
+        "Points": tables.results_table(tables.COLUMNS, run.latest)
+        + tables.paragraphs(table_notes(run.latest, truths)),
+        f"Against free air{' and the truth of the simulation' if truths else ''}": tables.results_table(
+            (*tables.AIR_COLUMNS, *tables.truth_columns(truths)), measured
         ),
-        "Further bands": _bands_table(measured),
-        "Nonlinear distortion": _distortion_table(measured),
-        "Left out": _bullets(skipped_lines(run)),
-        "Damaged files": _bullets(
-            [*run.problems, *([NOT_CHECKED.format(run.unchecked)] if run.unchecked else [])]
-        ),
+        "Further bands": tables.bands_table(measured),
+        "Nonlinear distortion": tables.distortion_table(measured),
+        "Left out": tables.bullets(skipped_lines(run)),
         "Scene": f"<pre>{html.escape(run.scene)}</pre>",
         "Made with": f"<pre>{html.escape(yaml.safe_dump(facts, sort_keys=False))}</pre>",
     }
-    parts = [f"<h1>{html.escape(name)}</h1>"]
-    parts += [_paragraphs([SIMULATED], mark=True) if simulated else "", _paragraphs(summary(run))]
-    for picture in pictures:
-        data = base64.b64encode(picture).decode()
-        parts.append(f'<img alt="pole map" src="data:image/png;base64,{data}">')
-    parts += [f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text]
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
-        f"<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
+    head = f"<h1>{html.escape(name)}</h1>{tables.warning_list(warnings_of(run, boundary))}"
+    head += tables.paragraphs(summary(run))
+    encoded = (base64.b64encode(picture).decode() for picture in pictures)
+    paper = "".join(f'<img alt="pole map" src="data:image/png;base64,{data}">' for data in encoded)
+    below = "".join(
+        f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text
     )
+    data = page_data(
+        [run_entry(run, name, details, boundary)], paper_figures(run, details), len(details)
+    )
+    return page(name, f'{head}<div class="paper">{paper}</div>', data, below)
+
+
+def run_entry(
+    run: RunContent,
+    name: str,
+    details: Mapping[int, PointDetails],
+    boundary: RunBoundary | None = None,
+) -> dict[str, Any]:
+    """A run as `page.js` shows it: its points and map in each band, and what a click on a point shows."""
+    scene = scene_of(run)
+    maps, bands = pole_maps_of(run), [None] if scene is None else scene.sensor.bands
+    lines = lines_each(len(details))
+    return {
+        "name": name,
+        "simulated": any(result.simulated for result in run.latest),
+        "force_mn": None if scene is None else 1e3 * scene.force_n,
+        "bands": [
+            {
+                "name": "" if band is None else f"{band.low_hz:g} to {band.high_hz:g} Hz",
+                "points": [point_entry(result.of_band(k)) for result in run.latest],
+                **map_entry(
+                    maps[k].surface(_CELLS) if k < len(maps) else None, None if k else boundary
+                ),
+            }
+            for k, band in enumerate(bands)
+        ],
+        "details": {str(index): each.entry(lines) for index, each in details.items()},
+    }
+
+
+def warnings_of(run: RunContent, boundary: RunBoundary | None = None) -> list[str]:
+    """What a reader must know before any figure of the run, the gravest first."""
+    scene, results = scene_of(run), run.latest
+    told = [f"damaged: {problem}" for problem in run.problems[:_MOST_NAMED]]
+    if len(run.problems) > _MOST_NAMED:
+        told.append(f"{len(run.problems) - _MOST_NAMED} further files are damaged")
+    if run.unchecked:
+        told.append(NOT_CHECKED.format(run.unchecked))
+    if scene is None:
+        told.append("scene.yaml cannot be read: plan and outcome cannot be compared")
+    if len(results) < len(run.points):
+        told.append(
+            f"{len(run.points) - len(results)} of {len(run.points)} points are not finished"
+        )
+    health, sentence = _health(run, scene)
+    if health is not SensorHealth.STEADY:
+        told.append(sentence)
+    measured = [r for r in results if r.outcome is PointOutcome.DONE]
+    off: list[PointResult] = []
+    if scene is not None:
+        off = [r for r in measured if _force_is_off(r, scene.force_n)]
+    for what, points, why in (
+        ("failed", [r for r in results if r.outcome is PointOutcome.FAILED], lambda r: r.reason),
+        (
+            "poles with a remark",
+            [r for r in measured if r.poles_status not in ("", *_SURE)],
+            lambda r: r.poles_status,
+        ),
+        ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
+        ("force not quiet at first", [r for r in measured if r.gate], lambda r: r.gate),
+        (
+            "tissue unknown",
+            [r for r in measured if r.tissue_class == UNKNOWN],
+            lambda r: r.tissue_reason,
+        ),
+    ):
+        if points:
+            named = [f"{r.index + 1}" + (f" ({text})" if (text := why(r)) else "") for r in points]
+            more = f" and {len(points) - _MOST_NAMED} more" if len(points) > _MOST_NAMED else ""
+            of = f"{len(points)} of {len(results)} points"
+            told.append(f"{what}, {of}: {', '.join(named[:_MOST_NAMED])}{more}")
+    if boundary is not None and not boundary.met:
+        told.append("the boundary is not known as well as was asked for")
+    if any(r.repeats for r in results):
+        told.append(repeats_sentence(results))
+    simulated = any(result.simulated for result in results)
+    return [*([SIMULATED] if simulated else []), *told]
+
+
+def _health(run: RunContent, scene: ScanScene | None) -> tuple[SensorHealth, str]:
+    return sensor_health(run, scene.drift_limits if scene else DriftLimits())
+
+
+def _force_is_off(result: PointResult, force_n: float) -> bool:
+    """Whether the mean force differs from the scene's beyond its noise and by more than a share of it."""
+    off_n = abs(result.force_n - force_n)
+    noise_n = np.nan_to_num(result.force_std_n)
+    return bool(off_n > _FORCE_SHARE * force_n and off_n > _SIGNIFICANT * noise_n)
 
 
 def summary(run: RunContent) -> list[str]:
@@ -230,134 +295,6 @@ def skipped_lines(run: RunContent) -> list[str]:
     return lines
 
 
-def _paragraphs(lines: Iterable[str], mark: bool = False) -> str:
-    css = ' class="mark"' if mark else ""
-    return "".join(f"<p{css}>{html.escape(line)}</p>" for line in lines)
-
-
-def _bullets(lines: Iterable[str]) -> str:
-    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
-    return items and f"<ul>{items}</ul>"
-
-
-def _row(kind: str, names: Sequence[str], texts: Sequence[str], css: str = "") -> str:
-    cells = ""
-    for name, text in zip(names, texts, strict=True):
-        side = ' class="text"' if name in _TEXT else ""
-        cells += f"<{kind}{side}>{html.escape(text)}</{kind}>"
-    return f"<tr{css}>{cells}</tr>"
-
-
-def _table(names: Sequence[str], rows: Iterable[str]) -> str:
-    return f'<div class="wide"><table>{_row("th", names, names)}{"".join(rows)}</table></div>'
-
-
-def _results(columns: Columns, results: Iterable[PointResult]) -> str:
-    names, rows = [name for name, _ in columns], []
-    for result in results:
-        css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
-        rows.append(_row("td", names, [show(result) for _, show in columns], css))
-    return _table(names, rows)
-
-
-def _truth_columns(truths: Truths) -> Columns:
-    """What the simulated bench knew; none of it for hardware."""
-    if not truths:
-        return ()
-
-    def known(show: Callable[[PointResult, PointTruth], str]) -> Callable[[PointResult], str]:
-        return lambda r: show(r, truths[r.index]) if r.index in truths else "-"
-
-    return (
-        ("true f0 [Hz]", known(lambda _, truth: _number(truth.estimate[0], 3))),
-        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[0]:+.1f}")),
-        ("true damping", known(lambda _, truth: _number(truth.estimate[1], 5))),
-        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[1]:+.1f}")),
-    )
-
-
-def _bands_table(results: Sequence[PointResult]) -> str:
-    """Poles of the bands beyond the first; empty where there are none."""
-    names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
-    for result in results:
-        for band in result.further:
-            texts = (
-                f"{result.index + 1}",
-                f"{band.band_low_hz:g} to {band.band_high_hz:g}",
-                _with_std(band.f0_hz, band.f0_std_hz, 3),
-                _with_std(band.damping_ratio, band.damping_ratio_std, 5),
-                band.poles_status,
-            )
-            rows.append(_row("td", names, texts))
-    return _table(names, rows) if rows else ""
-
-
-def _distortion_table(results: Sequence[PointResult]) -> str:
-    """Levels at the lines left out, against those excited; in brackets the noise; empty where unknown."""
-    sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
-    names, rows = ("point", "band [Hz]", *sides), []
-
-    def level(value_db: float, noise_db: float, above: bool) -> str:
-        text = f"{_number(value_db, 1)} ({_number(noise_db, 1)})"
-        return text if above else f"{text}, only noise"
-
-    for result in results:
-        for band in result.distortion:
-            texts = (
-                f"{result.index + 1}",
-                f"{band.low_hz:g} to {band.high_hz:g}",
-                level(band.even_db, band.even_noise_db, band.even_above_noise),
-                level(band.odd_db, band.odd_noise_db, band.odd_above_noise),
-                _number(band.input_even_db, 1),
-                _number(band.input_odd_db, 1),
-            )
-            rows.append(_row("td", names, texts))
-    return _table(names, rows) if rows else ""
-
-
-def _time_table(results: Sequence[PointResult]) -> str:
-    """Where the time of the points went; nothing where it is unknown, as in runs of earlier versions."""
-    budget = time_budget(results)
-    whole_s = float(sum(each.sum() for each in budget.values()))
-    if not whole_s:
-        return ""
-    names, rows = ("what", "median [s]", "largest [s]", "all points [s]", "share [%]"), []
-    for name, each in {**budget, "all": np.sum(list(budget.values()), axis=0)}.items():
-        figures = (np.median(each), each.max(), each.sum())
-        texts = (f"{figure:.2f}" for figure in figures)
-        rows.append(_row("td", names, (name, *texts, f"{100 * each.sum() / whole_s:.0f}")))
-    return _table(names, rows)
-
-
-def _compared_with_plan(scene: ScanScene | None, run: RunContent) -> str:
-    """Nothing where the scene cannot be read."""
-    if scene is None:
-        return ""
-    names = ("what", "planned", "came")
-    return _table(names, [_row("td", names, row) for row in plan_against_outcome(scene, run)])
-
-
-def _touches(surface: Mapping[str, Any] | None) -> str:
-    """What the surface rests on; empty where it was not found by touch."""
-    if surface is None:
-        return ""
-    names, rows = (
-        ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]"),
-        [],
-    )
-    for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
-        x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
-        z += f" ± {1e3 * touch['std_m']:.2g}"
-        texts = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
-        rows.append(_row("td", names, texts))
-    told = {
-        True: "The touches lie on it as well as their noise allows.",
-        False: "The touches lie off it by more than their noise explains.",
-        None: "There was no touch to spare to check it.",
-    }[surface["consistent"]]
-    return _paragraphs([f"A {surface['form']}. {told}"]) + _table(names, rows)
-
-
 def scene_of(run: RunContent) -> ScanScene | None:
     """None where it cannot be read: a run is reported whatever became of its scene."""
     try:
@@ -366,33 +303,11 @@ def scene_of(run: RunContent) -> ScanScene | None:
         return None
 
 
-def _scene_name(run: RunContent) -> str:
+def scene_name(run: RunContent) -> str:
+    """Name of what was scanned; of the folder where the scene has none."""
     try:
         content = parse_yaml(run.scene)
     except ValueError:
         content = None
     named = content.get("name") if isinstance(content, dict) else None
     return str(named or run.path.name)
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "-"
-
-
-def _with_std(value: float, std: float, digits: int) -> str:
-    text = _number(value, digits)
-    return f"{text} ± {std:.2g}" if np.isfinite(value) and np.isfinite(std) else text
-
-
-def _spread(result: PointResult) -> str:
-    """How the force moved while it was measured."""
-    if not np.isfinite(result.force_rms_n):
-        return "-"
-    low, high = (_number(1e3 * force, 2) for force in (result.force_min_n, result.force_max_n))
-    return f"{_number(1e3 * result.force_rms_n, 2)}, {low} to {high}"
-
-
-def _outcome(result: PointResult) -> str:
-    parts = [result.outcome.name.lower(), result.verdict, result.gate]
-    parts += [result.reason, result.tissue_reason, result.notes]
-    return "; ".join(part for part in parts if part)

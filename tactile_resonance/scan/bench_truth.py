@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
@@ -40,17 +41,29 @@ class PointTruth:
     force_rms_n: float
 
 
-def truths_of(run: RunContent) -> dict[int, PointTruth]:
+def truths_of(run: RunContent, known: Container[int] = ()) -> dict[int, PointTruth]:
     """Truth of the latest attempts, by point; empty for a run on hardware.
+
+    Parameters
+    ----------
+    run : RunContent
+    known : container of int
+        Points that are left out.
 
     Raises
     ------
     ValueError
         If a file is damaged.
     """
-    simulated = [r for r in run.latest if r.simulated and r.outcome is PointOutcome.DONE]
-    truths = {result.index: _truth_of(run, result) for result in simulated}
-    return {index: truth for index, truth in truths.items() if truth is not None}
+    truths = {}
+    for result in run.latest:
+        if not result.simulated or result.outcome is not PointOutcome.DONE or result.index in known:
+            continue
+        messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
+        told = [poles_from_message(message) for _, _, message in messages]
+        if truth := truth_of_point(told, result):
+            truths[result.index] = truth
+    return truths
 
 
 def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:
@@ -64,11 +77,20 @@ def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
     return (result.estimate - truth.estimate) / np.sqrt(np.diag(result.covariance))
 
 
-def _truth_of(run: RunContent, result: PointResult) -> PointTruth | None:
-    """The bench's truth over the blocks that the last poles rest on; its mode nearest to the estimate."""
+def truth_of_point(
+    poles_and_truths: Iterable[tuple[Poles, Origin]], result: PointResult
+) -> PointTruth | None:
+    """The bench's truth over the blocks that the last poles rest on; its mode nearest to the estimate.
+
+    Parameters
+    ----------
+    poles_and_truths : iterable of (Poles, Origin)
+        All that the file of an attempt holds, in order.
+    result : PointResult
+        Of the attempt.
+    """
     told, middle_ns = [], 0
-    for _, _, message in read_messages_of_type(file_of(run.path, result), POLES_TYPE):
-        poles, origin = poles_from_message(message)
+    for poles, origin in poles_and_truths:
         if origin.measurement_id != result.measurement_id:
             continue
         if poles.status is PolesStatus.TRUTH:

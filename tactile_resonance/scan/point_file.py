@@ -248,9 +248,9 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, Any]]:
     return _read(path, lambda connection: connection.topic == topic)
 
 
-def read_messages_of_type(path: Path, type_name: str) -> Iterator[tuple[int, str, Any]]:
-    """As `read_messages`, of all messages of a type, under whatever namespace."""
-    return _read(path, lambda connection: connection.msgtype == type_name)
+def read_messages_of_type(path: Path, *type_names: str) -> Iterator[tuple[int, str, Any]]:
+    """As `read_messages`, of all messages of a type or of several, under whatever namespace."""
+    return _read(path, lambda connection: connection.msgtype in type_names)
 
 
 def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[int, str, Any]]:

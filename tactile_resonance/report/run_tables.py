@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables and lists of a run's page, as HTML; every text is escaped here."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tactile_resonance.report.point_table import tissue_of
+from tactile_resonance.scan.bench_truth import PointTruth, deviation
+from tactile_resonance.scan.plan_text import plan_against_outcome
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_times import time_budget
+from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import ScanScene
+
+MOST_ROWS = 500
+"""Of a table in a page; a browser takes seconds for ten thousand, and `results.csv` has all."""
+Truths = Mapping[int, PointTruth]
+Columns = Sequence[tuple[str, Callable[[PointResult], str]]]
+COLUMNS: Columns = (
+    ("point", lambda r: f"{r.index + 1}" + (f" (attempt {r.attempt + 1})" if r.attempt else "")),
+    ("x [mm]", lambda r: _number(1e3 * r.x_m, 2)),
+    ("y [mm]", lambda r: _number(1e3 * r.y_m, 2)),
+    ("z [mm]", lambda r: _number(1e3 * r.z_m, 2)),
+    ("force [mN]", lambda r: _with_std(1e3 * r.force_n, 1e3 * r.force_std_n, 2)),
+    ("rms of the force, smallest to largest [mN]", lambda r: _spread(r)),
+    ("age of contact [s]", lambda r: _number(r.contact_age_s, 2)),
+    ("measured f0 [Hz]", lambda r: _with_std(r.f0_hz, r.f0_std_hz, 3)),
+    ("measured damping ratio", lambda r: _with_std(r.damping_ratio, r.damping_ratio_std, 5)),
+    ("nominal f0 [Hz]", lambda r: _with_std(r.nominal_f0_hz, r.nominal_f0_std_hz, 3)),
+    (
+        "nominal damping ratio",
+        lambda r: _with_std(r.nominal_damping_ratio, r.nominal_damping_ratio_std, 5),
+    ),
+    ("blocks", lambda r: f"{r.blocks}" + (f" ({r.blocks_saved} saved)" if r.blocks_saved else "")),
+    ("tissue", tissue_of),
+    ("repeats", lambda r: f"{r.repeats}: {r.disturbances}" if r.repeats else "-"),
+    ("outcome", lambda r: _outcome(r)),
+)
+AIR_COLUMNS: Columns = (
+    ("point", lambda r: f"{r.index + 1}"),
+    ("f0 less that in air [Hz]", lambda r: _with_std(r.f0_shift_hz, r.f0_shift_std_hz, 3)),
+    ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
+    ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
+)
+_TEXT = {"tissue", "repeats", "outcome", "what", "planned", "came"}
+
+
+def paragraphs(lines: Iterable[str], mark: bool = False) -> str:
+    """One paragraph a text; marked: as a warning."""
+    css = ' class="mark"' if mark else ""
+    return "".join(f"<p{css}>{html.escape(line)}</p>" for line in lines)
+
+
+def warning_list(lines: Sequence[str]) -> str:
+    """What stands above all else; that there is nothing, where so."""
+    if not lines:
+        return '<p class="calm">Nothing to warn of.</p>'
+    return f'<div class="warnings"><b>Mind</b>{bullets(lines)}</div>'
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A list of texts; nothing without one."""
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    return items and f"<ul>{items}</ul>"
+
+
+def _row(kind: str, names: Sequence[str], texts: Sequence[str], css: str = "") -> str:
+    cells = ""
+    for name, text in zip(names, texts, strict=True):
+        side = ' class="text"' if name in _TEXT else ""
+        cells += f"<{kind}{side}>{html.escape(text)}</{kind}>"
+    return f"<tr{css}>{cells}</tr>"
+
+
+def table(names: Sequence[str], rows: Sequence[str]) -> str:
+    """Table of columns with these names; the first `MOST_ROWS` rows, and a sentence on those left out."""
+    head, body = _row("th", names, names), "".join(rows[:MOST_ROWS])
+    more = len(rows) - MOST_ROWS
+    told = paragraphs(
+        [f"{more} further rows are left out here; results.csv has all."] if more > 0 else []
+    )
+    return (
+        f'<div class="wide"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>{told}'
+    )
+
+
+def results_table(columns: Columns, results: Sequence[PointResult], run: int = 0) -> str:
+    """One row a result; a click on it shows the point of that run of the page."""
+    names, rows = [name for name, _ in columns], []
+    for result in results[: MOST_ROWS + 1]:
+        css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
+        place = f'{css} data-run="{run}" data-point="{result.index}"'
+        rows.append(_row("td", names, [show(result) for _, show in columns], place))
+    rows += [""] * (len(results) - len(rows))
+    return table(names, rows)
+
+
+def truth_columns(truths: Truths) -> Columns:
+    """What the simulated bench knew; none of it for hardware."""
+    if not truths:
+        return ()
+
+    def known(show: Callable[[PointResult, PointTruth], str]) -> Callable[[PointResult], str]:
+        return lambda r: show(r, truths[r.index]) if r.index in truths else "-"
+
+    return (
+        ("true f0 [Hz]", known(lambda _, truth: _number(truth.estimate[0], 3))),
+        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[0]:+.1f}")),
+        ("true damping", known(lambda _, truth: _number(truth.estimate[1], 5))),
+        ("off by [std]", known(lambda r, truth: f"{deviation(r, truth)[1]:+.1f}")),
+    )
+
+
+def bands_table(results: Sequence[PointResult]) -> str:
+    """Poles of the bands beyond the first; empty where there are none."""
+    names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
+    for result in results:
+        for band in result.further:
+            texts = (
+                f"{result.index + 1}",
+                f"{band.band_low_hz:g} to {band.band_high_hz:g}",
+                _with_std(band.f0_hz, band.f0_std_hz, 3),
+                _with_std(band.damping_ratio, band.damping_ratio_std, 5),
+                band.poles_status,
+            )
+            rows.append(_row("td", names, texts))
+    return table(names, rows) if rows else ""
+
+
+def distortion_table(results: Sequence[PointResult]) -> str:
+    """Levels at the lines left out, against those excited; in brackets the noise; empty where unknown."""
+    sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
+    names, rows = ("point", "band [Hz]", *sides), []
+
+    def level(value_db: float, noise_db: float, above: bool) -> str:
+        text = f"{_number(value_db, 1)} ({_number(noise_db, 1)})"
+        return text if above else f"{text}, only noise"
+
+    for result in results:
+        for band in result.distortion:
+            texts = (
+                f"{result.index + 1}",
+                f"{band.low_hz:g} to {band.high_hz:g}",
+                level(band.even_db, band.even_noise_db, band.even_above_noise),
+                level(band.odd_db, band.odd_noise_db, band.odd_above_noise),
+                _number(band.input_even_db, 1),
+                _number(band.input_odd_db, 1),
+            )
+            rows.append(_row("td", names, texts))
+    return table(names, rows) if rows else ""
+
+
+def time_table(results: Sequence[PointResult]) -> str:
+    """Where the time of the points went; nothing where it is unknown, as in runs of earlier versions."""
+    budget = time_budget(results)
+    whole_s = float(sum(each.sum() for each in budget.values()))
+    if not whole_s:
+        return ""
+    names, rows = ("what", "median [s]", "largest [s]", "all points [s]", "share [%]"), []
+    for name, each in {**budget, "all": np.sum(list(budget.values()), axis=0)}.items():
+        figures = (np.median(each), each.max(), each.sum())
+        texts = (f"{figure:.2f}" for figure in figures)
+        rows.append(_row("td", names, (name, *texts, f"{100 * each.sum() / whole_s:.0f}")))
+    return table(names, rows)
+
+
+def plan_table(scene: ScanScene | None, run: RunContent) -> str:
+    """What was planned and what came; nothing where the scene cannot be read."""
+    if scene is None:
+        return ""
+    names = ("what", "planned", "came")
+    return table(names, [_row("td", names, row) for row in plan_against_outcome(scene, run)])
+
+
+def touches_table(surface: Mapping[str, Any] | None) -> str:
+    """What the surface rests on; empty where it was not found by touch."""
+    if surface is None:
+        return ""
+    names, rows = (
+        ("ball x [mm]", "ball y [mm]", "ball z [mm]", "off the form [mm]", "force [mN]"),
+        [],
+    )
+    for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
+        x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
+        z += f" ± {1e3 * touch['std_m']:.2g}"
+        texts = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
+        rows.append(_row("td", names, texts))
+    told = {
+        True: "The touches lie on it as well as their noise allows.",
+        False: "The touches lie off it by more than their noise explains.",
+        None: "There was no touch to spare to check it.",
+    }[surface["consistent"]]
+    return paragraphs([f"A {surface['form']}. {told}"]) + table(names, rows)
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "-"
+
+
+def _with_std(value: float, std: float, digits: int) -> str:
+    text = _number(value, digits)
+    return f"{text} ± {std:.2g}" if np.isfinite(value) and np.isfinite(std) else text
+
+
+def _spread(result: PointResult) -> str:
+    """How the force moved while it was measured."""
+    if not np.isfinite(result.force_rms_n):
+        return "-"
+    low, high = (_number(1e3 * force, 2) for force in (result.force_min_n, result.force_max_n))
+    return f"{_number(1e3 * result.force_rms_n, 2)}, {low} to {high}"
+
+
+def _outcome(result: PointResult) -> str:
+    parts = [result.outcome.name.lower(), result.verdict, result.gate]
+    parts += [result.reason, result.tissue_reason, result.notes]
+    return "; ".join(part for part in parts if part)

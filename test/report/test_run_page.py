@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a run holds what the run holds, runs nothing but its own script, and needs nothing else."""
+
+import hashlib
+import json
+import re
+import sys
+from base64 import b64decode
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_resonance.cli import main
+from tactile_resonance.report.page_data import as_json, model_response, s_plane
+from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
+from tactile_resonance.report.run_report import warnings_of
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.run_content import read_run
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from browser import shown
+from page_runs import BAND_HZ, HOSTILE, scan, write_scene
+
+MB = 1e6
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """A run of nine points, one of which failed, whose names are HTML; its folder and what was recorded."""
+    folder = tmp_path_factory.mktemp("page")
+    scene = write_scene(folder / "scene.yaml", name=HOSTILE, tissue=HOSTILE)
+    recorded = scan(scene, folder / "run", failed=(4,))
+    assert main(["report", str(folder / "run")]) == 0
+    return folder / "run", recorded
+
+
+class Page(HTMLParser):
+    """Elements, attributes and scripts of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.loads, self.scripts, self.meta, self._script = [], [], {}, {}, None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self.tags.append(tag)
+        self.loads += [found[name] for name in ("src", "href", "srcset", "action") if name in found]
+        assert not [name for name in found if name.startswith("on")]
+        if tag == "script":
+            self._script = found.get("id") or f"script {len(self.scripts)}"
+            self.scripts[self._script] = ""
+        if tag == "meta" and "http-equiv" in found:
+            self.meta[found["http-equiv"]] = found["content"]
+
+    def handle_endtag(self, tag):
+        self._script = None if tag == "script" else self._script
+
+    def handle_data(self, data):
+        if self._script is not None:
+            self.scripts[self._script] += data
+
+
+def page_of(folder):
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def data_of(folder):
+    return json.loads(page_of(folder).scripts["data"])
+
+
+def test_the_data_of_the_page_are_those_of_the_run(hostile):
+    folder, _ = hostile
+    (run,) = data_of(folder)["runs"]
+    results = read_run(folder).latest
+    assert [p["index"] for p in run["bands"][0]["points"]] == [r.index for r in results]
+    for point, result in zip(run["bands"][0]["points"], results, strict=True):
+        assert point["outcome"] == result.outcome.name.lower()
+        if result.failed:
+            assert point["f0_hz"] is None
+            assert point["re"] is None
+            continue
+        # to the last digit
+        assert (point["f0_hz"], point["f0_std_hz"]) == (result.f0_hz, result.f0_std_hz)
+        assert (point["damping"], point["damping_std"]) == (result.damping_ratio, result.damping_ratio_std)
+        assert point["nominal_f0_hz"] == result.nominal_f0_hz
+        assert (point["tissue"], point["probability"]) == (result.tissue_class, result.tissue_probability)
+        assert point["x_mm"] == 1e3 * result.x_m
+        assert point["force_mn"] == 1e3 * result.force_n
+    surface = run["bands"][0]["surface"]
+    assert np.shape(surface["f0_hz"]) == (len(surface["y_mm"]), len(surface["x_mm"]))
+
+
+def test_a_click_shows_the_frf_that_was_recorded_and_the_model_that_was_identified(hostile):
+    folder, recorded = hostile
+    (run,) = data_of(folder)["runs"]
+    assert set(run["details"]) == {str(index) for index in recorded}
+    for index, (frf, poles) in recorded.items():
+        detail = run["details"][str(index)]
+        g = np.array(detail["frf"]["re"]) + 1j * np.array(detail["frf"]["im"])
+        lines = np.isin(frf.frequency_hz, detail["frf"]["frequency_hz"])
+        inside = (frf.frequency_hz >= BAND_HZ[0]) & (frf.frequency_hz <= BAND_HZ[1])
+        assert np.all(lines[inside])
+        np.testing.assert_allclose(g, frf.g[lines], rtol=1e-5, atol=1e-9)
+        std = np.sqrt(frf.variance_noise[lines])
+        np.testing.assert_allclose(detail["frf"]["std"], std, rtol=1e-5)
+        (model,) = detail["frf"]["models"]
+        at_hz = np.array(model["frequency_hz"])
+        response = np.array(model["re"]) + 1j * np.array(model["im"])
+        # messages hold the poles and residues; what they do not hold follows from the FRF within its noise
+        off = np.abs(response - poles.fit.response(at_hz))
+        assert np.max(off) < 5 * np.sqrt(np.max(frf.variance_noise[inside]))
+        (pole,) = detail["poles"]
+        assert complex(pole["re"], pole["im"]) == pytest.approx(complex(poles.poles_rad_s[0]), rel=1e-9)
+        assert len(detail["force"]["t_s"]) == 10
+        np.testing.assert_allclose(detail["force"]["force_mn"][1], 10 + 0.1 * np.sin(1), rtol=1e-4)
+        assert abs(detail["truth"]["f0_hz"] - pole["f0_hz"]) < 5 * pole["f0_std_hz"]
+
+
+def test_the_model_with_the_poles_and_residues_of_a_fit_is_the_fit(hostile):
+    _, recorded = hostile
+    frf, poles = recorded[0]
+    inside = (frf.frequency_hz >= BAND_HZ[0]) & (frf.frequency_hz <= BAND_HZ[1])
+    lines = frf.frequency_hz[inside]
+    exact = poles.fit.response(lines)
+    at_hz = np.linspace(*BAND_HZ, 333)
+    found = model_response(lines, exact, np.full(lines.size, np.nan), poles, at_hz)
+    np.testing.assert_allclose(found, poles.fit.response(at_hz), rtol=1e-6)
+
+
+def test_covariances_go_over_into_the_s_plane():
+    rng = np.random.default_rng(3)
+    at, std = np.array([250.0, 0.034]), np.array([0.02, 1e-4])
+    covariance = np.outer(std, std) * [[1, 0.4], [0.4, 1]]
+    drawn = rng.multivariate_normal(at, covariance, 200_000)
+    w, z = 2 * np.pi * drawn[:, 0], drawn[:, 1]
+    poles = -z * w + 1j * w * np.sqrt(1 - z**2)
+    pole, slope = s_plane(*at)
+    assert abs(np.mean(poles) - pole) < 4 * np.std(poles) / np.sqrt(len(poles))
+    np.testing.assert_allclose(slope @ covariance @ slope.T, np.cov(poles.real, poles.imag), rtol=0.02)
+
+
+def test_texts_of_a_run_are_texts_of_the_page(hostile):
+    folder, _ = hostile
+    page = page_of(folder)
+    # three scripts: data, plotly.js, our own; no picture but the map
+    assert page.tags.count("script") == 3
+    assert page.tags.count("img") == 1
+    assert set(page.scripts) == {"data", "script 1", "script 2"}
+    (run,) = json.loads(page.scripts["data"])["runs"]
+    assert run["name"] == HOSTILE
+    assert HOSTILE in {point["tissue"] for point in run["bands"][0]["points"]}
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "<img src=x" not in text
+    # plotly reads tags in names: figures made here have them escaped
+    for figure in data_of(folder)["figures"]:
+        assert not [t for t in figure["traces"] if "<" in t["name"]]
+
+
+def test_json_of_the_page_cannot_end_its_element():
+    text = as_json({"a": "</script><!--\u2028\u2029&"})
+    assert not set("<>&\u2028\u2029") & set(text)
+    assert json.loads(text) == {"a": "</script><!--\u2028\u2029&"}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        as_json({"a": float("nan")})
+
+
+def test_the_page_loads_nothing_and_runs_nothing_else(hostile):
+    folder, _ = hostile
+    page = page_of(folder)
+    assert [link[:22] for link in page.loads] == ["data:image/png;base64,"]
+    policy = page.meta["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'none'" in policy
+    allowed = {b64decode(each) for each in re.findall(r"'sha256-(.*?)'", policy)}
+    own = {hashlib.sha256(t.encode()).digest() for name, t in page.scripts.items() if name != "data"}
+    assert own == allowed
+    styles = re.findall(r"<style>(.*?)</style>", (folder / "report.html").read_text(), re.DOTALL)
+    assert styles
+    assert not [s for s in styles if "url(" in s or "@import" in s]
+
+
+def test_warnings_stand_first(hostile):
+    folder, _ = hostile
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    first = text.index('class="warnings"')
+    assert first < text.index("points finished") < text.index('id="interactive"') < text.index("<h2>")
+    told = warnings_of(read_run(folder))
+    assert told[0] == "simulated, not measured"
+    assert any(line.startswith("sensor health unknown") for line in told)
+    assert any(line.startswith("failed, 1 of 9 points: 5 (lost") for line in told)
+    damaged = folder / "recording/point-00000-00.mcap"
+    content = damaged.read_bytes()
+    try:
+        damaged.write_bytes(content[:-100])
+        told = warnings_of(read_run(folder))
+    finally:
+        damaged.write_bytes(content)
+    assert told[1].startswith("damaged: point-00000-00.mcap")
+    assert "1 of 9 points are not finished" in told
+
+
+def test_a_point_off_its_force_is_named(hostile):
+    folder, _ = hostile
+    run = read_run(folder)
+    assert not [line for line in warnings_of(run) if "force other than" in line]
+    off = tuple(replace(r, force_n=0.012, force_std_n=1e-4) if r.index == 2 else r for r in run.results)
+    (line,) = [t for t in warnings_of(replace(run, results=off)) if "force other than" in t]
+    assert line == "force other than the scene's, 1 of 9 points: 3 (12.00 mN)"
+
+
+def test_figures_of_the_paper_that_a_run_cannot_give_say_why(hostile):
+    folder, _ = hostile
+    figures = {re.search(r"\((.*)\)$", f["title"])[1]: f for f in data_of(folder)["figures"]}
+    assert set(figures) == {"figure 5", "figures 5 and 6", "figure 8", "figure 9"}
+    assert figures["figures 5 and 6"]["traces"] == []
+    assert "distortion is not among the outputs" in figures["figures 5 and 6"]["note"]
+    for name in ("figure 5", "figure 8", "figure 9"):
+        assert figures[name]["traces"], name
+    assert "preparations" in figures["figure 9"]["note"]
+
+
+def test_noise_over_periods_is_that_of_one_period(hostile):
+    folder, recorded = hostile
+    (figure,) = [f for f in data_of(folder)["figures"] if "figure 9" in f["title"]]
+    classes = Counter(r.tissue_class for r in read_run(folder).latest if r.index in recorded)
+    name, count = classes.most_common(1)[0]
+    frfs = [recorded[r.index][0] for r in read_run(folder).latest if r.tissue_class == name]
+    assert count >= 4
+    assert figure["note"].startswith(name)
+    mean, positions, periods = figure["traces"]
+    assert [t["name"].split(" (")[0] for t in (positions, periods)] == ["positions", "periods"]
+    inside = np.isin(np.round(frfs[0].frequency_hz, 6), np.round(mean["x"], 6))
+    # of the mean of four periods the variance is a fourth of that of one
+    one_period = 4 * np.mean([f.variance_noise for f in frfs], axis=0)
+    np.testing.assert_allclose(periods["y"], 10 * np.log10(one_period[inside]), atol=1e-3)
+    scatter = np.var([f.g for f in frfs], axis=0, ddof=1)
+    np.testing.assert_allclose(positions["y"], 10 * np.log10(scatter[inside]), atol=1e-3)
+
+
+def test_large_runs_keep_few_details_and_say_so():
+    many = [PointResult(k, measurement_id=k + 1) for k in range(10_000)]
+    chosen = detailed(many)
+    assert len(chosen) == MOST_DETAILED
+    assert chosen[0] is many[0]
+    assert chosen[-1] is many[-1]
+    assert np.ptp(np.diff([r.index for r in chosen])) <= 1
+    # lines of all points together are bounded too
+    assert lines_each(25) == 600
+    assert lines_each(MOST_DETAILED) * MOST_DETAILED <= 60_000
+    assert detailed([PointResult(0, outcome=PointOutcome.FAILED, measurement_id=1)]) == []
+
+
+def test_the_page_shows_a_point_without_an_error(hostile, tmp_path):
+    folder, _ = hostile
+    html, console = shown(f"{(folder / 'report.html').as_uri()}#point=4", tmp_path)
+    assert console == []
+    assert html.count("<script") == 3
+    html = re.sub(r"<script.*?</script>", "", html, flags=re.DOTALL)
+    assert "<h2>point 4</h2>" in html
+    # map, FRF, s-plane, force, three figures
+    assert html.count('class="main-svg"') >= 2 * 7
+    assert "no FRF of this point" not in html
+    assert html.count("<img") == 1
+
+
+def test_the_page_of_a_usual_run_is_small(hostile):
+    folder, _ = hostile
+    assert (folder / "report.html").stat().st_size < 8 * MB
