@@ -178,7 +178,7 @@ def run_job(job: Job) -> int:
     ended.at_once()  # every file of a report is whole or not there
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
-    report.run(argparse.Namespace(run_folder=job.output))
+    report.report_run(job.output)
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
     return 0 if result.ending is Ending.COMPLETE and result.done else 1
 

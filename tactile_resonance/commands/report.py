@@ -1,33 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tactile_resonance report`: page and picture of a run."""
+"""`tactile_resonance report`: page and picture of a run, and of several runs beside each other."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from tactile_resonance.files import write_whole
+
+COMPARISON = Path("comparison.html")
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
     parser = commands.add_parser(
         "report",
-        help="page and picture of a scan's run",
-        description="Write report.html, which needs nothing else, pole_map.png, map.mcap, the map as it "
-        "grew for Foxglove and rviz, and boundary.json, where the scene wants a boundary, into the folder of a "
-        "run; of a run that is going on, too.",
+        help="page and picture of a scan's run; comparison of several",
+        description="Of one run, also of one that is going on, write into its folder: report.html, a page to "
+        "look into that needs nothing else, pole_map.png, map.mcap, the map as it grew for Foxglove and rviz, "
+        "and boundary.json, where the scene wants a boundary. Of several runs write one page that compares the "
+        "others with the first.",
     )
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument(
+        "run_folders",
+        type=Path,
+        nargs="+",
+        metavar="RUN",
+        help="folder of a run; several: a comparison",
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help=f"of a comparison (default: {COMPARISON}); the files of one run are in its folder",
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read the run, draw, write each file whole."""
+    """Read, draw, write each file whole."""
+    if len(options.run_folders) > 1:
+        return _compare(options.run_folders, options.output or COMPARISON)
+    if options.output is not None:
+        raise ValueError(
+            f"--output: {options.output}, accepted with several runs only: files of one run are in its folder"
+        )
+    return report_run(options.run_folders[0])
+
+
+def _compare(folders: Sequence[Path], output: Path) -> int:
+    # only here: the command answers --help without the library for recordings
+    from tactile_resonance.front import read_run
+    from tactile_resonance.report.boundary import boundary_of_run
+    from tactile_resonance.report.comparison import as_comparison, differences, sentence
+    from tactile_resonance.report.point_details import MOST_DETAILED, details_of
+
+    runs = [read_run(folder) for folder in folders]
+    details = [details_of(content, MOST_DETAILED // len(runs)) for content in runs]
+    page = as_comparison(runs, details, [boundary_of_run(content) for content in runs])
+    write_whole(output, page.encode())
+    for folder, content in zip(folders[1:], runs[1:], strict=True):
+        print(sentence(str(folder), str(folders[0]), differences(runs[0], content)))
+    print(output)
+    return 0
+
+
+def report_run(folder: Path) -> int:
+    """Write page, pictures, map and boundary of a run into its folder, and print its table."""
     # only here: the command answers --help without the library for recordings
     from tactile_resonance.front import read_run
 
-    content = read_run(options.run_folder)
+    content = read_run(folder)
     from tactile_resonance.report.boundary import FILE, boundary_of_run
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
@@ -47,17 +91,17 @@ def run(options: argparse.Namespace) -> int:
     details, boundary = details_of(content), boundary_of_run(content)
     truths = truths_with(content, details)
     pole_maps, pictures = pole_maps_of(content), []
-    name = options.run_folder.resolve().name
+    name = folder.resolve().name
     for band, pole_map in enumerate(pole_maps):
         title = f"Pole map, {name}" + (f", band {band + 1}" if len(pole_maps) > 1 else "")
         pictures.append(
             figure_bytes(draw_pole_map(pole_map, title, None if band else boundary), ".png")
         )
-        write_whole(options.run_folder / map_names(band + 1)[-1], pictures[-1])
+        write_whole(folder / map_names(band + 1)[-1], pictures[-1])
     page = as_page(content, pictures, details, truths, boundary)
-    write_whole(options.run_folder / "report.html", page.encode())
+    write_whole(folder / "report.html", page.encode())
     if boundary is not None:
-        write_whole(options.run_folder / FILE, boundary.as_json().encode())
+        write_whole(folder / FILE, boundary.as_json().encode())
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
@@ -74,5 +118,5 @@ def run(options: argparse.Namespace) -> int:
     if pole_maps:
         write_map_recording(content)  # last: the page and the table do not wait for it
         drawn.append("map.mcap")
-    print(f"{', '.join(drawn)} in {options.run_folder}")
+    print(f"{', '.join(drawn)} in {folder}")
     return 0

@@ -294,7 +294,7 @@ def _lines(lines: Lines) -> list[Any]:
 
 
 def page_data(
-    runs: Sequence[dict[str, Any]], figures: Sequence[dict[str, Any]] = (), detailed: int = 0
+    runs: Sequence[dict[str, Any]], figures: Sequence[dict[str, Any]], detailed: int, heading: str
 ) -> dict[str, Any]:
     """All that `page.js` reads.
 
@@ -306,6 +306,8 @@ def page_data(
         Of `paper_figures`.
     detailed : int
         Points whose details are in the page.
+    heading : str
+        Of the figures.
     """
     measured = sum(
         sum(p["done"] for p in run["bands"][0]["points"]) for run in runs if run["bands"]
@@ -326,6 +328,7 @@ def page_data(
     return {
         "runs": list(runs),
         "figures": list(figures),
+        "heading": heading,
         "colours": [LOW, HIGH],
         "note": " ".join(notes),
     }

@@ -83,7 +83,7 @@ def lines_each(points: int) -> int:
     return max(40, min(_LINES_OF_A_POINT, _LINES_OF_A_PAGE // max(points, 1)))
 
 
-def details_of(run: RunContent) -> dict[int, PointDetails]:
+def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDetails]:
     """By point, of those that are `detailed`.
 
     Raises
@@ -91,7 +91,7 @@ def details_of(run: RunContent) -> dict[int, PointDetails]:
     ValueError
         If a file is damaged.
     """
-    return {result.index: read_details(run, result) for result in detailed(run.latest)}
+    return {result.index: read_details(run, result) for result in detailed(run.latest, most)}
 
 
 def truths_with(run: RunContent, details: Mapping[int, PointDetails]) -> dict[int, PointTruth]:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 # Facts of the run that have a place of their own on the page.
 _SHOWN = {"skipped", "notes", "surface"}
+_FIGURES = "Figures in the manner of the paper, from the estimates of the run"
 _CELLS = 60  # of the map between the points, along its longer side
 _MOST_NAMED = 8  # points or files, in a warning
 _SURE = ("ok", "no covariance")  # status of poles that nothing speaks against
@@ -110,9 +111,8 @@ def as_page(
     below = "".join(
         f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text
     )
-    data = page_data(
-        [run_entry(run, name, details, boundary)], paper_figures(run, details), len(details)
-    )
+    entry = run_entry(run, name, details, boundary)
+    data = page_data([entry], paper_figures(run, details), len(details), _FIGURES)
     return page(name, f'{head}<div class="paper">{paper}</div>', data, below)
 
 
@@ -121,11 +121,18 @@ def run_entry(
     name: str,
     details: Mapping[int, PointDetails],
     boundary: RunBoundary | None = None,
+    most: int = 0,
 ) -> dict[str, Any]:
-    """A run as `page.js` shows it: its points and map in each band, and what a click on a point shows."""
+    """A run as `page.js` shows it: its points and map in each band, and what a click on a point shows.
+
+    Parameters
+    ----------
+    most : int
+        Points with details in the page, where there are more than those of this run.
+    """
     scene = scene_of(run)
     maps, bands = pole_maps_of(run), [None] if scene is None else scene.sensor.bands
-    lines = lines_each(len(details))
+    lines = lines_each(max(most, len(details)))
     return {
         "name": name,
         "simulated": any(result.simulated for result in run.latest),

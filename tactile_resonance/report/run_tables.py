@@ -47,7 +47,17 @@ AIR_COLUMNS: Columns = (
     ("f0 over that in air", lambda r: _with_std(r.f0_over_air, r.f0_over_air_std, 5)),
     ("damping less that in air", lambda r: _with_std(r.damping_shift, r.damping_shift_std, 5)),
 )
-_TEXT = {"tissue", "repeats", "outcome", "what", "planned", "came"}
+_TEXT = {
+    "tissue",
+    "repeats",
+    "outcome",
+    "what",
+    "planned",
+    "came",
+    "run",
+    "scene",
+    "tissue of the other",
+}
 
 
 def paragraphs(lines: Iterable[str], mark: bool = False) -> str:
@@ -89,6 +99,11 @@ def table(names: Sequence[str], rows: Sequence[str]) -> str:
     )
 
 
+def text_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Table of texts, a row each."""
+    return table(names, [_row("td", names, row) for row in rows])
+
+
 def results_table(columns: Columns, results: Sequence[PointResult], run: int = 0) -> str:
     """One row a result; a click on it shows the point of that run of the page."""
     names, rows = [name for name, _ in columns], []
@@ -128,8 +143,8 @@ def bands_table(results: Sequence[PointResult]) -> str:
                 _with_std(band.damping_ratio, band.damping_ratio_std, 5),
                 band.poles_status,
             )
-            rows.append(_row("td", names, texts))
-    return table(names, rows) if rows else ""
+            rows.append(texts)
+    return text_table(names, rows) if rows else ""
 
 
 def distortion_table(results: Sequence[PointResult]) -> str:
@@ -151,8 +166,8 @@ def distortion_table(results: Sequence[PointResult]) -> str:
                 _number(band.input_even_db, 1),
                 _number(band.input_odd_db, 1),
             )
-            rows.append(_row("td", names, texts))
-    return table(names, rows) if rows else ""
+            rows.append(texts)
+    return text_table(names, rows) if rows else ""
 
 
 def time_table(results: Sequence[PointResult]) -> str:
@@ -173,8 +188,7 @@ def plan_table(scene: ScanScene | None, run: RunContent) -> str:
     """What was planned and what came; nothing where the scene cannot be read."""
     if scene is None:
         return ""
-    names = ("what", "planned", "came")
-    return table(names, [_row("td", names, row) for row in plan_against_outcome(scene, run)])
+    return text_table(("what", "planned", "came"), plan_against_outcome(scene, run))
 
 
 def touches_table(surface: Mapping[str, Any] | None) -> str:
@@ -189,13 +203,13 @@ def touches_table(surface: Mapping[str, Any] | None) -> str:
         x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
         z += f" ± {1e3 * touch['std_m']:.2g}"
         texts = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
-        rows.append(_row("td", names, texts))
+        rows.append(texts)
     told = {
         True: "The touches lie on it as well as their noise allows.",
         False: "The touches lie off it by more than their noise explains.",
         None: "There was no touch to spare to check it.",
     }[surface["consistent"]]
-    return paragraphs([f"A {surface['form']}. {told}"]) + table(names, rows)
+    return paragraphs([f"A {surface['form']}. {told}"]) + text_table(names, rows)
 
 
 def _number(value: float, digits: int) -> str:

@@ -10,6 +10,7 @@
   const SYMBOLS = ["circle", "square", "diamond", "triangle-up", "star", "pentagon", "hexagon", "cross"];
   const SAME_PLACE_MM = 0.1;
   const CHI = Math.sqrt(-2 * Math.log(0.05)); // radius of the 95 % ellipse in standard deviations
+  const MOST_OTHERS = 1000; // poles of other points behind those of the chosen one
   const PAPER_WIDTH = 690; // pixels across A4 within its margins
 
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
@@ -28,6 +29,7 @@
   function draw(place, traces, layout) {
     const base = {
       margin: { l: 62, r: 14, t: 62, b: 44 }, font: { size: 12 }, hovermode: "closest", separators: ".", uirevision: "kept",
+      hoverlabel: { bgcolor: "white", font: { color: "#222" }, align: "left" },
       legend: { orientation: "h", x: 0, y: 1.01, yanchor: "bottom", font: { size: 11 } },
     };
     const title = { text: layout.title, font: { size: 14 }, x: 0.01, xanchor: "left", y: 0.98, yanchor: "top" };
@@ -63,7 +65,8 @@
   }
 
   const hoverText = (run, point) =>
-    [nameOf(run, point), ...rows(point).slice(0, 5).map((row) => row.join(": "))].map(plain).join("<br>");
+    [`${nameOf(run, point)}: ${point.outcome}`, ...rows(point).filter((row) => ["tissue", "f0", "damping ratio", "force"].includes(row[0]))
+      .map((row) => row.join(": "))].map(plain).join("<br>");
 
   function rangeOf(values) {
     const known = values.filter((value) => value !== null);
@@ -84,7 +87,7 @@
     const found = shown.points.filter((p) => p.f0_hz !== null && p.x_mm !== null);
     const failed = shown.points.filter((p) => p.f0_hz === null && p.x_mm !== null && p.outcome !== "skipped");
     const classes = [...new Set(found.map((p) => p.tissue))].sort();
-    const traces = [];
+    const traces = [], size = Math.max(4, Math.min(12, 250 / Math.sqrt(shown.points.length)));
     if (shown.surface) {
       const s = shown.surface;
       traces.push({ type: "heatmap", x: s.x_mm, y: s.y_mm, z: s.f0_hz, zmin: low, zmax: high, colorscale: scale,
@@ -104,18 +107,26 @@
     classes.forEach((name, k) => {
       const points = found.filter((p) => p.tissue === name);
       traces.push(spot(points, name || "poles", {
-        size: 12, symbol: SYMBOLS[k % SYMBOLS.length], color: points.map((p) => p.f0_hz), cmin: low, cmax: high,
+        size, symbol: SYMBOLS[k % SYMBOLS.length], color: points.map((p) => p.f0_hz), cmin: low, cmax: high,
         colorscale: scale, line: { color: "black", width: 1 }, showscale: k === 0, colorbar: { title: { text: "f0 [Hz]" }, thickness: 14 } }));
     });
-    if (failed.length) traces.push(spot(failed, "failed", { size: 12, symbol: "x", color: "red" }));
-    const chosen = chosenPoints().filter((each) => each.run === run).map((each) => each.point);
-    traces.push({ ...spot(chosen, "chosen", { size: 20, symbol: "circle-open", color: "black", line: { width: 2.5 } }),
-      hoverinfo: "skip", showlegend: false });
+    if (failed.length) traces.push(spot(failed, "failed", { size, symbol: "x", color: "red" }));
+    const chosen = chosenOf(run);
+    traces.push({ ...spot(chosen, "chosen", { size: size + 8, symbol: "circle-open", color: "black", line: { width: 2.5 } }),
+      hoverinfo: "skip", showlegend: false }); // the last one: see `mark`
     const title = [page.runs.length > 1 ? plain(run.name) : "map of f0", run.bands.length > 1 ? shown.name : ""].filter(Boolean).join(", ");
     const square = { scaleanchor: "x", scaleratio: 1 };
     return draw(place, traces, { title: title + (run.simulated ? " (simulated, not measured)" : ""),
       xaxis: axis("x [mm]", { constrain: "domain" }), yaxis: axis("y [mm]", square) });
   }
+
+  // a ring about what is chosen; all other points stay as they are drawn
+  function mark({ run, place }) {
+    const chosen = chosenOf(run);
+    Plotly.restyle(place, { x: [chosen.map((p) => p.x_mm)], y: [chosen.map((p) => p.y_mm)] }, [place.data.length - 1]);
+  }
+
+  const chosenOf = (run) => chosenPoints().filter((each) => each.run === run).map((each) => each.point);
 
   function addMap(parent, run, band) {
     maps.push({ run, band, place: make(parent, "div", "plot") });
@@ -153,7 +164,7 @@
   function choose(run, index, told) {
     selected = { run, index };
     drawDetails(chosenPoints());
-    maps.forEach(drawMap);
+    maps.forEach(mark);
     if (told && !page.live) history.replaceState(null, "", `#run=${page.runs.indexOf(run) + 1}&point=${index + 1}`);
   }
 
@@ -241,7 +252,8 @@
     const title = "poles in the s-plane, 95 % ellipses";
     const traces = [], corners = { x: [], y: [] };
     page.runs.forEach((run) => {
-      const others = run.bands[0] ? run.bands[0].points.filter((p) => p.re !== null) : [];
+      const all = run.bands[0].points.filter((p) => p.re !== null), step = Math.ceil(all.length / MOST_OTHERS);
+      const others = all.filter((_, k) => k % step === 0);
       traces.push({ type: "scatter", mode: "markers", x: others.map((p) => p.re), y: others.map((p) => p.im), name: "all points",
         showlegend: false, text: others.map((p) => plain(`${nameOf(run, p)}: ${tissueOf(p)}`)), hoverinfo: "text", marker: { color: "#bbb", size: 5 } });
     });
@@ -290,7 +302,7 @@
   // ---- the whole page
 
   function build() {
-    const first = make(root, "div", "screen");
+    const first = make(root, "div", page.runs.length > 1 ? "" : "screen"); // one run has its map on paper as a picture
     if (page.note) make(first, "p", "note", page.note);
     addPanels(first);
     const asked = new URLSearchParams(location.hash.slice(1));
@@ -306,7 +318,7 @@
       first.scrollIntoView();
     }));
     if (page.figures.length) {
-      make(root, "h2", "", "Figures in the manner of the paper, from the estimates of the run");
+      make(root, "h2", "", page.heading);
       const figures = make(root, "div", "figures");
       const places = page.figures.map((figure) => {
         const box = make(figures, "div", "figure");
@@ -368,7 +380,8 @@
         if (at < 0) points.push(point); else points[at] = point;
       });
       Object.assign(run.details, details);
-      if (pinned) maps.forEach(drawMap); else choose(run, bands[0].index, false);
+      maps.forEach(drawMap);
+      if (!pinned) choose(run, bands[0].index, false);
     });
     on("surface", ({ band, surface, boundary }) => {
       Object.assign(page.runs[0].bands[band], { surface, boundary });

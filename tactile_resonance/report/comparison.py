@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several runs on one page: maps side by side, and by how much poles differ at places in common."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+from scipy.spatial import cKDTree
+
+from tactile_resonance.report import run_tables as tables
+from tactile_resonance.report.boundary import RunBoundary
+from tactile_resonance.report.page import page
+from tactile_resonance.report.page_data import HIGH, LOW, MM, listed, page_data
+from tactile_resonance.report.point_details import PointDetails
+from tactile_resonance.report.run_report import run_entry, scene_name, warnings_of
+from tactile_resonance.scan.point_result import PointKind, PointResult
+from tactile_resonance.scan.pole_map import SAME_PLACE_M
+from tactile_resonance.scan.run_content import RunContent
+
+FloatArray = npt.NDArray[np.float64]
+SIGNIFICANT = 3.0
+"""Standard deviations beyond which a difference is counted."""
+_RANGE = 6.0  # of the colours of differences, in standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What two runs found at one place.
+
+    Attributes
+    ----------
+    first, other : PointResult
+    change : (2,) float
+        Of f0 [Hz] and damping ratio, other less first.
+    covariance : (2, 2) float
+        Of the change: the sum of both, as of independent measurements.
+    nominal : bool
+        Whether both poles are at the nominal contact; else as measured.
+    """
+
+    first: PointResult
+    other: PointResult
+    change: FloatArray
+    covariance: FloatArray
+    nominal: bool
+
+    @property
+    def deviations(self) -> FloatArray:
+        """(2,) changes in their standard deviations."""
+        return self.change / np.sqrt(np.diag(self.covariance))
+
+    @property
+    def distance2(self) -> float:
+        """Chi-square of both together, with two degrees of freedom where nothing changed."""
+        return float(self.change @ np.linalg.solve(self.covariance, self.change))
+
+
+def differences(first: RunContent, other: RunContent) -> list[Difference]:
+    """At each place of the first run within 0.1 mm of one of the other, in one frame, where both have poles.
+
+    Poles at the nominal contact are compared where both points have them: their covariance holds what force and
+    age of contact add. An error of the sensitivity to these is common to both, so it is counted twice.
+    """
+    points, others = (
+        [r for r in run.latest if not r.failed and r.kind is PointKind.TISSUE]
+        for run in (first, other)
+    )
+    if not points or not others:
+        return []
+    tree = cKDTree([r.position_m for r in others])
+    distance_m, nearest = tree.query([r.position_m for r in points])
+    pairs = [
+        _difference(point, others[k])
+        for point, m, k in zip(points, distance_m, nearest, strict=True)
+        if m <= SAME_PLACE_M and point.frame_id == others[k].frame_id
+    ]
+    return [pair for pair in pairs if np.all(np.isfinite(pair.covariance))]
+
+
+def _difference(first: PointResult, other: PointResult) -> Difference:
+    nominal = all(np.isfinite(r.nominal_f0_std_hz) for r in (first, other))
+    (x, p), (y, q) = (_pole(r, nominal) for r in (first, other))
+    return Difference(first, other, y - x, p + q, nominal)
+
+
+def _pole(result: PointResult, nominal: bool) -> tuple[FloatArray, FloatArray]:
+    """(2,) f0 [Hz] and damping ratio, and their covariance (2, 2)."""
+    if not nominal:
+        return result.estimate, result.covariance
+    cross = result.nominal_f0_damping_covariance_hz
+    covariance = [
+        [result.nominal_f0_std_hz**2, cross],
+        [cross, result.nominal_damping_ratio_std**2],
+    ]
+    return np.array([result.nominal_f0_hz, result.nominal_damping_ratio]), np.array(covariance)
+
+
+def sentence(name: str, first: str, found: Sequence[Difference]) -> str:
+    """What the differences of one run from the first say together."""
+    if not found:
+        return f"{name} and {first} have no place in common (0.1 mm) where both have poles with a covariance."
+    off = np.array([each.deviations for each in found])
+    rms, largest = np.sqrt(np.mean(off**2, axis=0)), np.max(np.abs(off), axis=0)
+    beyond = int(np.count_nonzero(np.any(np.abs(off) > SIGNIFICANT, axis=1)))
+    total = sum(each.distance2 for each in found)
+    chance = float(stats.chi2.sf(total, 2 * len(found)))
+    which = "at the nominal contact" if all(each.nominal for each in found) else "as measured"
+    return (
+        f"{name} less {first}, {len(found)} places in common, poles {which}: differences of f0 have an rms of "
+        f"{rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping ratio "
+        f"{rms[1]:.2f}, at most {largest[1]:.1f}; {beyond} places differ by more than {SIGNIFICANT:g}. Were "
+        f"nothing different, chance would give as much or more with probability {chance:.2g}."
+    )
+
+
+def as_comparison(
+    runs: Sequence[RunContent],
+    details: Sequence[Mapping[int, PointDetails]],
+    boundaries: Sequence[RunBoundary | None],
+) -> str:
+    """HTML of runs beside each other; the first one is what the others are compared with.
+
+    Parameters
+    ----------
+    runs : sequence of RunContent
+        Two or more.
+    details : sequence of mapping of int to PointDetails
+        Of each run, by point, as far as they are to be in the page.
+    boundaries : sequence of RunBoundary or None
+        Of each run, where one was wanted.
+    """
+    names = _names(runs)
+    pairs = [differences(runs[0], run) for run in runs[1:]]
+    warned = [
+        f"{name}: {line}"
+        for name, run, boundary in zip(names, runs, boundaries, strict=True)
+        for line in warnings_of(run, boundary)
+    ]
+    sentences = [
+        sentence(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)
+    ]
+    title = f"Comparison of {', '.join(names)}"
+    head = (
+        f"<h1>{html.escape(title)}</h1>{tables.warning_list(warned)}{tables.paragraphs(sentences)}"
+    )
+    entries = [
+        run_entry(run, name, each, boundary, sum(map(len, details)))
+        for run, name, each, boundary in zip(runs, names, details, boundaries, strict=True)
+    ]
+    figures = [_figure(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)]
+    below = f"<h2>Runs</h2>{_runs_table(runs, names)}"
+    for name, found in zip(names[1:], pairs, strict=True):
+        if found:
+            below += f"<h2>{html.escape(f'{name} less {names[0]}')}</h2>{_differences_table(found)}"
+    data = page_data(entries, figures, sum(map(len, details)), "Differences at common places")
+    return page(title, head, data, below)
+
+
+def _names(runs: Sequence[RunContent]) -> list[str]:
+    """Of their folders, with a number where two are alike."""
+    names = [run.path.resolve().name for run in runs]
+    many = Counter(names)
+    return [f"{name} ({k + 1})" if many[name] > 1 else name for k, name in enumerate(names)]
+
+
+def _runs_table(runs: Sequence[RunContent], names: Sequence[str]) -> str:
+    columns = (
+        "run",
+        "scene",
+        "begun",
+        "points",
+        "with poles",
+        "f0 [Hz]",
+        "std of f0 [Hz]",
+        "tissue",
+    )
+    rows = []
+    for run, name in zip(runs, names, strict=True):
+        found = [r for r in run.latest if not r.failed]
+        f0 = np.array([r.f0_hz for r in found])
+        spread = f"{f0.min():.2f} to {f0.max():.2f}" if found else "-"
+        std = f"{np.median([r.f0_std_hz for r in found]):.2g}" if found else "-"
+        classes = Counter(r.tissue_class for r in found if r.tissue_class)
+        called = ", ".join(f"{tissue} {count}" for tissue, count in classes.most_common())
+        counts = f"{len(run.latest)} of {len(run.points)}", f"{len(found)}"
+        begun = str(run.facts.get("begun", "-"))
+        rows.append((name, scene_name(run), begun, *counts, spread, std, called or "-"))
+    return tables.text_table(columns, rows)
+
+
+def _differences_table(found: Sequence[Difference]) -> str:
+    columns = (
+        "x [mm]",
+        "y [mm]",
+        "points",
+        "change of f0 [Hz]",
+        "[std]",
+        "change of damping",
+        "[std]",
+    )
+    rows = []
+    for each in found:
+        std, off = np.sqrt(np.diag(each.covariance)), each.deviations
+        rows.append(
+            (
+                *(f"{1e3 * value:.2f}" for value in (each.first.x_m, each.first.y_m)),
+                f"{each.first.index + 1} and {each.other.index + 1}",
+                *(f"{each.change[0]:+.3f} ± {std[0]:.2g}", f"{off[0]:+.1f}"),
+                *(f"{each.change[1]:+.5f} ± {std[1]:.2g}", f"{off[1]:+.1f}"),
+                *(each.first.tissue_class or "-", each.other.tissue_class or "-"),
+            )
+        )
+    return tables.text_table((*columns, "tissue", "tissue of the other"), rows)
+
+
+def _figure(name: str, first: str, found: Sequence[Difference]) -> dict[str, Any]:
+    """Places in the colours of the change of f0 in standard deviations."""
+    title = f"{name} less {first}, change of f0"
+    if not found:
+        return {"title": title, "note": "Left out: no place in common.", "traces": [], "layout": {}}
+    where = MM * np.array([each.first.position_m[:2] for each in found])
+    off = [each.deviations[0] for each in found]
+    texts = [
+        f"{x:+.1f} standard deviations, {e.change[0]:+.3f} Hz"
+        for x, e in zip(off, found, strict=True)
+    ]
+    marker = {
+        "color": listed(off, 4),
+        "size": 14,
+        "cmin": -_RANGE,
+        "cmax": _RANGE,
+        "colorscale": [[0, LOW], [0.5, "#ffffff"], [1, HIGH]],
+        "line": {"color": "black", "width": 1},
+        "colorbar": {"title": {"text": "[std]"}, "thickness": 14},
+    }
+    trace = {
+        **{"type": "scatter", "mode": "markers", "marker": marker, "name": ""},
+        **{"x": listed(where[:, 0]), "y": listed(where[:, 1]), "text": texts, "hoverinfo": "text"},
+    }
+    axes = {
+        "xaxis": {"title": {"text": "x [mm]"}},
+        "yaxis": {"title": {"text": "y [mm]"}, "scaleanchor": "x"},
+    }
+    note = f"Colours end at {_RANGE:g} standard deviations of the difference."
+    if all(each.nominal for each in found):
+        note += " What force and age of contact add to both alike is counted twice: an rms below 1 is usual."
+    return {"title": title, "note": note, "traces": [trace], "layout": axes}

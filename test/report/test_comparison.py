@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs beside each other: common places, differences in their standard deviations, one page."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tactile_resonance.cli import main
+from tactile_resonance.report.comparison import differences, sentence
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.run_content import RunContent, read_run
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from browser import shown
+from page_runs import HOSTILE, scan, write_scene
+
+STD = np.array([0.02, 1e-4])
+COVARIANCE = np.outer(STD, STD) * [[1, 0.4], [0.4, 1]]
+
+
+def run_of(results):
+    return RunContent(Path("r"), "", {}, (), results=tuple(results))
+
+
+def drawn(count, seed, shift=(0.0, 0.0), **values):
+    """A run of so many places 1 mm apart, of one pole."""
+    poles = np.random.default_rng(seed).multivariate_normal(np.add([250.0, 0.034], shift), COVARIANCE, count)
+    columns = {"f0_std_hz": STD[0], "damping_ratio_std": STD[1], "y_m": 0.0, "z_m": 0.0}
+    columns |= {"f0_damping_covariance_hz": COVARIANCE[0, 1], "frame_id": "table"} | values
+    return run_of(
+        PointResult(k, x_m=1e-3 * k, f0_hz=f0, damping_ratio=z, **columns) for k, (f0, z) in enumerate(poles)
+    )
+
+
+def test_differences_of_equal_runs_are_as_large_as_they_say():
+    found = differences(drawn(1000, 1), drawn(1000, 2))
+    assert len(found) == 1000
+    assert not any(each.nominal for each in found)
+    total = sum(each.distance2 for each in found)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 2000)  # 99.9 %
+    assert low < total < high
+    off = np.array([each.deviations for each in found])
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 1000)
+    assert np.all((low < np.sum(off**2, axis=0)) & (np.sum(off**2, axis=0) < high))
+
+
+def test_a_change_shows_with_its_sign_and_size():
+    found = differences(drawn(200, 1), drawn(200, 2, shift=(0.2, 0.0)))
+    change = np.array([each.change for each in found])
+    assert np.mean(change[:, 0]) == pytest.approx(0.2, abs=4 * np.sqrt(2 / 200) * STD[0])
+    told = sentence("b", "a", found)
+    assert "200 places in common, poles as measured" in told
+    assert float(re.search(r"probability (\S+)\.$", told)[1]) < 1e-6
+    assert int(re.search(r"(\d+) places differ by more than 3", told)[1]) > 195
+
+
+def test_only_equal_places_with_poles_are_compared():
+    first, other = drawn(6, 1), drawn(6, 2)
+    changed = [
+        other.results[0],
+        replace(other.results[1], y_m=2e-4),
+        replace(other.results[2], frame_id="base"),
+        replace(other.results[3], outcome=PointOutcome.FAILED, f0_hz=np.nan),
+        replace(other.results[4], kind=PointKind.AIR),
+        replace(other.results[5], f0_std_hz=np.nan),
+    ]
+    found = differences(first, run_of(changed))
+    assert [(each.first.index, each.other.index) for each in found] == [(0, 0)]
+    assert "no place in common" in sentence("b", "a", [])
+    assert differences(first, run_of([])) == []
+
+
+def test_poles_at_the_nominal_contact_are_compared_where_both_are_known():
+    values = {"nominal_f0_hz": 251.0, "nominal_f0_std_hz": 0.06, "nominal_damping_ratio": 0.034}
+    values |= {"nominal_damping_ratio_std": 2e-4, "nominal_f0_damping_covariance_hz": 0.0}
+    first = drawn(1, 1, **values)
+    (each,) = differences(first, drawn(1, 2, **{**values, "nominal_f0_hz": 251.3}))
+    assert each.nominal
+    assert each.change[0] == pytest.approx(0.3)
+    assert each.deviations[0] == pytest.approx(0.3 / (0.06 * np.sqrt(2)))
+    (each,) = differences(first, drawn(1, 2))
+    assert not each.nominal
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """Comparison of two runs of one name, and the runs."""
+    folder = tmp_path_factory.mktemp("comparison")
+    scene = write_scene(folder / "scene.yaml", spacing_m=0.02, tissue=HOSTILE)
+    runs = [folder / "a" / "run", folder / "b" / "run"]
+    for run in runs:
+        run.parent.mkdir()
+        scan(scene, run)
+    output = folder / "both.html"
+    assert main(["report", *map(str, runs), "--output", str(output)]) == 0
+    return output, runs
+
+
+def test_the_page_holds_both_runs_and_one_plotly(page, capsys):
+    output, runs = page
+    text = output.read_text(encoding="utf-8")
+    assert text.count("plotly.js v") == 1
+    assert "<script>alert" not in text
+    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
+    assert [run["name"] for run in data["runs"]] == ["run (1)", "run (2)"]
+    for entry, folder in zip(data["runs"], runs, strict=True):
+        wanted = [r.f0_hz for r in read_run(folder).latest]
+        assert [p["f0_hz"] for p in entry["bands"][0]["points"]] == wanted
+    # the same seeds: nothing differs
+    (figure,) = data["figures"]
+    assert figure["traces"][0]["marker"]["color"] == [0.0] * 4
+    assert "run (1): simulated, not measured" in text
+
+
+def test_the_page_shows_both_runs_at_one_place(page, tmp_path):
+    html, console = shown(f"{page[0].as_uri()}#run=2&point=3", tmp_path)
+    assert console == []
+    assert "<h2>run (1), point 3 and run (2), point 3</h2>" in html
+
+
+def test_output_is_for_comparisons(page, tmp_path, capsys):
+    assert main(["report", str(page[1][0]), "--output", str(tmp_path / "x.html")]) == 1
+    assert "accepted with several runs only" in capsys.readouterr().err
