@@ -82,6 +82,7 @@ def _parser() -> OneLineParser:
         compare,
         compile,
         figures,
+        live,
         plan,
         references,
         reidentify,
@@ -98,8 +99,9 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(plan, scan, analyze, reidentify, references, compare, report, figures, benchmark),
-        *(calibrate_table, simulate_ur, simulate_cell, check_robot, compile),
+        *(plan, scan, live, analyze, reidentify, references, compare),
+        *(report, figures, benchmark, calibrate_table, simulate_ur, simulate_cell, check_robot),
+        *(compile,),
     ):
         command.add_parser(commands)
     return parser

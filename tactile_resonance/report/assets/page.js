@@ -348,6 +348,9 @@
     const box = make(root, "div");
     const state = make(box, "p", "state", "waiting for the nodes");
     const told = make(box, "p", "note");
+    const again = make(box, "button", "", "follow the scan again");
+    again.hidden = true;
+    again.addEventListener("click", () => { pinned = false; });
     const strip = make(box, "div", "plot low");
     const rest = make(root, "div");
     const forces = [];
@@ -355,7 +358,9 @@
 
     const showState = (now) => {
       state.textContent = now.text;
-      told.textContent = `${now.points} points, ${now.failed} failed` + (now.simulated ? "; simulated, not measured" : "") + (pinned ? "; a click beside the points follows the scan again" : "");
+      told.textContent = `${now.points} points, ${now.failed} failed` + (now.simulated ? "; simulated, not measured" : "");
+      again.hidden = !pinned;
+      if (page.runs.length) page.runs[0].simulated = now.simulated;
       forces.push(...now.forces);
       while (forces.length && forces[0][0] < forces[forces.length - 1][0] - 20) forces.shift();
       const end = forces.length ? forces[forces.length - 1][0] : 0;
@@ -383,8 +388,8 @@
       maps.forEach(drawMap);
       if (!pinned) choose(run, bands[0].index, false);
     });
-    on("surface", ({ band, surface, boundary }) => {
-      Object.assign(page.runs[0].bands[band], { surface, boundary });
+    on("surface", ({ band, surface }) => {
+      page.runs[0].bands[band].surface = surface;
       maps.forEach(drawMap);
     });
     on("measuring", (entry) => {
@@ -392,7 +397,6 @@
       if (!pinned) drawDetails([newest], `under way: ${entry.title}`);
     });
     setInterval(() => { if (heard && Date.now() - heard > 3000) state.textContent = "nothing heard from the server"; }, 1000);
-    rest.addEventListener("dblclick", () => { pinned = false; });
   }
 
   if (page.live) follow(); else build();

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance live`: the page of a scan while it goes on, for a person beside the robot."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import threading
+
+from tactile_resonance.processes import ENDING
+
+PORT = 8765
+EACH_S = 0.2
+"""Between two events of the page [s]."""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "live",
+        help="page of a scan while it goes on: map, force, poles, state",
+        description="Listen to the nodes of this ROS_DOMAIN_ID and serve a page that shows what they publish: "
+        "the map as it grows, force, poles and state; on 127.0.0.1 only, and to be read only. Ctrl-C ends it.",
+    )
+    parser.add_argument(
+        "--port", type=int, default=PORT, help=f"default: {PORT}; 0: any that is free"
+    )
+    parser.add_argument("--namespace", default="", help="of the nodes (default: none)")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Listen and serve until interrupted."""
+    from tactile_resonance.commands.bench_scan import require_packages
+    from tactile_resonance.report.live_run import LiveRun
+    from tactile_resonance.report.live_server import LiveServer
+
+    require_packages("rclpy", "tactile_resonance.msg")
+    from tactile_resonance.nodes.live_listener import LiveListener
+
+    for number in ENDING:  # also where a shell began it in the background, interrupts ignored
+        signal.signal(number, signal.default_int_handler)
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    live = LiveRun(lambda name, data: server.publish(name, data))
+    server = LiveServer(options.port, live.snapshot)
+    ended = threading.Event()
+
+    def tick() -> None:
+        while not ended.wait(EACH_S):
+            if server.readers:
+                live.tick()
+
+    with server, LiveListener(live, options.namespace) as listener:
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        print(f"{server.url} shows the nodes of ROS_DOMAIN_ID={domain}; Ctrl-C ends it", flush=True)
+        threading.Thread(target=tick, daemon=True).start()
+        try:
+            while True:
+                listener.spin(1.0)
+        finally:
+            ended.set()
