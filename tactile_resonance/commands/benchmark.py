@@ -9,9 +9,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 NAMES = (
-    *("frf", "poles", "bench", "contact", "touch", "robot", "twist", "cell"),
-    *("recording", "pipeline", "live", "load", "truth", "skip", "references"),
-    *("stability", "hostile", "overview"),
+    *("frf", "poles", "bench", "contact", "touch", "robot"),
+    *("twist", "cell", "recording", "pipeline", "live", "load"),
+    *("truth", "skip", "references", "report", "stability", "hostile"),
+    *("overview",),
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""

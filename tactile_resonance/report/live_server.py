@@ -28,7 +28,7 @@ _ALIVE_S = 10.0
 _WITHIN_S = 10.0  # for a request, and for a reader to take what is sent
 _HEAD = (
     '<h1>Scan under way</h1><p class="note">This page only shows: nothing here reaches the robot. '
-    "Figures are those of the nodes as they publish them; the stop is not on this page.</p>"
+    "Figures are those of the nodes as they publish them. There is no stop on this page.</p>"
 )
 
 

@@ -70,7 +70,7 @@ def warning_list(lines: Sequence[str]) -> str:
     """What stands above all else; that there is nothing, where so."""
     if not lines:
         return '<p class="calm">Nothing to warn of.</p>'
-    return f'<div class="warnings"><b>Mind</b>{bullets(lines)}</div>'
+    return f'<div class="warnings"><b>Warnings</b>{bullets(lines)}</div>'
 
 
 def bullets(lines: Iterable[str]) -> str:

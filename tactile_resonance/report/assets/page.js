@@ -40,8 +40,8 @@
 
   // ---- points
 
-  const nameOf = (run, point) =>
-    (page.runs.length > 1 ? `${run.name}, ` : "") + `point ${point.index + 1}` + (point.attempt ? `, attempt ${point.attempt + 1}` : "");
+  const nameOf = (run, point) => (point.outcome === "under way" ? point.outcome :
+    (page.runs.length > 1 ? `${run.name}, ` : "") + `point ${point.index + 1}` + (point.attempt ? `, attempt ${point.attempt + 1}` : ""));
 
   function tissueOf(point) {
     if (!point.tissue) return "-";
@@ -197,8 +197,8 @@
       make(row, "td", "text", name);
       columns.forEach((column) => make(row, "td", "text", (column.find((each) => each[0] === name) || ["", "-"])[1]));
     });
-    entries.forEach(({ point, detail }) => ((detail && detail.poles) || []).forEach((pole) => {
-      if (pole.message && !point.reason.includes(pole.message)) make(facts, "p", "note", `point ${point.index + 1}, ${pole.band_hz.join(" to ")} Hz: ${pole.message}`);
+    entries.forEach(({ run, point, detail }) => ((detail && detail.poles) || []).forEach((pole) => {
+      if (pole.message && !point.reason.includes(pole.message)) make(facts, "p", "note", `${nameOf(run, point)}, ${pole.band_hz.join(" to ")} Hz: ${pole.message}`);
     }));
     PANELS.forEach((panel, k) => panel(panels[k], entries));
   }
