@@ -2,7 +2,7 @@
 """The pages: how long one takes to write and how large it is, and what the live page costs while a demo runs.
 
 The time of writing is that of reading details and making the page, without the pictures, as a ratio to the
-time that this machine takes for a loop (see `benchmarks.processor`). The live page is followed by one reader; its
+time that this machine takes for a loop (`benchmarks.processor`). The live page is followed by one reader; its
 share is the processor time of all its threads over time, of one core. Its delay is from when another program on
 this machine hears the result of a point to when the reader has it.
 """

@@ -19,7 +19,7 @@ import time
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-WITHIN_S = 60.0
+WITHIN_S = 180.0
 # the browser reads from descriptor 3 and writes to 4
 _LAUNCH = """
 import fcntl, os, sys
