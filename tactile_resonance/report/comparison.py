@@ -140,8 +140,8 @@ def as_comparison(
     pairs = [differences(runs[0], run) for run in runs[1:]]
     warned = [
         f"{name}: {line}"
-        for name, run, boundary in zip(names, runs, boundaries, strict=True)
-        for line in warnings_of(run, boundary)
+        for name, run, boundary, each in zip(names, runs, boundaries, details, strict=True)
+        for line in warnings_of(run, boundary, each)
     ]
     sentences = [
         sentence(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)

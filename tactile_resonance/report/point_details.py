@@ -41,12 +41,15 @@ class PointDetails:
         Times [s] after the first, and forces [N], while it was measured.
     truth : PointTruth or None
         What the simulated bench knew.
+    problem : str
+        Why the file was not read, as where an earlier version recorded it; empty: it was.
     """
 
-    frf: Any
-    poles: Poles | None
-    force: tuple[tuple[float, float], ...]
-    truth: PointTruth | None
+    frf: Any = None
+    poles: Poles | None = None
+    force: tuple[tuple[float, float], ...] = ()
+    truth: PointTruth | None = None
+    problem: str = ""
 
     def entry(self, most_lines: int) -> dict[str, Any]:
         """As the page shows it, with so many lines of the FRF at the most."""
@@ -84,14 +87,14 @@ def lines_each(points: int) -> int:
 
 
 def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDetails]:
-    """By point, of those that are `detailed`.
-
-    Raises
-    ------
-    ValueError
-        If a file is damaged.
-    """
-    return {result.index: read_details(run, result) for result in detailed(run.latest, most)}
+    """By point, of those that are `detailed`; a file that cannot be read has its problem instead."""
+    found = {}
+    for result in detailed(run.latest, most):
+        try:
+            found[result.index] = read_details(run, result)
+        except ValueError as error:
+            found[result.index] = PointDetails(problem=str(error))
+    return found
 
 
 def truths_with(run: RunContent, details: Mapping[int, PointDetails]) -> dict[int, PointTruth]:
@@ -106,7 +109,7 @@ def read_details(run: RunContent, result: PointResult) -> PointDetails:
     Raises
     ------
     ValueError
-        If the file is damaged.
+        If the file is damaged, or of a version whose messages cannot be read any more.
     """
     own = result.measurement_id
     frf, poles, told, force = None, None, [], []

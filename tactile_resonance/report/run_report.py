@@ -104,7 +104,8 @@ def as_page(
         "Scene": f"<pre>{html.escape(run.scene)}</pre>",
         "Made with": f"<pre>{html.escape(yaml.safe_dump(facts, sort_keys=False))}</pre>",
     }
-    head = f"<h1>{html.escape(name)}</h1>{tables.warning_list(warnings_of(run, boundary))}"
+    warned = warnings_of(run, boundary, details)
+    head = f"<h1>{html.escape(name)}</h1>{tables.warning_list(warned)}"
     head += tables.paragraphs(summary(run))
     encoded = (base64.b64encode(picture).decode() for picture in pictures)
     paper = "".join(f'<img alt="pole map" src="data:image/png;base64,{data}">' for data in encoded)
@@ -151,7 +152,11 @@ def run_entry(
     }
 
 
-def warnings_of(run: RunContent, boundary: RunBoundary | None = None) -> list[str]:
+def warnings_of(
+    run: RunContent,
+    boundary: RunBoundary | None = None,
+    details: Mapping[int, PointDetails] | None = None,
+) -> list[str]:
     """What a reader must know before any figure of the run, the gravest first."""
     scene, results = scene_of(run), run.latest
     told = [f"damaged: {problem}" for problem in run.problems[:_MOST_NAMED]]
@@ -159,6 +164,9 @@ def warnings_of(run: RunContent, boundary: RunBoundary | None = None) -> list[st
         told.append(f"{len(run.problems) - _MOST_NAMED} further files are damaged")
     if run.unchecked:
         told.append(NOT_CHECKED.format(run.unchecked))
+    unread = [each.problem for each in (details or {}).values() if each.problem]
+    if unread:
+        told.append(f"FRF and force of {len(unread)} points cannot be read: {unread[0]}")
     if scene is None:
         told.append("scene.yaml cannot be read: plan and outcome cannot be compared")
     if len(results) < len(run.points):

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
+from tactile_resonance.report import point_details
 from tactile_resonance.report.page_data import as_json, model_response, s_plane
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
-from tactile_resonance.report.run_report import warnings_of
+from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 
@@ -204,6 +205,24 @@ def test_warnings_stand_first(hostile):
         damaged.write_bytes(content)
     assert told[1].startswith("damaged: point-00000-00.mcap")
     assert "1 of 9 points are not finished" in told
+
+
+def test_a_file_of_a_version_that_cannot_be_read_costs_its_details_alone(hostile, monkeypatch):
+    folder, _ = hostile
+    run = read_run(folder)
+
+    def refuse(*_):
+        raise ValueError("point-00000-00.mcap: recorded by a version without the field instant_s")
+
+    monkeypatch.setattr(point_details, "read_messages_of_type", refuse)
+    details = point_details.details_of(run)
+    told = warnings_of(run, None, details)
+    wanted = f"FRF and force of {len(details)} points cannot be read: point-00000-00.mcap: recorded"
+    assert wanted in " ".join(told)
+    data = as_page(run, [], details, {})
+    (entry,) = json.loads(Page(data).scripts["data"])["runs"]
+    assert entry["bands"][0]["points"][0]["f0_hz"] == run.latest[0].f0_hz
+    assert entry["details"]["0"]["frf"] is None
 
 
 def test_a_point_off_its_force_is_named(hostile):
