@@ -133,7 +133,7 @@ def run_job(job: Job) -> int:
 
     Returns 0 where every point of the plan is finished and one at least has poles, else 1.
     """
-    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags")
+    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags", "plotly")
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
     from tactile_resonance.scan.adaptive import WantedBoundary
@@ -188,7 +188,7 @@ def require_packages(*packages: str) -> None:
     for package in packages:
         if find_spec(package) is None:
             raise ValueError(
-                f"{package} not found: this needs ROS 2, ur-rtde, python-can and rosbags; use "
+                f"{package} not found: this needs ROS 2, ur-rtde, python-can, rosbags and plotly; use "
                 "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
             )
 

@@ -8,6 +8,7 @@ it allows no other origin.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -72,7 +73,8 @@ class LiveServer:
         self._server.server_close()
         with self._lock:
             for reader in self._readers:
-                reader.put(None)
+                with contextlib.suppress(queue.Full):  # its thread ends with the process
+                    reader.put_nowait(None)
 
     @property
     def readers(self) -> int:

@@ -302,6 +302,19 @@ def test_the_page_shows_a_point_without_an_error(hostile):
         assert {each.partition("#")[0] for each in page.requests} == {address}
 
 
+def test_a_page_of_nothing_and_of_failures_alone_opens(tmp_path):
+    scene = write_scene(tmp_path / "scene.yaml")
+    scan(scene, tmp_path / "begun", most=0)
+    scan(scene, tmp_path / "failed", most=2, failed=(0, 1))
+    with browser() as page:
+        for name, heading in (("begun", ""), ("failed", "point 1")):
+            assert main(["report", str(tmp_path / name)]) == 0
+            address = (tmp_path / name / "report.html").as_uri()
+            page.show(address, f"document.querySelector('#interactive h2')?.textContent === '{heading}'")
+        assert "no FRF of this point" in page.value("document.body.innerText")
+        assert page.console == []
+
+
 def test_the_page_of_a_usual_run_is_small(hostile):
     folder, _ = hostile
     assert (folder / "report.html").stat().st_size < 8 * MB
