@@ -29,7 +29,7 @@ import numpy as np
 from benchmarks.processor import cpu_s, loop_s
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.report.point_details import detailed, details_of, truths_with
-from tactile_resonance.report.run_report import as_page
+from tactile_resonance.report.run_report import as_page, pole_maps_of
 from tactile_resonance.scan.point_result import PointKind
 from tactile_resonance.scan.run_content import RunContent, read_run
 
@@ -80,7 +80,7 @@ def _written(
         chosen = detailed(content.latest)
         details = {r.index: each[k % len(each)] for k, r in enumerate(chosen)}
         truths = {}
-    page = as_page(content, [], details, truths).encode()
+    page = as_page(content, pole_maps_of(content), [], details, truths).encode()
     return len(content.latest), (time.process_time() - begun_s) / speed_s, len(page) / 1e6
 
 

@@ -98,7 +98,7 @@ def report_run(folder: Path) -> int:
             figure_bytes(draw_pole_map(pole_map, title, None if band else boundary), ".png")
         )
         write_whole(folder / map_names(band + 1)[-1], pictures[-1])
-    page = as_page(content, pictures, details, truths, boundary)
+    page = as_page(content, pole_maps, pictures, details, truths, boundary)
     write_whole(folder / "report.html", page.encode())
     if boundary is not None:
         write_whole(folder / FILE, boundary.as_json().encode())

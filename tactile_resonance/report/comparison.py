@@ -19,7 +19,7 @@ from tactile_resonance.report.boundary import RunBoundary
 from tactile_resonance.report.page import page
 from tactile_resonance.report.page_data import HIGH, LOW, MM, listed, page_data
 from tactile_resonance.report.point_details import PointDetails
-from tactile_resonance.report.run_report import run_entry, scene_name, warnings_of
+from tactile_resonance.report.run_report import pole_maps_of, run_entry, scene_name, warnings_of
 from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.pole_map import SAME_PLACE_M
 from tactile_resonance.scan.run_content import RunContent
@@ -151,7 +151,7 @@ def as_comparison(
         f"<h1>{html.escape(title)}</h1>{tables.warning_list(warned)}{tables.paragraphs(sentences)}"
     )
     entries = [
-        run_entry(run, name, each, boundary, sum(map(len, details)))
+        run_entry(run, name, pole_maps_of(run), each, boundary, sum(map(len, details)))
         for run, name, each, boundary in zip(runs, names, details, boundaries, strict=True)
     ]
     figures = [_figure(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)]

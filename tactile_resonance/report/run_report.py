@@ -8,6 +8,7 @@ import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import reduce
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,6 +63,7 @@ def pole_maps_of(run: RunContent) -> list[PoleMap]:
 
 def as_page(
     run: RunContent,
+    pole_maps: Sequence[PoleMap],
     pictures: Sequence[bytes],
     details: Mapping[int, PointDetails],
     truths: Truths,
@@ -72,8 +74,10 @@ def as_page(
     Parameters
     ----------
     run : RunContent
+    pole_maps : sequence of PoleMap
+        Of the bands, as `pole_maps_of` gives them.
     pictures : sequence of bytes
-        Maps of the bands (PNG), in their order: for paper, and where no script runs.
+        Of these (PNG): for paper, and where no script runs.
     details : mapping of int to PointDetails
         By point, as far as they are to be in the page.
     truths : mapping of int to PointTruth
@@ -112,7 +116,7 @@ def as_page(
     below = "".join(
         f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text
     )
-    entry = run_entry(run, name, details, boundary)
+    entry = run_entry(run, name, pole_maps, details, boundary)
     data = page_data([entry], paper_figures(run, details), len(details), _FIGURES)
     return page(name, f'{head}<div class="paper">{paper}</div>', data, below)
 
@@ -120,6 +124,7 @@ def as_page(
 def run_entry(
     run: RunContent,
     name: str,
+    pole_maps: Sequence[PoleMap],
     details: Mapping[int, PointDetails],
     boundary: RunBoundary | None = None,
     most: int = 0,
@@ -132,7 +137,7 @@ def run_entry(
         Points with details in the page, where there are more than those of this run.
     """
     scene = scene_of(run)
-    maps, bands = pole_maps_of(run), [None] if scene is None else scene.sensor.bands
+    bands = [None] if scene is None else scene.sensor.bands
     lines = lines_each(max(most, len(details)))
     return {
         "name": name,
@@ -143,10 +148,10 @@ def run_entry(
                 "name": "" if band is None else f"{band.low_hz:g} to {band.high_hz:g} Hz",
                 "points": [point_entry(result.of_band(k)) for result in run.latest],
                 **map_entry(
-                    maps[k].surface(_CELLS) if k < len(maps) else None, None if k else boundary
+                    None if pole_map is None else pole_map.surface(_CELLS), None if k else boundary
                 ),
             }
-            for k, band in enumerate(bands)
+            for k, (band, pole_map) in enumerate(zip_longest(bands, pole_maps[: len(bands)]))
         ],
         "details": {str(index): each.entry(lines) for index, each in details.items()},
     }

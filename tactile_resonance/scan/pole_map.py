@@ -129,9 +129,9 @@ class PoleMap:
         """The same after one attempt at a point of a scan; one in free air or discarded changes nothing."""
         if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
             return self
-        now = self.without(result)
-        skipped = result.outcome is PointOutcome.SKIPPED
-        return now if skipped else now.with_point(MapPoint.planned(result))
+        if result.outcome is PointOutcome.SKIPPED:
+            return self.without(result)
+        return self.with_point(MapPoint.planned(result))
 
     def without(self, result: PointResult) -> PoleMap:
         """The same with nothing at the place of a result."""

@@ -219,7 +219,7 @@ def test_a_file_of_a_version_that_cannot_be_read_costs_its_details_alone(hostile
     told = warnings_of(run, None, details)
     wanted = f"FRF and force of {len(details)} points cannot be read: point-00000-00.mcap: recorded"
     assert wanted in " ".join(told)
-    data = as_page(run, [], details, {})
+    data = as_page(run, [], [], details, {})
     (entry,) = json.loads(Page(data).scripts["data"])["runs"]
     assert entry["bands"][0]["points"][0]["f0_hz"] == run.latest[0].f0_hz
     assert entry["details"]["0"]["frf"] is None

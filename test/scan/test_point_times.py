@@ -94,7 +94,7 @@ def test_a_scan_keeps_the_times_of_each_point(tmp_path, spent):
 @pytest.mark.parametrize("spent", [None, SPENT])
 def test_report_shows_where_the_time_went_where_that_is_known(tmp_path, spent):
     _, run, _ = scan(tmp_path / "run", scene(3), Bench(spent=spent))
-    page = as_page(run, [], {}, {})
+    page = as_page(run, [], [], {}, {})
     assert ("<h2>Time</h2>" in page) == (spent is not None)
     assert any(line.startswith("A point took") for line in summary(run)) == (spent is not None)
     if spent:
