@@ -13,7 +13,7 @@ TOOLS = {
     *("array_files", "rows_file", "strict_yaml"),
 }
 CORE = {
-    *("contact", "frf", "poles", "tissue"),
+    *("contact", "frf", "mechanics", "poles", "tissue"),
     *("crest_factor", "multisine", "record", "sensor", "silent", "tones"),
 }
 MAY_IMPORT = {
@@ -29,7 +29,7 @@ MAY_IMPORT = {
 """By part of the package; parts that are not here may import all others."""
 OF_THE_ROBOT = ("contact.vectors", "fields", "simulation.noise", "simulation.ur5e")
 LIBRARIES = {
-    "numba": {"poles"},
+    "numba": {"poles", "mechanics"},
     "rosbags": {"scan"},
     **dict.fromkeys(("rtde_control", "rtde_receive", "can", "nidaqmx"), {"drivers"}),
     "rclpy": {"nodes", "client"},

@@ -41,6 +41,19 @@ def check_goal(
         raise ValueError(
             f"force_n: got {goal.aim.force_n}; accepted is up to {most:g}, two thirds of abort_force_n"
         )
+    if math.isfinite(goal.hold_s):
+        slow = goal.unload_speed_m_s
+        unload_s = limits.depth_m / slow if slow > 0 else 0.0
+        if not 0 <= goal.hold_s <= limits.hold_s - unload_s:
+            raise ValueError(
+                f"hold_s: got {goal.hold_s:g}; accepted is up to {limits.hold_s - unload_s:g}, limits.hold_s "
+                f"less {unload_s:g} s to draw back"
+            )
+        if not 0 <= slow <= parameters.retract_speed_m_s:
+            raise ValueError(
+                f"unload_speed_m_s: got {slow:g}; accepted is up to {parameters.retract_speed_m_s:g}, "
+                "retract_speed_m_s"
+            )
     box, normal = limits.workspace, np.array(rotated(goal.touch.turn, (0.0, 0.0, 1.0)))
     for name, height in (
         ("standoff", parameters.standoff_m),

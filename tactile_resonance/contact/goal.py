@@ -52,11 +52,20 @@ class ContactGoal:
     standoff_m : float
         Height above the touch where the approach begins and to which the tip is drawn back [m]; infinite: that
         of the parameters, which is never raised.
+    press_speed_m_s : float
+        Towards the surface and into it, at most [m/s]; those of the parameters are never raised.
+    hold_s : float
+        The tip is drawn back by itself after it was held so long [s]; infinite: when that is asked for.
+    unload_speed_m_s : float
+        With which it is then drawn back while it presses [m/s]; 0: as after any contact.
     """
 
     touch: Pose
     aim: Aim
     standoff_m: float = math.inf
+    press_speed_m_s: float = math.inf
+    hold_s: float = math.inf
+    unload_speed_m_s: float = 0.0
 
 
 class Command(NamedTuple):

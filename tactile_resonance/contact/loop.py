@@ -112,9 +112,7 @@ class ContactLoop:
     @property
     def demand(self) -> Demand:
         """Whether what is under way needs simulated time to pass."""
-        controller = self.controller
-        stays = controller.settled or controller.state is State.HOLD
-        return Demand.NONE if stays else Demand.FAST
+        return Demand.NONE if self.controller.waits else Demand.FAST
 
     def wait(self) -> None:
         """Wait for the next period; requests may be made meanwhile."""

@@ -129,6 +129,12 @@ class ContactController:
         return None if model is None else model.estimate(self._height_m)
 
     @property
+    def waits(self) -> bool:
+        """Whether the contact goes on as it is until somebody asks for something else."""
+        held = self.state is State.HOLD and self.goal is not None and math.isinf(self.goal.hold_s)
+        return held or self.settled
+
+    @property
     def settled(self) -> bool:
         """Whether nothing more happens without a request: idle, or in a fault after which the tip stays."""
         stays = self.state is State.IDLE or (self.state is State.FAULT and self._stays)
@@ -173,7 +179,9 @@ class ContactController:
         """
         if not self._free_for_goals:
             raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
-        p, limits = self.parameters.with_standoff(goal.standoff_m), self.limits
+        p = self.parameters.lowered(goal.standoff_m, goal.press_speed_m_s)
+        limits = self.limits
+        limits.check(p)
         check_goal(goal, p, limits, self._tip)
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
@@ -335,6 +343,8 @@ class ContactController:
         if move.breach is not None:
             self._fail(move.breach, now_ns)
         elif move.to is not None:
+            if move.to is State.RETRACT and self.state is State.HOLD:
+                self._end(Breach(Cause.HOLD_ENDED, f"held for {goal.hold_s:g} s as asked"), now_ns)
             if move.estimate is not None:
                 told_m = self._free.told_m
                 self._outcome.reached(now_ns, self._pressing.touched_ns, move.estimate, told_m)

@@ -149,8 +149,10 @@ class ContactParameters:
         low = self.early_m
         require(self.standoff_m > low, "standoff_m", self.standoff_m, f"above early_m = {low}")
 
-    def with_standoff(self, standoff_m: float) -> ContactParameters:
-        """Return these with a standoff that is no higher; the surface may be found as much less early.
+    def lowered(self, standoff_m: float, press_speed_m_s: float) -> ContactParameters:
+        """Return these with no higher standoff and no faster way into the tissue.
+
+        With a lower standoff the surface may be found as much less early.
 
         Raises
         ------
@@ -159,7 +161,13 @@ class ContactParameters:
         """
         standoff_m = min(self.standoff_m, standoff_m)
         early_m = min(self.early_m, EARLY_SHARE * standoff_m)
-        return replace(self, standoff_m=standoff_m, early_m=early_m)
+        return replace(
+            self,
+            standoff_m=standoff_m,
+            early_m=early_m,
+            approach_speed_m_s=min(self.approach_speed_m_s, press_speed_m_s),
+            press_speed_m_s=min(self.press_speed_m_s, press_speed_m_s),
+        )
 
     @property
     def beam_n_per_m(self) -> float:

@@ -125,14 +125,15 @@ class Pressing:
         touch_speed_m_s: float = math.inf,
     ) -> None:
         self._touch_speed_m_s = touch_speed_m_s
-        self._aim, self._path, self._observer = goal.aim, path, observer
+        self._goal, self._aim, self._path, self._observer = goal, goal.aim, path, observer
         self._parameters, self._limits = parameters, limits
         self.touched_ns = 0
         self.motion = HeldMotion()
         self._lost_n = limits.lost_below_n(goal.aim.force_n)
         self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
-        self._hold_height_m = 0.0
+        self._hold_height_m, self._held_ns = 0.0, 0
+        self._unload_from_m: float | None = None
         self._looked_again = False
         self._taken_back = 0
 
@@ -146,7 +147,7 @@ class Pressing:
         assert model is not None
         gone = self._lost(now_ns, state)
         if gone is not None:
-            return gone
+            return gone if self._unload_from_m is None else Move(None, State.RETRACT)
         to: State | None = None
         if not holding:
             sure = now_ns - self.touched_ns > self._sure_ns
@@ -154,9 +155,12 @@ class Pressing:
                 return self._early(arm, model.surface_m)
             to = self._nearer(now_ns, state, model, place.height_m, sure)
             if to is State.HOLD:
-                holding, self._hold_height_m = True, place.height_m
+                holding, self._hold_height_m, self._held_ns = True, place.height_m, now_ns
         if holding:
             self.motion.add(now_ns, place.height_m)
+            over_s = (now_ns - self._held_ns) * 1e-9 - self._goal.hold_s
+            if over_s >= 0 and to is None:
+                return self._unload(over_s, arm, place)
         pending = self._observer.arm_model.pending_m
         if holding and self._aim.hold is HoldMode.INDENTATION:
             speed = place_speed(self._hold_height_m, place.height_m, pending, p)
@@ -177,6 +181,19 @@ class Pressing:
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         reached = model.estimate(place.height_m) if to is State.HOLD else None
         return Move(twist, to, estimate=reached)
+
+    def _unload(self, over_s: float, arm: ArmSample, place: Place) -> Move:
+        """After the hold that was asked for: draw back, at an even speed where one is asked for."""
+        up_m_s = self._goal.unload_speed_m_s
+        if up_m_s == 0.0:
+            return Move(None, State.RETRACT)
+        if self._unload_from_m is None:
+            self._unload_from_m = place.height_m - up_m_s * over_s
+        target_m = self._unload_from_m + up_m_s * over_s
+        pending = self._observer.arm_model.pending_m
+        speed = up_m_s + place_speed(target_m, place.height_m, pending, self._parameters)
+        most = self._parameters.retract_speed_m_s
+        return Move(self._path.along_normal(arm, min(most, max(0.0, speed))))
 
     def _nearer(
         self, now_ns: int, state: State, model: ContactFilter, height_m: float, sure: bool

@@ -177,12 +177,12 @@ def test_surface_above_a_low_standoff_is_refused_before_it_is_pressed_on():
 
 
 def test_standoff_is_never_raised_and_not_below_its_range():
-    assert P.with_standoff(1.0) == P
-    low = P.with_standoff(LOW_M)
+    assert P.lowered(1.0, np.inf) == P
+    low = P.lowered(LOW_M, np.inf)
     assert low.standoff_m == LOW_M
     assert low.early_m < low.standoff_m
     with pytest.raises(ValueError, match="standoff_m"):
-        P.with_standoff(1e-4)
+        P.lowered(1e-4, np.inf)
 
 
 FAULTS = {

@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tactile_resonance.fields import check_above_zero, check_within, require
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from tactile_resonance.mechanics.prony import ComplexArray, FloatArray, Prony
 
 
 @dataclass(frozen=True)
@@ -67,34 +65,28 @@ class Tissue:
         return float(self.relaxation_modulus_1s_pa - self.prony_moduli_pa @ left)
 
     @property
+    def prony(self) -> Prony:
+        """The series itself."""
+        return Prony(
+            self.equilibrium_modulus_pa, self.prony_moduli_pa, np.array(self.prony_times_s)
+        )
+
+    @property
     def instantaneous_modulus_pa(self) -> float:
         """E(0) [Pa]."""
-        return float(self.equilibrium_modulus_pa + self.prony_moduli_pa.sum())
+        return self.prony.instantaneous_pa
 
     def relaxation_modulus(self, time_s: ArrayLike) -> FloatArray:
         """Return E(t) [Pa], of the shape of `time_s` (0 or above)."""
-        time = np.asarray(time_s, dtype=float)[..., None]  # (..., 1)
-        decay = np.exp(-time / np.asarray(self.prony_times_s, dtype=float))  # (..., terms)
-        return np.asarray(self.equilibrium_modulus_pa + decay @ self.prony_moduli_pa)
+        return self.prony.relaxation_modulus(time_s)
 
     def complex_modulus(self, s_rad_s: ArrayLike) -> ComplexArray:
-        """Return ``E*(s) = Einf + sum E_j s tau_j / (1 + s tau_j)`` [Pa] at complex s [rad/s]."""
-        s = np.asarray(s_rad_s, dtype=complex)[..., None] * np.asarray(self.prony_times_s)
-        return np.asarray(self.equilibrium_modulus_pa + (s / (1 + s)) @ self.prony_moduli_pa)
+        """Return E*(s) [Pa] at complex s [rad/s]."""
+        return self.prony.complex_modulus(s_rad_s)
 
     def creep_compliance(self, time_s: ArrayLike) -> FloatArray:
-        """Return the creep compliance J(t) [1/Pa], of the shape of `time_s` (0 or above).
-
-        Exact inverse of the Prony series: ``s J(s) = 1 / E*(s)``, whose poles are the eigenvalues
-        of a symmetric rank-one change of ``diag(1 / tau)``.
-        """
-        time = np.asarray(time_s, dtype=float)[..., None]
-        rate = 1 / np.asarray(self.prony_times_s, dtype=float)
-        glassy = self.instantaneous_modulus_pa
-        root = np.sqrt(self.prony_moduli_pa * rate)
-        retardation, vectors = np.linalg.eigh(np.diag(rate) - np.outer(root, root) / glassy)
-        weight = (vectors.T @ root) ** 2 / glassy**2 / retardation
-        return np.asarray(1 / glassy - np.expm1(-time * retardation) @ weight)
+        """Return the creep compliance J(t) [1/Pa], of the shape of `time_s` (0 or above)."""
+        return self.prony.creep_compliance(time_s)
 
 
 @dataclass(frozen=True)

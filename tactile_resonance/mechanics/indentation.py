@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One test of tissue with a ball: force and depth through time, and the means of them that a fit takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_resonance.fields import require
+from tactile_resonance.mechanics.ball import Ball
+
+FloatArray = NDArray[np.float64]
+
+
+class Protocol(str, Enum):
+    """What is done with the tissue, after it was pressed until a force was reached."""
+
+    RELAXATION = "relaxation"
+    """The robot keeps its place."""
+    CREEP = "creep"
+    """The force is kept."""
+    INDENTATION = "indentation"
+    """The tip is drawn back slowly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Indentation:
+    """A record of one test.
+
+    Attributes
+    ----------
+    protocol : Protocol
+    time_s, force_n, depth_m : (n,) arrays
+        Ascending times; force along the normal, compression positive; way of the robot past the surface, negative
+        above it. Of the ball, where it is held rigidly.
+    ball : Ball
+    depth_std_m, force_std_n : float
+        Standard deviations of the zeros of depth and force; NaN: unknown, the record has to show them. 0: exact.
+    noise_n : float
+        Standard deviation of one force; NaN: the forces show it.
+    label : str
+    source : str
+        Of the forces: a sensor, a file.
+    simulated : bool
+    """
+
+    protocol: Protocol
+    time_s: FloatArray
+    force_n: FloatArray
+    depth_m: FloatArray
+    ball: Ball
+    depth_std_m: float = np.nan
+    force_std_n: float = np.nan
+    noise_n: float = np.nan
+    label: str = ""
+    source: str = ""
+    simulated: bool = False
+
+    def __post_init__(self) -> None:
+        count = self.time_s.size
+        for name in ("time_s", "force_n", "depth_m"):
+            values = getattr(self, name)
+            good = values.shape == (count,) and count >= MOST_FEW and bool(np.isfinite(values).all())
+            accepted = f"at least {MOST_FEW} finite numbers, as many of each"
+            require(good, name, f"shape {values.shape}", accepted)
+        rising = bool((np.diff(self.time_s) > 0).all())
+        require(rising, "time_s", "times that do not ascend", "ascending times")
+        require(self.depth_m.max() > 0, "depth_m", float(self.depth_m.max()), "a largest one above 0")
+
+
+MOST_FEW = 20
+"""A record has so many samples, at least."""
+SMOOTH = 9
+"""Samples over which force and depth are averaged to find where pressing ends."""
+PRESSED_DEPTH, PRESSED_FORCE = 0.98, 0.95
+"""Of the largest one, at which the tissue counts as pressed."""
+BACK = 0.05
+"""By which the robot may go back while it presses, and at which a record may begin, of the largest depth."""
+RAMP_PARTS, BEFORE_PARTS, AFTER_PARTS = 50, 6, 4
+"""Means of the ramp, of the time before the touch, and after the tip is clear."""
+GROWTH = 1.06
+"""From one mean of a hold to the next, longer by this factor."""
+CLEAR_M = 2e-4
+"""Above the surface the tip is clear of the tissue [m]: nothing clings to it any more."""
+
+
+@dataclass(frozen=True)
+class Means:
+    """What is left of a record: means of force and depth, few enough for a fit.
+
+    Attributes
+    ----------
+    time_s, depth_m, force_n, std_n : (N,) arrays
+        Of the contact; std_n from the noise of the forces alone.
+    turn : int
+        Last of them before the tip is drawn back.
+    free_time_s, free_force_n, free_std_n : (M,) arrays
+        Of the time before the touch, and after the tip is clear.
+    begin_s, ramp_s, end_s : float
+        When the tip touches, how long it presses until depth or force is nearly there, and when the hold ends.
+    noise_n : float
+        Of one force.
+    """
+
+    time_s: FloatArray
+    depth_m: FloatArray
+    force_n: FloatArray
+    std_n: FloatArray
+    turn: int
+    free_time_s: FloatArray
+    free_force_n: FloatArray
+    free_std_n: FloatArray
+    begin_s: float
+    ramp_s: float
+    end_s: float
+    noise_n: float = field(default=np.nan)
+
+    @property
+    def hold_s(self) -> float:
+        """From the end of the ramp to the end of the hold [s]."""
+        return self.end_s - self.begin_s - self.ramp_s
+
+
+def means_of(test: Indentation) -> Means:
+    """Means over parts of a record that are short where it changes fast.
+
+    Raises
+    ------
+    ValueError
+        If the record begins in contact, or the robot goes back before the end of the hold.
+    """
+    time, force, depth = test.time_s, test.force_n, test.depth_m
+    smooth = min(SMOOTH, time.size // 4)
+    deep, strong = (np.convolve(v, np.ones(smooth) / smooth, "same") for v in (depth, force))
+    most = deep.max()
+    begun = f"{depth[0]:.3g} m at its beginning, {most:.3g} at most"
+    require(depth[0] < BACK * most, "depth_m", begun, "a record that begins before the touch")
+    first = int(np.argmax(depth > 0))
+    last = int(np.flatnonzero(deep >= PRESSED_DEPTH * most)[-1])
+    least = int(np.argmax(deep == most)) if test.protocol is not Protocol.INDENTATION else last
+    pressing = deep[first : last + 1]
+    back = float((np.maximum.accumulate(pressing) - pressing).max())
+    accepted = f"a way into the tissue that goes back by less than {BACK:.0%} before it is drawn back"
+    require(back < BACK * most, "depth_m", f"{back:.3g} m back", accepted)
+    reached = int(np.argmax(deep >= PRESSED_DEPTH * most))
+    felt = int(np.argmax(strong >= PRESSED_FORCE * strong[: last + 1].max()))
+    ramp = max(first + 1, min(reached, felt, least, last))
+    edges = [first, *_even(time, first, ramp, RAMP_PARTS)]
+    edges += _growing(time, ramp, last + 1, (time[ramp] - time[first]) / RAMP_PARTS)
+    turn = len(edges) - 2
+    clear = _clear_from(depth, last)
+    if test.protocol is Protocol.INDENTATION:
+        edges += _even(time, last + 1, clear, RAMP_PARTS)
+    noise = test.noise_n
+    if np.isnan(noise):  # mean square successive difference, von Neumann 1941
+        noise = float(np.sqrt(np.median(np.diff(force) ** 2) / 2 / MEDIAN_OF_SQUARE))
+    noise = max(noise, 1e-9 * float(np.abs(force).max()))
+    taken = np.asarray(edges)
+    inside = [_mean(v, taken) for v in (time, depth, force)]
+    std = noise / np.sqrt(np.diff(taken))
+    ends = [0, *_even(time, 0, first, BEFORE_PARTS)] if first > BEFORE_PARTS else []
+    before = np.asarray(ends, int)
+    after = np.asarray([], int)
+    if time.size - clear > AFTER_PARTS:
+        after = np.asarray([clear, *_even(time, clear, time.size, AFTER_PARTS)])
+    free = [np.concatenate([_mean(v, part) for part in (before, after)]) for v in (time, force)]
+    counts = np.concatenate([np.diff(before), np.diff(after)])
+    return Means(
+        *inside,
+        std,
+        turn,
+        *free,
+        noise / np.sqrt(counts),
+        float(time[first]),
+        float(time[ramp] - time[first]),
+        float(time[last]),
+        noise,
+    )
+
+
+MEDIAN_OF_SQUARE = 0.4549364
+"""Of a normal variable with variance 1."""
+
+
+def _mean(values: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
+    """(len(edges) - 1,) means between samples."""
+    if edges.size < 2:
+        return np.zeros(0)
+    sums = np.add.reduceat(values[: edges[-1]], edges[:-1])
+    return sums / np.diff(edges)
+
+
+def _even(time: FloatArray, begin: int, end: int, parts: int) -> list[int]:
+    """Ends of parts of equal duration, one sample or more in each, of samples from `begin` to before `end`."""
+    if end <= begin:
+        return []
+    wanted = np.linspace(time[begin], time[end - 1], parts + 1)[1:-1]
+    found = np.unique(np.searchsorted(time[begin:end], wanted)) + begin
+    return [int(i) for i in found if begin < i < end] + [end]
+
+
+def _growing(time: FloatArray, begin: int, end: int, shortest_s: float) -> list[int]:
+    """Ends of parts that grow with the time since `begin`."""
+    if end <= begin + 1:
+        return [end] if end > begin else []
+    since = time[begin:end] - time[begin]
+    parts = np.log1p(since * (GROWTH - 1) / shortest_s) / np.log(GROWTH)
+    found = np.flatnonzero(np.diff(np.floor(parts)) > 0) + begin + 1
+    return [*(int(i) for i in found), end]
+
+
+def _clear_from(depth: FloatArray, last: int) -> int:
+    """First sample after the hold at which the tip is clear of the tissue; their number where it never is."""
+    clear = np.flatnonzero(depth[last:] < -CLEAR_M)
+    return last + int(clear[0]) if clear.size else depth.size

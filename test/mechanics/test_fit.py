@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from mechanics.made import RADIUS_M, force_over, relaxation
+from tactile_resonance.mechanics.ball import Ball
+from tactile_resonance.mechanics.fit import Known, fit_indentation
+from tactile_resonance.mechanics.indentation import Indentation, Protocol
+from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.simulation.tissue.library import read_tissues
+
+STANDARD = Prony(4e3, np.array([3e3]), np.array([2.0]))
+
+
+def deviations(fit, truth):
+    """Of all that is called determined, in its own standard deviations."""
+    found = []
+    for term in fit.terms:
+        if term.known is Known.DETERMINED:
+            near = int(np.argmin(np.abs(np.log(truth.times_s / term.time_s))))
+            found.append(np.log(term.modulus_pa / truth.moduli_pa[near]) / term.modulus_std)
+            found.append(np.log(term.time_s / truth.times_s[near]) / term.time_std)
+    if fit.equilibrium_known is Known.DETERMINED:
+        found.append(np.log(fit.equilibrium_pa / truth.equilibrium_pa) / fit.equilibrium_std)
+    return found
+
+
+@pytest.mark.parametrize("stiffness_n_per_m", [np.inf, 14.8])
+def test_constants_of_one_and_two_terms_lie_within_their_deviations(stiffness_n_per_m):
+    pooled = []
+    for seed in range(14):
+        rng = np.random.default_rng(seed)
+        terms = 1 + seed % 2
+        times = rng.uniform(0.8, 1.5) * np.array([1.0, rng.uniform(6, 10)])[:terms]
+        einf = rng.uniform(1e3, 2e4)
+        truth = Prony(einf, einf * rng.uniform(0.4, 1.2, terms), times)
+        test = relaxation(truth, rng, stiffness_n_per_m=stiffness_n_per_m, hold_s=60.0)
+        pooled += deviations(fit_indentation(test, most_terms=3), truth)
+    pooled = np.abs(pooled)
+    assert pooled.size > 30
+    assert pooled.max() < 4
+    # not significantly below .93 at 99.9 %
+    assert binom.cdf((pooled < 1.96).sum(), pooled.size, 0.93) > 1e-3
+
+
+def test_terms_beyond_ramp_and_hold_are_not_determined():
+    tissue = read_tissues()["liver"]
+    rng = np.random.default_rng(3)
+    fit = fit_indentation(relaxation(tissue.prony, rng, hold_s=20.0))
+    truth = tissue.prony
+    determined = [term for term in fit.terms if term.known is Known.DETERMINED]
+    assert all(fit.ramp_s < term.time_s < fit.hold_s for term in determined)
+    assert any(term.known is Known.SLOWER for term in fit.terms)  # 60 s
+    assert fit.equilibrium_known is Known.SLOWER
+    assert np.all(np.abs(deviations(fit, truth)) < 4)
+    # within ramp and hold the modulus itself is known, beyond them it is not stated
+    value, std = fit.modulus(5.0)
+    assert abs(np.log(value / truth.relaxation_modulus(5.0))) < 4 * std
+    assert std < 0.2
+    assert np.isnan(fit.modulus(100.0)).all()
+    assert np.isnan(fit.modulus(1e-3)).all()
+
+
+def test_a_record_without_its_ramp_is_refused():
+    test = relaxation(STANDARD, np.random.default_rng(5))
+    late = test.time_s > 0.25
+    cut = {name: getattr(test, name)[late & (test.time_s < 30)] for name in ("time_s", "force_n", "depth_m")}
+    with pytest.raises(ValueError, match="depth_m: got .* accepted is .* before the touch"):
+        fit_indentation(replace(test, **cut))
+
+
+def test_creep_at_constant_force_gives_the_same_constants():
+    ball = Ball(RADIUS_M)
+    time = np.concatenate([np.linspace(0, 0.2, 101)[:-1], np.arange(0.2, 40, 0.01)])
+    force = 0.01 * np.minimum(time / 0.2, 1.0)
+    # the way that keeps the force, by bisection of the course itself
+    depth = np.zeros_like(time)
+    rng = np.random.default_rng(2)
+    compliance = STANDARD.creep_compliance
+    rises = np.diff(force, prepend=0.0)
+    ramp = slice(0, 101)
+    for i, t in enumerate(time):
+        passed = compliance(np.maximum(t - time[ramp], 0.0)) * rises[ramp] * (time[ramp] <= t)
+        depth[i] = (passed.sum() / ball.factor) ** (2 / 3)
+    noisy = force + 2e-4 * rng.standard_normal(time.size)
+    test = Indentation(Protocol.CREEP, time, noisy, depth, ball, force_std_n=0.0, depth_std_m=0.0)
+    fit = fit_indentation(test, most_terms=2)
+    assert fit.equilibrium_known is Known.DETERMINED
+    assert np.all(np.abs(deviations(fit, STANDARD)) < 4)
+
+
+def test_load_and_unload_give_the_constants_too():
+    ball = Ball(RADIUS_M)
+    time = np.arange(0.0, 24.0, 0.01)
+    depth = np.interp(time, [0, 2, 20, 24], [0, 1e-3, 1e-3, -1e-3])
+    turn = int(np.flatnonzero(depth >= 1e-3 - 1e-12)[-1])
+    force, _ = force_over(ball, time, depth, Prony(4e3, np.array([3e3]), np.array([5.0])), turn)
+    noisy = force + 1e-4 * np.random.default_rng(4).standard_normal(time.size)
+    test = Indentation(Protocol.INDENTATION, time, noisy, depth, ball, force_std_n=0.0)
+    fit = fit_indentation(test, most_terms=2)
+    assert fit.time_s[-1] > 21
+    assert fit.chi_square / fit.dof < 1.5
+    truth = Prony(4e3, np.array([3e3]), np.array([5.0]))
+    assert np.all(np.abs(deviations(fit, truth)) < 4)
+
+
+def test_what_hertz_leaves_out_is_said():
+    soft = Prony(500.0, np.array([500.0]), np.array([2.0]))
+    fit = fit_indentation(relaxation(soft, np.random.default_rng(1)), most_terms=1, thickness_m=5e-3)
+    assert fit.contact_ratio > 0.7
+    assert any("a/R" in text for text in fit.status)
+    assert any("thin" in text for text in fit.status)
+
+
+def test_a_way_that_goes_back_is_refused():
+    test = relaxation(STANDARD, np.random.default_rng(1))
+    depth = test.depth_m.copy()
+    depth[(test.time_s > 5) & (test.time_s < 6)] *= 0.5
+    with pytest.raises(ValueError, match="depth_m: got .* back.*; accepted is"):
+        fit_indentation(replace(test, depth_m=depth))
