@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force and depth through one contact, from the approach until the tip is back: what a mechanical test records."""
+"""Force and depth through one contact, from the approach until the tip is back: what a test records."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from tactile_resonance.contact.goal import TOUCHING, ContactGoal, State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.mechanics.ball import Ball
-from tactile_resonance.mechanics.indentation import Indentation, Protocol
+from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
 
 RECORDED = (State.APPROACH, *TOUCHING, State.RETRACT)
 
@@ -64,7 +63,9 @@ class IndentationRecorder:
             If the tissue was not touched, or too little was recorded.
         """
         if result is None or result.surface_m is None or not self._forces:
-            raise ValueError("indentation: the tissue was not touched; accepted is a contact that was reached")
+            raise ValueError(
+                "indentation: the tissue was not touched; accepted is a contact that was reached"
+            )
         forces, heights = np.array(self._forces), np.array(self._heights)
         ns = forces[:, 0].astype(np.int64)
         begin_ns = int(ns[0])

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prony series of tissue from a test with a ball: estimates, their covariance, and what the record determines.
 
-The model is that of `ball` over the recorded way of the robot, ramp and all; unknown are Einf, E_j and tau_j, the
-place of the surface and the zero of the force with its drift. It is fitted to the forces by weighted least
-squares in the logarithms of the constants, for one term (the standard linear solid), two terms and so on;
-the number of terms is that of least BIC.
+The model is that of `course` over the recorded way of the robot, ramp and all; unknown are Einf, E_j and
+tau_j, the place of the surface and the zero of the force with its drift. It is fitted to the forces by
+weighted least squares in the logarithms of the constants, for one term (the standard linear solid), two
+terms and so on; the number of terms is the least on which more do not improve by an F test.
 
-A term acts on the record only between the duration of the ramp and that of the hold: of faster ones the ramp shows
-one number, of slower ones the hold shows a part. All faster terms together are fitted as one of an eighth of the
-ramp, and slower ones as they come, for the others would be biased without them; they are declared `not
-determined`. What is left to chance in the number of terms is in the deviations: the step of each constant to the
-series with one term more.
+A term acts on the record only between the duration of the ramp and that of the hold: of faster ones the
+ramp shows one number, of slower ones the hold shows a part. All faster terms together are fitted as one of
+an eighth of the ramp, and slower ones as they come, for the others would be biased without them; they are
+declared `not determined`. What is left to chance in the number of terms is in the deviations: the step of
+each constant to the series with one term more.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -24,7 +25,7 @@ from scipy.optimize import least_squares, nnls
 from scipy.special import fdtrc
 
 from tactile_resonance.fields import require
-from tactile_resonance.mechanics.ball import Ball, course_of
+from tactile_resonance.mechanics.course import course_of, layer_share, sphere_share
 from tactile_resonance.mechanics.indentation import Indentation, Means, means_of
 from tactile_resonance.mechanics.prony import Prony
 
@@ -93,10 +94,12 @@ class Fit:
     zero_n, zero_drift_n_per_s : float
         Of the force.
     covariance : (2 n + 1, 2 n + 1) array
-        Of the logarithms of Einf, E_1.., tau_1..; in the order of `terms`.
+        From noise alone, of the logarithms of Einf, E_1.., tau_1..; in the order of `terms`.
+    beyond : Prony or None
+        The series with one term more; None where it was not found.
     chi_square, dof : float, int
-        Of the means, by the noise of the forces: expected chi_square / dof is 1. Where it is more the covariance
-        is larger by that.
+        Of the means, by the noise of the forces: expected chi_square / dof is 1. Where it is more the
+        covariance is larger by that.
     bic : tuple of float
         Of one term, two and so on, for comparison: the number of terms is that of an F test, at 5 %.
     begin_s, ramp_s, hold_s : float
@@ -110,8 +113,8 @@ class Fit:
     contact_ratio : float
         Largest contact radius over that of the ball.
     sphere_share, layer_share : float
-        What Hertz's force leaves out, as in `ball`: a sphere's over a paraboloid's, a layer's over a half-space's
-        (NaN: thickness unknown).
+        What Hertz's force leaves out, as in `course`: a sphere's over a paraboloid's, a layer's over a
+        half-space's (NaN: thickness unknown).
     status : tuple of str
         What limits the result, for people; empty: nothing.
     """
@@ -125,6 +128,7 @@ class Fit:
     zero_n: float
     zero_drift_n_per_s: float
     covariance: FloatArray
+    beyond: Prony | None
     chi_square: float
     dof: int
     bic: tuple[float, ...]
@@ -153,7 +157,7 @@ class Fit:
         """E(t) [Pa] at one time after a step and its relative deviation; NaN outside of ramp and hold."""
         if not self.ramp_s <= time_s <= self.hold_s:
             return np.nan, np.nan
-        series, n = self.prony, len(self.terms)
+        series = self.prony
         value = float(series.relaxation_modulus(time_s))
         decays = np.exp(-time_s / series.times_s)
         slope = np.concatenate(
@@ -163,8 +167,11 @@ class Fit:
                 series.moduli_pa * decays * time_s / series.times_s,
             ]
         )
-        assert slope.size == 2 * n + 1
-        return value, float(np.sqrt(slope @ self.covariance @ slope)) / value
+        std = float(np.sqrt(slope @ self.covariance @ slope)) / value
+        moved = 0.0
+        if self.beyond is not None:
+            moved = float(np.log(self.beyond.relaxation_modulus(time_s) / value))
+        return value, math.hypot(std, moved)
 
 
 def fit_indentation(
@@ -259,14 +266,18 @@ class _Problem:
         spread = np.geomspace(*self._tried_s, terms + 2)[1:-1]
         moduli, _ = self._linear(spread, 0.0 if fewer is None else fewer.x[-3])
         others = np.zeros(4) if fewer is None else fewer.x[-4:]
-        starts = [np.concatenate([np.log(np.maximum(moduli[:-1], self._small_pa)), np.log(spread), others])]
+        starts = [
+            np.concatenate(
+                [np.log(np.maximum(moduli[:-1], self._small_pa)), np.log(spread), others]
+            )
+        ]
         if fewer is not None:
             starts += self._starts_after(fewer)
         found = [solution for x in starts if (solution := self._from(terms, x)) is not None]
         return min(found, key=lambda solution: solution.chi_square, default=None)
 
     def shortened(self, longer: _Solution, known: _Solution) -> _Solution:
-        """Best of a solution and of those from one with a term more, two of its own made one or one left out."""
+        """Best of a solution and of those from one with a term more, two made one or one left out."""
         n, x = longer.terms, longer.x
         moduli, times = x[1 : 1 + n], x[1 + n : 1 + 2 * n]
         j, least = int(np.argmin(np.diff(times))), int(np.argmin(moduli))
@@ -289,7 +300,12 @@ class _Problem:
         ]
         for j in range(n):
             halves = np.insert(moduli - np.log(2) * (np.arange(n) == j), j, moduli[j] - np.log(2))
-            made.append((halves, np.insert(times + np.log(2) * (np.arange(n) == j), j, times[j] - np.log(2))))
+            made.append(
+                (
+                    halves,
+                    np.insert(times + np.log(2) * (np.arange(n) == j), j, times[j] - np.log(2)),
+                )
+            )
         made.sort(key=lambda one: self._linear(np.exp(one[1]), x[-3])[1])
         return [np.concatenate([x[:1], *one, x[-4:]]) for one in made[:STARTS]]
 
@@ -410,10 +426,11 @@ class _Problem:
         dof = max(1, count - best.x.size)
         more = max(1.0, best.chi_square / dof)
         covariance = more * best.covariance
-        if further is not None:
-            moved = _moved(best, further)
-            covariance = covariance + np.outer(moved, moved)
         std = np.sqrt(np.diag(covariance))
+        beyond = None
+        if further is not None:
+            std = np.hypot(std, _moved(best, further))
+            beyond = _series(further)
         values = np.exp(best.x[: 2 * n + 1])
         hold_s = max(means.hold_s, means.ramp_s)
         terms = []
@@ -422,7 +439,10 @@ class _Problem:
             stds = std[1 + j], std[1 + n + j]
             known = _known(time, *stds, means.ramp_s, hold_s)
             terms.append(Term(float(modulus), float(time), float(stds[0]), float(stds[1]), known))
-        slow = any(t.known is Known.SLOWER or (t.known is Known.UNCERTAIN and t.time_s > hold_s / 4) for t in terms)
+        slow = any(
+            t.known is Known.SLOWER or (t.known is Known.UNCERTAIN and t.time_s > hold_s / 4)
+            for t in terms
+        )
         equilibrium = Known.DETERMINED
         if slow:
             equilibrium = Known.SLOWER
@@ -434,8 +454,8 @@ class _Problem:
         deepest = float(ball_m[0, : means.turn + 1].max())
         peak, held = float(force[0].max()), float(force[0, means.turn])
         ball = self._ball
-        sphere = ball.sphere_share(deepest)
-        layer = np.nan if np.isnan(thickness_m) else ball.layer_share(deepest, thickness_m)
+        sphere = sphere_share(ball, deepest)
+        layer = np.nan if np.isnan(thickness_m) else layer_share(ball, deepest, thickness_m)
         ratio = float(np.sqrt(deepest / ball.radius_m))
         return Fit(
             tuple(terms),
@@ -447,9 +467,12 @@ class _Problem:
             float(zero),
             float(drift),
             covariance[: 2 * n + 1, : 2 * n + 1],
+            beyond,
             best.chi_square,
             dof,
-            tuple(count * np.log(s.chi_square / count) + 2 * s.terms * np.log(count) for s in tried),
+            tuple(
+                count * np.log(s.chi_square / count) + 2 * s.terms * np.log(count) for s in tried
+            ),
             means.begin_s,
             means.ramp_s,
             means.hold_s,
@@ -467,13 +490,20 @@ class _Problem:
         )
 
 
-def _known(time_s: float, modulus_std: float, time_std: float, ramp_s: float, hold_s: float) -> Known:
+def _known(
+    time_s: float, modulus_std: float, time_std: float, ramp_s: float, hold_s: float
+) -> Known:
     middle_s = np.sqrt(ramp_s * hold_s)
     if time_s < middle_s and time_s * np.exp(-SURE * time_std) < ramp_s:
         return Known.FASTER
     if time_s >= middle_s and time_s * np.exp(SURE * time_std) > hold_s / SHOWN:
         return Known.SLOWER
     return Known.UNCERTAIN if max(modulus_std, time_std) > LARGEST_STD else Known.DETERMINED
+
+
+def _series(solution: _Solution) -> Prony:
+    values = np.exp(solution.x[: 2 * solution.terms + 1])
+    return Prony(float(values[0]), *np.split(values[1:], 2))
 
 
 def _moved(best: _Solution, further: _Solution) -> FloatArray:

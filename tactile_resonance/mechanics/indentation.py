@@ -3,16 +3,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.fields import require
-from tactile_resonance.mechanics.ball import Ball
+from tactile_resonance.fields import check_within, require
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ball:
+    """What presses.
+
+    Attributes
+    ----------
+    radius_m : float
+    poisson_ratio : float
+        Of the tissue.
+    stiffness_n_per_m : float
+        Between robot and ball; infinite where it is held rigidly.
+    """
+
+    radius_m: float
+    poisson_ratio: float = 0.49
+    stiffness_n_per_m: float = np.inf
+
+    def __post_init__(self) -> None:
+        for name in ("radius_m", "stiffness_n_per_m"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        check_within(self, poisson_ratio=(0, 0.5))
+
+    @property
+    def factor(self) -> float:
+        """Force of Hertz per modulus and ``delta^(3/2)`` [m^(1/2)]."""
+        return 4 / 3 * math.sqrt(self.radius_m) / (1 - self.poisson_ratio**2)
 
 
 class Protocol(str, Enum):
@@ -34,11 +62,12 @@ class Indentation:
     ----------
     protocol : Protocol
     time_s, force_n, depth_m : (n,) arrays
-        Ascending times; force along the normal, compression positive; way of the robot past the surface, negative
-        above it. Of the ball, where it is held rigidly.
+        Ascending times; force along the normal, compression positive; way of the robot past the surface,
+        negative above it. Of the ball, where it is held rigidly.
     ball : Ball
     depth_std_m, force_std_n : float
-        Standard deviations of the zeros of depth and force; NaN: unknown, the record has to show them. 0: exact.
+        Standard deviations of the zeros of depth and force; NaN: unknown, the record has to show them. 0:
+        exact.
     noise_n : float
         Standard deviation of one force; NaN: the forces show it.
     label : str
@@ -63,12 +92,16 @@ class Indentation:
         count = self.time_s.size
         for name in ("time_s", "force_n", "depth_m"):
             values = getattr(self, name)
-            good = values.shape == (count,) and count >= MOST_FEW and bool(np.isfinite(values).all())
+            good = (
+                values.shape == (count,) and count >= MOST_FEW and bool(np.isfinite(values).all())
+            )
             accepted = f"at least {MOST_FEW} finite numbers, as many of each"
             require(good, name, f"shape {values.shape}", accepted)
         rising = bool((np.diff(self.time_s) > 0).all())
         require(rising, "time_s", "times that do not ascend", "ascending times")
-        require(self.depth_m.max() > 0, "depth_m", float(self.depth_m.max()), "a largest one above 0")
+        require(
+            self.depth_m.max() > 0, "depth_m", float(self.depth_m.max()), "a largest one above 0"
+        )
 
 
 MOST_FEW = 20
@@ -100,7 +133,8 @@ class Means:
     free_time_s, free_force_n, free_std_n : (M,) arrays
         Of the time before the touch, and after the tip is clear.
     begin_s, ramp_s, end_s : float
-        When the tip touches, how long it presses until depth or force is nearly there, and when the hold ends.
+        When the tip touches, how long it presses until depth or force is nearly there, and when the hold
+        ends.
     noise_n : float
         Of one force.
     """
@@ -116,7 +150,7 @@ class Means:
     begin_s: float
     ramp_s: float
     end_s: float
-    noise_n: float = field(default=np.nan)
+    noise_n: float
 
     @property
     def hold_s(self) -> float:
@@ -143,10 +177,15 @@ def means_of(test: Indentation) -> Means:
     least = int(np.argmax(deep == most)) if test.protocol is not Protocol.INDENTATION else last
     pressing = deep[first : last + 1]
     back = float((np.maximum.accumulate(pressing) - pressing).max())
-    accepted = f"a way into the tissue that goes back by less than {BACK:.0%} before it is drawn back"
+    accepted = (
+        f"a way into the tissue that goes back by less than {BACK:.0%} before it is drawn back"
+    )
     require(back < BACK * most, "depth_m", f"{back:.3g} m back", accepted)
     reached = int(np.argmax(deep >= PRESSED_DEPTH * most))
-    felt = int(np.argmax(strong >= PRESSED_FORCE * strong[: last + 1].max()))
+    noise = _noise_of(test)
+    # of many means the largest one is more than the force by several of their deviations
+    peak = strong[: last + 1].max() - LARGEST * noise / np.sqrt(smooth)
+    felt = int(np.argmax(strong >= PRESSED_FORCE * peak))
     ramp = max(first + 1, min(reached, felt, least, last))
     edges = [first, *_even(time, first, ramp, RAMP_PARTS)]
     edges += _growing(time, ramp, last + 1, (time[ramp] - time[first]) / RAMP_PARTS)
@@ -154,25 +193,26 @@ def means_of(test: Indentation) -> Means:
     clear = _clear_from(depth, last)
     if test.protocol is Protocol.INDENTATION:
         edges += _even(time, last + 1, clear, RAMP_PARTS)
-    noise = test.noise_n
-    if np.isnan(noise):  # mean square successive difference, von Neumann 1941
-        noise = float(np.sqrt(np.median(np.diff(force) ** 2) / 2 / MEDIAN_OF_SQUARE))
-    noise = max(noise, 1e-9 * float(np.abs(force).max()))
     taken = np.asarray(edges)
-    inside = [_mean(v, taken) for v in (time, depth, force)]
+    time_s, depth_m, force_n = (_mean(v, taken) for v in (time, depth, force))
     std = noise / np.sqrt(np.diff(taken))
     ends = [0, *_even(time, 0, first, BEFORE_PARTS)] if first > BEFORE_PARTS else []
     before = np.asarray(ends, int)
     after = np.asarray([], int)
     if time.size - clear > AFTER_PARTS:
         after = np.asarray([clear, *_even(time, clear, time.size, AFTER_PARTS)])
-    free = [np.concatenate([_mean(v, part) for part in (before, after)]) for v in (time, force)]
+    free_s, free_n = (
+        np.concatenate([_mean(v, part) for part in (before, after)]) for v in (time, force)
+    )
     counts = np.concatenate([np.diff(before), np.diff(after)])
     return Means(
-        *inside,
+        time_s,
+        depth_m,
+        force_n,
         std,
         turn,
-        *free,
+        free_s,
+        free_n,
         noise / np.sqrt(counts),
         float(time[first]),
         float(time[ramp] - time[first]),
@@ -183,6 +223,23 @@ def means_of(test: Indentation) -> Means:
 
 MEDIAN_OF_SQUARE = 0.4549364
 """Of a normal variable with variance 1."""
+ALIKE = 20
+"""Samples after which a filter's noise is new."""
+LARGEST = 3.5
+"""Deviations of the largest of some thousand normal variables."""
+
+
+def _noise_of(test: Indentation) -> float:
+    """Standard deviation of one force: what neighbours differ by (von Neumann 1941).
+
+    Of means over some samples, where there are many: those of a filter are alike.
+    """
+    noise, force = test.noise_n, test.force_n
+    if np.isnan(noise):
+        count = ALIKE if force.size > 50 * ALIKE else 1
+        means = force[: force.size // count * count].reshape(-1, count).mean(1)
+        noise = float(np.sqrt(count * np.median(np.diff(means) ** 2) / 2 / MEDIAN_OF_SQUARE))
+    return max(noise, 1e-9 * float(np.abs(test.force_n).max()))
 
 
 def _mean(values: FloatArray, edges: NDArray[np.int64]) -> FloatArray:

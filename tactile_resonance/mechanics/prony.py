@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A generalised Maxwell solid: its relaxation modulus is a Prony series; one term is the standard linear solid."""
+"""A generalised Maxwell solid: a Prony series; with one term the standard linear solid."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class Prony:
     def __post_init__(self) -> None:
         einf = self.equilibrium_pa
         require(0 <= einf < np.inf, "equilibrium_pa", einf, "a number, 0 or above")
-        moduli, times = (np.atleast_1d(np.asarray(v, float)) for v in (self.moduli_pa, self.times_s))
+        moduli, times = (
+            np.atleast_1d(np.asarray(v, float)) for v in (self.moduli_pa, self.times_s)
+        )
         good = bool(np.all((moduli >= 0) & np.isfinite(moduli)))
         require(good, "moduli_pa", moduli.tolist(), "numbers, 0 or above")
         good = moduli.shape == times.shape and bool(np.all((times > 0) & np.isfinite(times)))

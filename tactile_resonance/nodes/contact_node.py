@@ -3,21 +3,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import math
+from collections.abc import Callable
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.action import MakeContact
+from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.admission import require_fit
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.mechanics.indentation import Ball
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import ContactSettings, contact_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
@@ -26,11 +31,19 @@ from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
-from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
+from tactile_resonance.nodes.messages import (
+    contact_feedback,
+    contact_goal,
+    contact_result,
+    indent_goal,
+    indent_result,
+    time_message,
+)
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
+from tactile_resonance.recording.messages import write_indentation
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
@@ -77,7 +90,9 @@ DEAD_NS = 1_000_000_000
 
 
 class ContactNode(ManagedNode):
-    """Action `make_contact`, services `retract` and `stop`; publishes `wrench`, `tcp_pose`, `contact_state`.
+    """Actions `make_contact` and `indent`, services `retract` and `stop`.
+
+    Publishes `wrench`, `tcp_pose`, `contact_state`.
 
     The executor's thread only takes requests; devices, law and envelope run in the loop's thread. When
     the node is deactivated or ends, the tip is drawn back first, where the link allows it.
@@ -117,6 +132,7 @@ class ContactNode(ManagedNode):
             self._base_frame,
         )
         self._goal: ServerGoalHandle | None = None
+        self._recorder: IndentationRecorder | None = None  # of a goal of `indent`
         self._finished: Future | None = None
         self._fault: ArmError | ForceError | None = None
         self._sound_ns: int | None = None  # of the last cycle without a fault
@@ -137,6 +153,13 @@ class ContactNode(ManagedNode):
             MakeContact,
             "make_contact",
             self._on_goal,
+            on_cancel=lambda _: self._news.trigger(),
+            refusal=self._refusal,
+        )
+        self.act(
+            Indent,
+            "indent",
+            self._on_indent,
             on_cancel=lambda _: self._news.trigger(),
             refusal=self._refusal,
         )
@@ -209,39 +232,78 @@ class ContactNode(ManagedNode):
         return "" if self._fault is None else str(self._fault)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        result = MakeContact.Result(cause="refused")
+        def make() -> ContactGoal:
+            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+
+        try:
+            outcome = await self._outcome_of(goal, make)
+        except _NotDoneError as error:
+            return MakeContact.Result(cause=error.cause, message=str(error))
+        _end(goal, outcome.reached)
+        return contact_result(outcome)
+
+    async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
+        def make() -> ContactGoal:
+            asked, protocol = indent_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+            stiffness = self._settings.parameters.beam_n_per_m
+            self._recorder = IndentationRecorder(
+                asked,
+                protocol,
+                Ball(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
+                self._force.info.name,
+                simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
+            )
+            return asked
+
+        try:
+            outcome = await self._outcome_of(goal, make)
+            recorder, self._recorder = self._recorder, None
+        except _NotDoneError as error:
+            self._recorder = None
+            return Indent.Result(cause=error.cause, message=str(error))
+        result = indent_result(outcome)
+        # nothing that was recorded is lost where the protocol was not done
+        with contextlib.suppress(ValueError):
+            write_indentation(result.record, recorder.record(outcome))
+            stamp_ns = self._arm.clock.ros_ns(recorder.begun_ns)
+            result.record.header.stamp = time_message(stamp_ns)
+        result.record.header.frame_id = self._base_frame
+        result.record.pose, result.record.hold_s = goal.request.pose.pose, goal.request.hold_s
+        moved_n, std_m = outcome.zero_change_n, outcome.surface_std_m
+        result.record.zero_moved_n = math.nan if moved_n is None else moved_n
+        result.record.depth_std_m = math.nan if std_m is None else std_m
+        _end(goal, result.done)
+        return result
+
+    async def _outcome_of(
+        self, goal: ServerGoalHandle, make: Callable[[], ContactGoal]
+    ) -> ContactResult:
+        """What became of a goal; where there is nothing it is aborted, and why is raised."""
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
+            if self._goal is not None:
+                raise ValueError("goal: refused while another one is under way")
             if self._stop.stopped:
                 raise ValueError("goal: refused while the tip is stopped")
             limits = self._settings.limits.lowered(
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            asked = contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+            asked = make()
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
-            result.message = str(error)
             self.health.error(f"refused: {error}")
             goal.abort()
-            return result
+            raise _NotDoneError("refused", str(error)) from None
         self._goal, self._finished = goal, Future()
         outcome: ContactResult | None = await self._finished
         self._goal = self._finished = None
         if outcome is None:
-            result.cause, result.message = "stopped", "contact_node was stopped"
             goal.abort()
-            return result
-        result = contact_result(outcome)
-        if goal.is_cancel_requested:
-            goal.canceled()
-        elif outcome.reached:
-            goal.succeed()
-        else:
-            goal.abort()
-        return result
+            raise _NotDoneError("stopped", "contact_node was stopped")
+        return outcome
 
     def _draw_back(self) -> None:
         if self._thread is not None:
@@ -275,7 +337,8 @@ class ContactNode(ManagedNode):
         self._forces.look()
         if self._goal is not None:
             controller = thread.controller
-            feedback = contact_feedback(controller.state.value, controller.estimate)
+            kind = MakeContact if self._recorder is None else Indent
+            feedback = contact_feedback(kind, controller.state.value, controller.estimate)
             self._goal.publish_feedback(feedback)
 
     def _look(self) -> None:
@@ -305,7 +368,11 @@ class ContactNode(ManagedNode):
         if goal.is_cancel_requested and controller.state not in ended:
             thread.retract()
         result = controller.result
-        over = controller.state in (State.IDLE, State.FAULT) if goal.is_cancel_requested else True
+        over = True
+        if self._recorder is not None:  # it ends with the tip drawn back
+            over = controller.settled
+        elif goal.is_cancel_requested:
+            over = controller.state in (State.IDLE, State.FAULT)
         if result is not None and over:
             self._finish(result)
 
@@ -342,8 +409,33 @@ class ContactNode(ManagedNode):
             return
         if self._touch is not None:
             self._touch.moved(cycle.state, thread.clock.ros_ns(cycle.time_ns))
+        if self._recorder is not None:
+            self._recorder.take(cycle)
         self._forces.take(cycle)
         self._topics.take(cycle, thread)
+
+
+class _NotDoneError(Exception):
+    """Nothing became of a goal.
+
+    Attributes
+    ----------
+    cause : str
+    """
+
+    def __init__(self, cause: str, message: str) -> None:
+        super().__init__(message)
+        self.cause = cause
+
+
+def _end(goal: ServerGoalHandle, done: bool) -> None:
+    """Tell the client of a goal how it ended."""
+    if goal.is_cancel_requested:
+        goal.canceled()
+    elif done:
+        goal.succeed()
+    else:
+        goal.abort()
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.frf.result import BandDistortion
+from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
@@ -293,6 +294,44 @@ def write_pose(message: Any, contact: Contact) -> None:
 def spread_from_message(message: Any, prefix: str) -> ForceSpread:
     """How a force moved, of a message whose fields begin with `prefix`."""
     return ForceSpread(*(getattr(message, prefix + name) for name in SPREAD))
+
+
+PROTOCOLS = {Protocol.RELAXATION: 1, Protocol.CREEP: 2, Protocol.INDENTATION: 3}
+"""Constants of ``msg/Indentation``."""
+
+
+def indentation_from_message(message: Any, label: str = "") -> Indentation:
+    """Record of a mechanical test.
+
+    Raises
+    ------
+    ValueError
+        If its protocol is unknown, or it holds too few samples, or some that are not finite.
+    """
+    stiffness = message.beam_stiffness_n_per_m
+    return Indentation(
+        protocol=key_of(PROTOCOLS, message.protocol, "protocol"),
+        time_s=array_of(message.time_s),
+        force_n=array_of(message.force_n),
+        depth_m=array_of(message.depth_m),
+        ball=Ball(message.tip_radius_m, stiffness_n_per_m=stiffness or math.inf),
+        force_std_n=message.force_std_n,
+        label=label,
+        source=message.force_source,
+        simulated=message.simulated,
+    )
+
+
+def write_indentation(message: Any, test: Indentation) -> None:
+    """Write a record into a message."""
+    message.protocol = PROTOCOLS[test.protocol]
+    for name in ("time_s", "force_n", "depth_m"):
+        fill(getattr(message, name), getattr(test, name))
+    stiffness = test.ball.stiffness_n_per_m
+    message.beam_stiffness_n_per_m = stiffness if math.isfinite(stiffness) else 0.0
+    message.tip_radius_m = test.ball.radius_m
+    message.force_std_n, message.force_source = test.force_std_n, test.source
+    message.simulated = test.simulated
 
 
 def time_from_message(stamp: Any) -> int:

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
-from mechanics.made import RADIUS_M, force_over, relaxation
-from tactile_resonance.mechanics.ball import Ball
 from tactile_resonance.mechanics.fit import Known, fit_indentation
-from tactile_resonance.mechanics.indentation import Indentation, Protocol
+from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.tissue.library import read_tissues
+
+sys.path.insert(0, str(Path(__file__).parent))
+from made_indentations import RADIUS_M, force_over, relaxation
 
 STANDARD = Prony(4e3, np.array([3e3]), np.array([2.0]))
 
@@ -67,7 +70,10 @@ def test_terms_beyond_ramp_and_hold_are_not_determined():
 def test_a_record_without_its_ramp_is_refused():
     test = relaxation(STANDARD, np.random.default_rng(5))
     late = test.time_s > 0.25
-    cut = {name: getattr(test, name)[late & (test.time_s < 30)] for name in ("time_s", "force_n", "depth_m")}
+    cut = {
+        name: getattr(test, name)[late & (test.time_s < 30)]
+        for name in ("time_s", "force_n", "depth_m")
+    }
     with pytest.raises(ValueError, match="depth_m: got .* accepted is .* before the touch"):
         fit_indentation(replace(test, **cut))
 
@@ -109,7 +115,9 @@ def test_load_and_unload_give_the_constants_too():
 
 def test_what_hertz_leaves_out_is_said():
     soft = Prony(500.0, np.array([500.0]), np.array([2.0]))
-    fit = fit_indentation(relaxation(soft, np.random.default_rng(1)), most_terms=1, thickness_m=5e-3)
+    fit = fit_indentation(
+        relaxation(soft, np.random.default_rng(1)), most_terms=1, thickness_m=5e-3
+    )
     assert fit.contact_ratio > 0.7
     assert any("a/R" in text for text in fit.status)
     assert any("thin" in text for text in fit.status)

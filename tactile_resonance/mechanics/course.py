@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rigid ball pressed once into a viscoelastic half-space, by a robot and perhaps through a spring, and drawn back.
+"""A rigid ball pressed once into a viscoelastic half-space, perhaps through a spring, and drawn back.
 
 While the contact grows the force is Lee & Radok's (J. Appl. Mech. 27 (1960) 438),
-``F(t) = c integral_0^t E(t - s) d(delta^(3/2))(s)``, ``c = 4 sqrt(R) / (3 (1 - nu^2))``; while it shrinks Ting's
-(J. Appl. Mech. 33 (1966) 845): the same integral up to t1, when the contact was as large as it is now,
+``F(t) = c integral_0^t E(t - s) d(delta^(3/2))(s)``, ``c = 4 sqrt(R) / (3 (1 - nu^2))``; while it shrinks
+Ting's (J. Appl. Mech. 33 (1966) 845): the same integral up to t1, when the contact was as large as it is now,
 ``integral_t1^t E(t - s) d delta(s) = 0``. With a Prony series both integrals are one number per term, which
 is carried from node to node: delta is linear between nodes for Ting's condition, delta^(3/2) for the force.
 
-Robot and ball differ by the bending of what is between them: ``k (z - delta) = F`` is solved with the force at
-each node, for beams are soft (15 N/m: 1 cN bends them 0.67 mm) and the ball goes on while the robot stands.
+Robot and ball differ by the bending of what is between them: ``k (z - delta) = F`` is solved with the force
+at each node, for beams are soft (15 N/m: 1 cN bends them 0.67 mm) and the ball goes on while the robot
+stands.
 """
 
 from __future__ import annotations
@@ -17,60 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-FloatArray = NDArray[np.float64]
+from tactile_resonance.mechanics.indentation import Ball, FloatArray
 
 NEWTON_STEPS = 8
 """Of a cubic that is convex where it is solved: from above Newton's method comes down to the root."""
-
-
-@dataclass(frozen=True)
-class Ball:
-    """What presses.
-
-    Attributes
-    ----------
-    radius_m : float
-    poisson_ratio : float
-        Of the tissue.
-    stiffness_n_per_m : float
-        Between robot and ball; infinite where it is held rigidly.
-    """
-
-    radius_m: float
-    poisson_ratio: float = 0.49
-    stiffness_n_per_m: float = np.inf
-
-    @property
-    def factor(self) -> float:
-        """Force of Hertz per modulus and ``delta^(3/2)`` [m^(1/2)]."""
-        return 4 / 3 * np.sqrt(self.radius_m) / (1 - self.poisson_ratio**2)
-
-    def sphere_share(self, depth_m: float) -> float:
-        """Force of a sphere over that of Hertz's paraboloid at a depth (Sneddon 1965), 1 for small ones.
-
-        NaN where the sphere is in to its equator.
-        """
-
-        def depth_of(x: float) -> float:  # over R, of a contact radius x R
-            return x / 2 * np.log((1 + x) / (1 - x))
-
-        wanted = depth_m / self.radius_m
-        if not wanted < 1.0:
-            return np.nan
-        x = brentq(lambda x: depth_of(x) - wanted, 0.0, 1 - 1e-12)
-        force = (x * x + 1) / 2 * np.log((1 + x) / (1 - x)) - x
-        return float(force / (4 / 3 * wanted**1.5)) if wanted > 1e-9 else 1.0
-
-    def layer_share(self, depth_m: float, thickness_m: float) -> float:
-        """Force on a layer bonded to what is rigid over that of a half-space, ``nu`` 0.5.
-
-        Dimitriadis et al., Biophys. J. 82 (2002) 2798, equation 11.
-        """
-        x = np.sqrt(self.radius_m * depth_m) / thickness_m
-        return float(1 + x * (1.133 + x * (1.283 + x * (0.769 + x * 0.0975))))
 
 
 @dataclass(frozen=True)
@@ -206,3 +160,31 @@ def _press(c, bending, time, depth, turn, einf, moduli, times, force, delta):
             for j in range(terms):
                 d_now[j] = decay[j] * d_now[j] + gain[j] * (now - before)
             delta[p, n] = now
+
+
+def sphere_share(ball: Ball, depth_m: float) -> float:
+    """Force of a sphere over that of Hertz's paraboloid at a depth (Sneddon 1965), 1 for small ones.
+
+    NaN where the sphere is in to its equator.
+    """
+
+    def depth_of(x: float) -> float:  # over R, of a contact radius x R
+        return x / 2 * np.log((1 + x) / (1 - x))
+
+    wanted = depth_m / ball.radius_m
+    if not wanted < 1.0:
+        return np.nan
+    if wanted < 1e-9:
+        return 1.0
+    x = brentq(lambda x: depth_of(x) - wanted, 0.0, 1 - 1e-12)
+    force = (x * x + 1) / 2 * np.log((1 + x) / (1 - x)) - x
+    return float(force / (4 / 3 * wanted**1.5))
+
+
+def layer_share(ball: Ball, depth_m: float, thickness_m: float) -> float:
+    """Force on a layer bonded to what is rigid over that of a half-space, ``nu`` 0.5.
+
+    Dimitriadis et al., Biophys. J. 82 (2002) 2798, equation 11.
+    """
+    x = np.sqrt(ball.radius_m * depth_m) / thickness_m
+    return float(1 + x * (1.133 + x * (1.283 + x * (0.769 + x * 0.0975))))

@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from mechanics.made import RADIUS_M, force_over
-from tactile_resonance.mechanics.ball import Ball
+from tactile_resonance.mechanics.course import layer_share, sphere_share
+from tactile_resonance.mechanics.indentation import Ball
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues
+
+sys.path.insert(0, str(Path(__file__).parent))
+from made_indentations import RADIUS_M, force_over
 
 SOLID = Prony(2e3, np.array([3e3]), np.array([0.7]))
 ELASTIC = Prony(5e3, np.array([]), np.array([]))
@@ -81,7 +87,11 @@ def test_an_elastic_solid_unloads_as_it_was_loaded():
 def test_it_agrees_with_the_bench_over_ramp_hold_and_unloading(name, stiffness_n_per_m):
     tissue = read_tissues()[name]
     time = np.concatenate(
-        [np.linspace(0, 0.2, 401), 0.2 + np.geomspace(1e-3, 10, 200), 10.2 + np.linspace(0, 0.4, 401)]
+        [
+            np.linspace(0, 0.2, 401),
+            0.2 + np.geomspace(1e-3, 10, 200),
+            10.2 + np.linspace(0, 0.4, 401),
+        ]
     )
     time = np.unique(time)
     depth = np.interp(time, [0, 0.2, 10.2, 10.6], [0, 1e-3, 1e-3, -2e-4])
@@ -91,7 +101,10 @@ def test_it_agrees_with_the_bench_over_ramp_hold_and_unloading(name, stiffness_n
     bench = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=0.49)
     tip, exact = bench, 1e-4
     if np.isfinite(stiffness_n_per_m):  # a light beam that is damped hardly swings
-        tip, exact = SprungIndenter(bench, stiffness_n_per_m=14.8, mass_kg=1e-6, damping_ns_per_m=1e-4), 3e-3
+        tip, exact = (
+            SprungIndenter(bench, stiffness_n_per_m=14.8, mass_kg=1e-6, damping_ns_per_m=1e-4),
+            3e-3,
+        )
     tip.step(0.0, 1e-3)
     steps = zip(depth[1:], np.diff(time), strict=True)
     expected = np.array([0.0, *((tip.step(z, dt), bench.force_n)[1] for z, dt in steps)])
@@ -109,8 +122,8 @@ def test_behind_a_spring_the_ball_goes_on_while_the_robot_stands():
 
 def test_a_sphere_and_a_layer_against_hertz():
     # Sneddon's series: the force of a sphere at delta / R is less by about a tenth of it
-    assert BALL.sphere_share(1e-6) == pytest.approx(1.0, abs=1e-3)
-    assert BALL.sphere_share(0.1 * RADIUS_M) == pytest.approx(0.99, abs=2e-3)
-    assert np.isnan(BALL.sphere_share(1.2 * RADIUS_M))
-    assert BALL.layer_share(1e-4, 1.0) == pytest.approx(1.0, abs=1e-3)
-    assert BALL.layer_share(4e-4, 1e-3) == pytest.approx(1 + 1.133 + 1.283 + 0.769 + 0.0975)
+    assert sphere_share(BALL, 1e-6) == pytest.approx(1.0, abs=1e-3)
+    assert sphere_share(BALL, 0.1 * RADIUS_M) == pytest.approx(0.99, abs=2e-3)
+    assert np.isnan(sphere_share(BALL, 1.2 * RADIUS_M))
+    assert layer_share(BALL, 1e-4, 1.0) == pytest.approx(1.0, abs=1e-3)
+    assert layer_share(BALL, 4e-4, 1e-3) == pytest.approx(1 + 1.133 + 1.283 + 0.769 + 0.0975)

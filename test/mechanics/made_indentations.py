@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from tactile_resonance.mechanics.ball import Ball, course_of
-from tactile_resonance.mechanics.indentation import Indentation, Protocol
+from tactile_resonance.mechanics.course import course_of
+from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
 
 RADIUS_M = 2.5e-3
 
