@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
+from rclpy.serialization import serialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.contact.samples import Pose
@@ -36,6 +37,7 @@ from tactile_resonance.scan.hands import (
     Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.protocols import TOPIC, TYPE, ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
@@ -213,6 +215,27 @@ class NodeHands:
             text = f"measurement: the place of the tip is unknown: {reason}"
             raise PointDisturbed(text, "place unknown")
         return measured
+
+    def test(
+        self,
+        point: ScanPoint,
+        asked: ProtocolRequest,
+        force_n: float,
+        recording: PointRecording,
+        check: Check,
+    ) -> None:
+        """Carry a mechanical test out by contact_node; what it recorded is kept, whatever becomes of it."""
+        if self._tip is None:
+            raise ScanEnded(NOT_MOVED)
+        poll = self._poll_of([STATE_TOPIC])
+        with self._nodes.doubted_after(NodeAway):
+            result = self._tip.test(self._pose_of(point), asked, force_n, check, poll)
+        record = result.record
+        if record.time_s:
+            topic = self._node.resolve_topic_name(TOPIC)
+            recording.write(topic, TYPE, time.time_ns(), serialize_message(record))
+        if not result.done:
+            raise self._tip.failure(result)
 
     def retract(self) -> float:
         """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N]."""

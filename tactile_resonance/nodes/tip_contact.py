@@ -7,19 +7,20 @@ import math
 import re
 import time
 from collections.abc import Callable
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import SetBool, Trigger
 
 from tactile_resonance import msg
-from tactile_resonance.action import MakeContact
+from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.stop_input import STOP
-from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
@@ -32,6 +33,7 @@ from tactile_resonance.scan.hands import (
     SurfaceMissing,
 )
 from tactile_resonance.scan.point_times import StateTimes
+from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.scene import Hold
 
 STATE_TOPIC = "contact_state"
@@ -40,6 +42,7 @@ HALF_WAY = re.compile(r"moving tissue: (\d+) um ")
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
+OFFERED_WITHIN_S = 5.0
 # Faults of the devices, and requests of other clients, are no fault of the point: it is repeated.
 FOREIGN_CAUSES = frozenset(
     cause.value
@@ -77,7 +80,10 @@ class TipContact:
         self._node = node
         client = GoalClient(node, MakeContact, "make_contact")
         self._goals = Goals(client, "make_contact")
-        node.resources.callback(client.destroy)
+        tester = GoalClient(node, Indent, "indent")
+        self._tests = Goals(tester, "indent")
+        for each in (client, tester):
+            node.resources.callback(each.destroy)
         self._retract = node.create_client(Trigger, "retract")
         self._stop = node.create_client(SetBool, STOP)
         for service in (self._retract, self._stop):
@@ -129,7 +135,7 @@ class TipContact:
             poll()
             check()
             if state is not None and state.cause not in ("", Cause.NONE.value):
-                raise self._failure(state)
+                raise self.failure(state)
             time.sleep(POLL_S)
         self.touched_ns = self._held_ns - round(result.contact_s * 1e9)
         return result
@@ -151,6 +157,33 @@ class TipContact:
             finally:
                 self.retract(TOUCH_RETRACT_WITHIN_S)
 
+    def test(
+        self, pose: PoseStamped, asked: ProtocolRequest, force_n: float, check: Check, poll: Poll
+    ) -> Indent.Result:
+        """Carry a mechanical test out, and leave the tip free.
+
+        Raises
+        ------
+        ScanEnded
+            If no node offers the action: ideal contact does not.
+        """
+        if not self._tests.client.wait_for_server(self._time.patience_s(OFFERED_WITHIN_S)):
+            raise ScanEnded(
+                "protocols: no node offers the action indent; accepted are none without contact_node"
+            )
+        goal = Indent.Goal(
+            protocol=PROTOCOLS[asked.kind],
+            pose=pose,
+            force_n=force_n,
+            hold_s=asked.hold_s,
+            press_speed_m_s=asked.press_speed_m_s or 0.0,
+            unload_speed_m_s=asked.unload_speed_m_s or 0.0,
+        )
+        try:
+            return self._sent(self._tests, goal, check, poll)
+        finally:
+            self.retract()
+
     def retract(self, within_s: float = RETRACT_WITHIN_S) -> float:
         """Draw the tip back and wait until it is free; return by how much the zero of the force moved [N].
 
@@ -162,7 +195,9 @@ class TipContact:
         while time.monotonic() < deadline:
             self._end_if_hung()
             self._time.go()
-            if self._ask_to_retract() and self._seen_within(msg.ContactState.STATE_IDLE, ASK_AGAIN_S):
+            if self._ask_to_retract() and self._seen_within(
+                msg.ContactState.STATE_IDLE, ASK_AGAIN_S
+            ):
                 self.touching, self.touched_ns = False, None
                 moved_n = math.nan if self._state is None else self._state.zero_moved_n
                 return 0.0 if math.isnan(moved_n) else moved_n
@@ -183,17 +218,28 @@ class TipContact:
             return
         self._low = False
         self._time.go()
-        if self._ask_to_retract() and self._seen_within(msg.ContactState.STATE_RETRACT, ASK_AGAIN_S):
+        if self._ask_to_retract() and self._seen_within(
+            msg.ContactState.STATE_RETRACT, ASK_AGAIN_S
+        ):
             self._seen_within(msg.ContactState.STATE_IDLE, TOUCH_RETRACT_WITHIN_S)
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
         state = self._state
         if self.touching and state is not None and state.state != state.STATE_HOLD:
-            raise self._failure(state)
+            raise self.failure(state)
 
     def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
+        result = self._sent(self._goals, goal, check, poll)
+        if not result.reached:
+            raise self.failure(result)
+        return result
+
+    def _sent(
+        self, goals: Goals, goal: MakeContact.Goal | Indent.Goal, check: Check, poll: Poll
+    ) -> Any:
+        """Result of a goal, from a tip that is free."""
         # a contact that a scan before this one left is ended first
         state = self._state
         self.touching = self.touching or (state is not None and state.state != state.STATE_IDLE)
@@ -202,10 +248,7 @@ class TipContact:
         self._state = None
         self._times.begin()
         self._time.go()
-        result = self._goals.follow(self._goals.send(goal, check, poll), check, poll)
-        if not result.reached:
-            raise self._failure(result)
-        return result
+        return goals.follow(goals.send(goal, check, poll), check, poll)
 
     def _ask_to_retract(self) -> bool:
         """Whether contact_node takes the request; states from before its answer do not count."""
@@ -249,13 +292,14 @@ class TipContact:
             self._stop_asked_s = time.monotonic()
             self._stop.call_async(SetBool.Request(data=True))
 
-    def _failure(self, ended: MakeContact.Result | msg.ContactState) -> PointFailed:
+    def failure(self, ended: MakeContact.Result | Indent.Result | msg.ContactState) -> PointFailed:
+        """What to raise for a contact that was not reached, or that ended."""
         if self.stopped and ended.cause == Cause.CANCELLED.value:
             return Stopped()
         return _failure(ended)
 
 
-def _failure(ended: MakeContact.Result | msg.ContactState) -> PointFailed:
+def _failure(ended: MakeContact.Result | Indent.Result | msg.ContactState) -> PointFailed:
     """What a contact that was not reached, or that ended, means for the point."""
     text = f"contact: {ended.cause}: {ended.message}"
     if ended.cause in FOREIGN_CAUSES:

@@ -14,6 +14,7 @@ from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
@@ -189,6 +190,17 @@ class Hands(Protocol):
 
         After each block `enough` is asked with what all blocks so far gave and their number.
         """
+        ...
+
+    def test(
+        self,
+        point: ScanPoint,
+        asked: ProtocolRequest,
+        force_n: float,
+        recording: PointRecording,
+        check: Check,
+    ) -> None:
+        """Carry a mechanical test out, the tip free before and after; its record goes into the recording."""
         ...
 
     def retract(self) -> float:

@@ -104,7 +104,10 @@ class Plan:
         contact_s = len(position) * CONTACT_S - self.near * (CONTACT_S - NEAR_CONTACT_S)
         each_s = (travel_m / TRAVEL_M_S + contact_s) / len(position)
         count = self.most_points if points is None else points
-        return count * (each_s + blocks * self.measurement.block_s)
+        tests_s = sum(
+            asked.longest_s * (len(asked.points) or count) for asked in self.scene.protocols
+        )
+        return count * (each_s + blocks * self.measurement.block_s) + tests_s
 
     def next_point(
         self, touched: Sequence[ScanPoint], results: Iterable[PointResult]

@@ -75,6 +75,7 @@ def plan_rows(plan: Plan) -> Rows:
         rows.append(("poles", f"{band.low_hz:g} to {band.high_hz:g} Hz, {order}{of_data}"))
     if Output.DISTORTION in scene.outputs:
         rows.append(("distortion", "even and odd, at input and output, in each band of poles"))
+    rows += [("tested", str(asked)) for asked in scene.protocols]
     rows.append(("FRF", "at all lines that are excited"))
     if scene.tissue_classes:
         rows.append(("tissue", ", ".join(each.name for each in scene.tissue_classes)))

@@ -174,9 +174,11 @@ def _placed(scene: ScanScene, frames: Frames, hands: Hands) -> ScanScene:
 
 
 def _require_force(scene: ScanScene, forces: bool) -> None:
-    """A gate judges a force that is measured."""
+    """A gate judges a force that is measured; so does a mechanical test."""
     accepted = "none where scan_node's parameter contact is none: no force is measured then"
     require(scene.gate is None or forces, "gate", scene.gate, accepted)
+    asked = [str(each) for each in scene.protocols]
+    require(not asked or forces, "protocols", asked, accepted)
 
 
 def _frames_of(facts: Mapping[str, Any], scene: ScanScene, frames: Frames) -> dict[str, Pose]:

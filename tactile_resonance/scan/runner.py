@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from tactile_resonance.scan.decision import (
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
+    Check,
     Disturbances,
     Hands,
     Interrupted,
@@ -36,6 +37,7 @@ from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
+from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
@@ -170,6 +172,8 @@ class ScanRunner:
         scene, begun_s = self._scene, self._hands.now_s()
         decisions: list[Decision] = []
         keeper = GateKeeper(scene.gate, scene.force_n)
+        tests = [asked for asked in scene.protocols if asked.concerns(point.index)]
+        longest_s = scene.time_limits.point_s + sum(asked.longest_s for asked in tests)
 
         def enough(measured: Measured, blocks: int) -> bool:
             decisions.append(self._decide(measured, blocks))
@@ -178,11 +182,13 @@ class ScanRunner:
 
         def check() -> None:
             self._controls.check()
-            if self._hands.now_s() - begun_s > scene.time_limits.point_s:
-                raise PointFailed(f"time_limits.point_s: {scene.time_limits.point_s:g} s are over")
+            if self._hands.now_s() - begun_s > longest_s:
+                raise PointFailed(f"time_limits.point_s: {longest_s:g} s are over")
 
         with self._run.begin_point(point.index) as recording:
             measured, outcome, reason = None, PointOutcome.FAILED, ""
+            # of the contact in which it is measured: those of tests follow
+            moved_n, spent_s, not_tested = 0.0, None, ""
             # a point that is repeated on request has phases and noise of its own
             seed = self._seed + point.index + recording.attempt * ATTEMPT_SEEDS
             self._hands.begin(self._seed, point.index, recording.attempt)
@@ -201,6 +207,10 @@ class ScanRunner:
                     )
                     if keeper.counts(made):
                         measured = made
+                if tests:
+                    self._say(point, Phase.RETRACT)
+                    moved_n, spent_s = self._hands.retract(), self._hands.spent_s()
+                    not_tested = self._test(point, tests, recording, check)
             except PointDisturbed as error:
                 reason = str(error)
                 if self._disturbed[point.index].again(error):
@@ -219,7 +229,9 @@ class ScanRunner:
                 self._discard(point, recording, reason)
                 return
             self._say(point, Phase.RETRACT)
-            moved_n = self._hands.retract()
+            left_n = self._hands.retract()
+            if spent_s is None:
+                moved_n, spent_s = left_n, self._hands.spent_s()
             duration_s = self._hands.now_s() - begun_s
             result = self._ended(point, recording, outcome, reason, duration_s)
             if measured is not None:
@@ -227,9 +239,9 @@ class ScanRunner:
                 result = measured_result(result, scene, measured, decisions[-1], self._air)
             if moved_n:
                 text = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
-                result = replace(
-                    result, reason=f"{result.reason}; {text}" if result.reason else text
-                )
+                result = replace(result, reason=_joined(result.reason, text))
+            if not_tested:
+                result = replace(result, reason=_joined(result.reason, not_tested))
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(
                 result,
@@ -238,7 +250,7 @@ class ScanRunner:
                 gate="" if measured is None else str(keeper),
                 vibration_s=len(decisions) * self._plan.measurement.block_s,
                 between_s=begun_s - self._left_s,
-                **self._hands.spent_s(),
+                **spent_s,
             )
             self._left_s = begun_s + duration_s
             self._publish(recording.finish(result))
@@ -247,6 +259,27 @@ class ScanRunner:
             raise ScanEnded(
                 f"point {point.index + 1} failed and on_failure is stop: {result.reason}"
             )
+
+    def _test(
+        self,
+        point: ScanPoint,
+        tests: Sequence[ProtocolRequest],
+        recording: PointRecording,
+        check: Check,
+    ) -> str:
+        """Carry mechanical tests out; why some failed: the poles of the point count without them."""
+        failed = ""
+        for asked in tests:
+            self._say(point, Phase.CONTACT)
+            try:
+                self._hands.test(
+                    point, asked, asked.force_n or self._scene.force_n, recording, check
+                )
+            except PointDisturbed:
+                raise
+            except PointFailed as error:
+                failed = _joined(failed, f"{asked.kind.value}: {error}")
+        return failed
 
     def _decide(self, measured: Measured, blocks: int) -> Decision:
         block_s = self._plan.measurement.block_s
@@ -390,3 +423,8 @@ class ScanRunner:
             health=health,
             health_sentence=sentence,
         )
+
+
+def _joined(text: str, more: str) -> str:
+    """Two reasons as one."""
+    return f"{text}; {more}" if text else more

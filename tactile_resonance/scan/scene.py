@@ -36,6 +36,7 @@ from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.patterns import flat, read_positions, require_near
 from tactile_resonance.scan.period import residual_terms_of
+from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.standoff import is_plane
 from tactile_resonance.scan.surface import (
     NormalRequest,
@@ -252,6 +253,8 @@ class ScanScene:
         What people know of the session and no instrument measures.
     adaptive : Adaptive or None
         How positions are chosen; None: all are touched.
+    protocols : tuple of ProtocolRequest
+        Mechanical tests after the poles of a point are measured, in this order.
     """
 
     name: str
@@ -274,6 +277,7 @@ class ScanScene:
     normals: NormalRequest | None = None
     notes: Notes = field(default_factory=Notes)
     adaptive: Adaptive | None = None
+    protocols: tuple[ProtocolRequest, ...] = ()
 
     def __post_init__(self) -> None:
         check_above_zero(self, "force_n")
@@ -287,6 +291,11 @@ class ScanScene:
             good = 0.1 <= nominal_n / self.force_n <= 10
             accepted = f"a tenth to ten times force_n, {self.force_n:g}"
             require(good, "nominal_contact.force_n", nominal_n, accepted)
+        most = len(self.positions_m) if self.adaptive is None else self.adaptive.most
+        for k, asked in enumerate(self.protocols):
+            good = max(asked.points, default=1) <= most
+            accepted = f"numbers from 1 to {most}, of the points"
+            require(good, f"protocols[{k}].points", list(asked.points), accepted)
         if self.adaptive is not None:
             accepted = "none with adaptive positions: their normals are the surface's"
             require(self.normals is None, "normals", self.normals, accepted)
