@@ -83,6 +83,7 @@ def _parser() -> OneLineParser:
         compile,
         figures,
         live,
+        mechanics,
         plan,
         references,
         reidentify,
@@ -100,8 +101,8 @@ def _parser() -> OneLineParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
         *(plan, scan, live, analyze, reidentify, references, compare),
-        *(report, figures, benchmark, calibrate_table, simulate_ur, simulate_cell, check_robot),
-        *(compile,),
+        *(mechanics, report, figures, benchmark, calibrate_table, simulate_ur, simulate_cell),
+        *(check_robot, compile),
     ):
         command.add_parser(commands)
     return parser

@@ -7,8 +7,10 @@ import argparse
 import sys
 from pathlib import Path
 
-NAMES = ("simulation", "distortion", "variance")
+NAMES = ("simulation", "distortion", "variance", "mechanics")
 BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
+# of mechanical tests: what relaxes by four fifths is still more than the limit of a lost contact
+FORCE_N = 0.018
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -17,8 +19,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "figures",
         help="figures of the simulated bench, its distortion and its variance",
         description="Draw what the simulated bench is made of (docs/simulation.md), distortion over drive "
-        "level (figures 5 and 6 of arXiv 1805.00682) and variance by source (figure 9) from the simulated "
-        "bench. Nothing here is a measurement.",
+        "level (figures 5 and 6 of arXiv 1805.00682), variance by source (figure 9), and force that relaxes "
+        "(figure 7), creep and unloading with their fits, from the simulated bench. Nothing here is a "
+        "measurement.",
     )
     parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
     parser.add_argument(
@@ -34,7 +37,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Simulate, analyse, draw."""
     options.output.mkdir(parents=True, exist_ok=True)
-    draw = {"simulation": _simulation, "distortion": _distortion, "variance": _variance}
+    draw = {
+        "simulation": _simulation,
+        "distortion": _distortion,
+        "variance": _variance,
+        "mechanics": _mechanics,
+    }
     for name in NAMES if options.name is None else (options.name,):
         draw[name](options.output)
     return 0
@@ -123,3 +131,37 @@ def _variance(output: Path) -> None:
     title = f"Variance of the FRF by source (gelatine 12 %, {SIMULATED})"
     save_figure(draw_variance(whole, band, BAND_HZ, title), output / "variance.png")
     print(f"figure in {output}: variance.png")
+
+
+def _mechanics(output: Path) -> None:
+    from tactile_resonance.mechanics.indentation import Protocol
+    from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.report.mechanics_figure import draw_tests
+    from tactile_resonance.scan.tissue_tests import fitted
+    from tactile_resonance.sensor import sensor_named
+    from tactile_resonance.simulation.plant.tissue_bench import indent_tissue
+    from tactile_resonance.simulation.tissue.library import read_tissues
+
+    library, sensor = read_tissues(), sensor_named("bimorph")
+    for protocol, hold_s, unload_speed_m_s, tissues in (
+        (Protocol.RELAXATION, 180.0, 0.0, ("cortex", "white", "liver", "gel10", "gel14")),
+        (Protocol.CREEP, 60.0, 0.0, ("cortex", "liver", "gel10")),
+        (Protocol.INDENTATION, 2.0, 5e-4, ("cortex", "liver", "gel10")),
+    ):
+        tests = [
+            fitted(
+                indent_tissue(
+                    library[tissue],
+                    sensor,
+                    protocol,
+                    hold_s=hold_s,
+                    force_n=FORCE_N,
+                    unload_speed_m_s=unload_speed_m_s,
+                    progress=_progress,
+                )
+            )
+            for tissue in tissues
+        ]
+        title = f"{protocol.value.capitalize()} of tissue under a rigid ball of 5 mm"
+        save_figure(draw_tests(tests, title), output / f"{protocol.value}.png")
+    print(f"figures in {output}: relaxation.png, creep.png, indentation.png")

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mechanical tests of tissue in a scan: which are asked for where, and their records in a run."""
+"""Mechanical tests of tissue that a scene asks for; what came of them is in `scan.tissue_tests`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from tactile_resonance.fields import require
-from tactile_resonance.mechanics.indentation import Indentation, Protocol
-from tactile_resonance.recording.messages import indentation_from_message
-from tactile_resonance.scan.point_file import read_messages_of_type
-from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.run_content import RunContent, file_of
+from tactile_resonance.mechanics.indentation import Protocol
 
 TYPE, TOPIC = "tactile_resonance/msg/Indentation", "indentation"
 BESIDE_S = 30.0
@@ -76,16 +71,3 @@ class ProtocolRequest:
             f" at points {', '.join(map(str, self.points))}" if self.points else " at every point"
         )
         return f"{self.kind.value}{held}{where}"
-
-
-def records_of(run: RunContent, result: PointResult) -> Iterator[Indentation]:
-    """Tests at one attempt at a point, in the order in which they were made.
-
-    Raises
-    ------
-    ValueError
-        If its file is damaged.
-    """
-    path = file_of(run.path, result)
-    for _, _, message in read_messages_of_type(path, TYPE):
-        yield indentation_from_message(message, result.label)

@@ -114,6 +114,11 @@ class ScanRunner:
                     raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
                 self._point(point)
             self._reference(AFTER)
+            if self._scene.protocols:
+                # only here: what is compiled for the fits takes a second to load
+                from tactile_resonance.scan.tissue_tests import fits_of, write_fits
+
+                write_fits(self._run.path, list(fits_of(self._run.content)))
         except ScanEnded as error:
             message = str(error)
         except Interrupted:

@@ -24,6 +24,7 @@ from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.report.run_report import read_silent
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.tissue_tests import fits_at, fits_of
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -38,6 +39,8 @@ positions:
 outputs: [poles, map, silent]
 precision: {f0_std_hz: 0.02}
 blocks: {least: 3, most: 4}
+protocols:
+  - {kind: relaxation, hold_s: 5, force_n: 0.012, points: [2]}
 """
 HOST, TIME = own_host(9), own_time(9)
 
@@ -102,11 +105,22 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
         assert 1.01 < point.f0_over_air < 1.05  # the pole in air, not in the silent record
         assert point.simulated
 
+    # the test at the second point is in its file, and says what the tissue is
+    assert [len(fits_at(run, result)) for result in run.results] == [0, 1, 0]
+    (tested,) = fits_of(run)
+    assert (tested.result.index, tested.test.protocol.value) == (1, "relaxation")
+    assert tested.fit is not None, tested.reason
+    value, std = tested.fit.modulus(1.0)
+    truth = read_tissues().gelatine(10.0).relaxation_modulus(1.0)
+    assert abs(np.log(value / truth)) < 4 * std
+    assert (run_path / "mechanics.csv").read_text().count("\n") == 2
+
     # an independent reader finds every block's record, FRF and poles
     with Reader(run_path / "recording") as reader:
         counts = Counter(connection.topic for connection, _, _ in reader.messages())
     references = 3 * 3  # silent, and in free air before and after
     blocks = sum(point.blocks for point in run.results) + references
+    assert counts["/indentation"] == 1
     assert counts["/record"] == counts["/frf"] == counts["/poles"] == blocks
     assert counts["/point_result"] == 3 + 3
     # a late reader gets those of the node that was killed too

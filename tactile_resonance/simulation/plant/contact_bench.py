@@ -91,6 +91,17 @@ class VirtualBench:
         """Virtual time since the start [ns]."""
         return self.time_ns
 
+    @property
+    def simulated(self) -> bool:
+        """It is."""
+        return True
+
+    def ros_ns(self, time_ns: int) -> int:
+        """The same time: that of the simulation [ns]."""
+        return time_ns
+
+    own_ns = ros_ns
+
     def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
         """Let whole periods pass until a time is reached, whatever the demand."""
         while self.time_ns < time_ns:

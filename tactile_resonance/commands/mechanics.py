@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`tactile_resonance mechanics`: what mechanical tests say of tissue."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_resonance.files import write_whole
+
+if TYPE_CHECKING:
+    from tactile_resonance.mechanics.indentation import Indentation
+    from tactile_resonance.scan.tissue_tests import TissueTest
+
+COLUMNS = ("time_s", "force_n", "indentation_m")
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the command."""
+    parser = commands.add_parser(
+        "mechanics",
+        help="viscoelastic constants from relaxation, creep, load and unload",
+        description="Fit Prony series to mechanical tests with a ball: those of a run, or files with "
+        "time_s, force_n and indentation_m (.csv, .npz, .mat). Constants that a record does not determine are "
+        "declared so. Of a run mechanics.csv is written anew.",
+    )
+    parser.add_argument("paths", nargs="+", type=Path, metavar="RUN|FILE")
+    parser.add_argument("--terms", type=int, default=4, metavar="N", help="most terms (default: 4)")
+    parser.add_argument(
+        "--thickness-m",
+        type=float,
+        default=math.nan,
+        metavar="M",
+        help="of the tissue on what is rigid: whether Hertz's force holds",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw force and model")
+    of_files = parser.add_argument_group("files only: a run knows these")
+    of_files.add_argument(
+        "--protocol",
+        choices=("relaxation", "creep", "indentation"),
+        default="relaxation",
+        help="default: relaxation",
+    )
+    of_files.add_argument("--radius-m", type=float, metavar="M", help="of the ball")
+    of_files.add_argument(
+        "--stiffness-n-per-m",
+        type=float,
+        metavar="K",
+        help="between what indentation_m was measured on and the ball; without it --rigid is needed",
+    )
+    of_files.add_argument(
+        "--rigid", action="store_true", help="the ball is held rigidly: indentation_m is its depth"
+    )
+    of_files.add_argument(
+        "--poisson-ratio", type=float, default=0.49, metavar="NU", help="default: 0.49"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read, fit, print, write."""
+    tests = [one for path in options.paths for one in _tests(path, options)]
+    if not tests:
+        raise ValueError(
+            f"{options.paths[0]}: no mechanical test; a scene asks for them by protocols"
+        )
+    for one in tests:
+        print("\n".join(_lines(one)))
+    if options.json is not None:
+        text = json.dumps([one.as_json() for one in tests], indent=1, allow_nan=False)
+        write_whole(options.json, (text + "\n").encode())
+    if options.plot is not None:
+        from tactile_resonance.report.drawing import save_figure
+        from tactile_resonance.report.mechanics_figure import draw_tests
+
+        save_figure(draw_tests(tests, "Mechanical tests"), options.plot)
+    return 0 if any(one.fit is not None for one in tests) else 1
+
+
+def _tests(path: Path, options: argparse.Namespace) -> Iterator[TissueTest]:
+    # only here: the command answers --help without what is compiled for the fits
+    from tactile_resonance.scan.tissue_tests import fits_of, fitted, write_fits
+
+    terms, thickness_m = options.terms, options.thickness_m
+    if not path.is_dir():
+        yield fitted(_read(path, options), most_terms=terms, thickness_m=thickness_m)
+        return
+    from tactile_resonance.front import read_run
+
+    content = read_run(path)
+    tests = list(fits_of(content, most_terms=terms, thickness_m=thickness_m))
+    if tests:
+        write_fits(content.path, tests)
+    yield from tests
+
+
+def _read(path: Path, options: argparse.Namespace) -> Indentation:
+    """Record of a file."""
+    from tactile_resonance.array_files import read_arrays
+    from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+
+    if options.radius_m is None:
+        raise ValueError("--radius-m: not given; accepted is the radius of the ball [m]")
+    if options.rigid == (options.stiffness_n_per_m is not None):
+        raise ValueError(
+            "--stiffness-n-per-m: got "
+            f"{options.stiffness_n_per_m} with --rigid {options.rigid}; accepted is one of both: behind a "
+            "spring the indentation is not fixed while the stage is held"
+        )
+    arrays, names = read_arrays(path, COLUMNS)
+    missing = [name for name in COLUMNS if name not in arrays]
+    if missing:
+        raise ValueError(f"{path.name}: no {', '.join(missing)} among {', '.join(names)}")
+    stiffness = math.inf if options.rigid else options.stiffness_n_per_m
+    time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
+    return Indentation(
+        Protocol(options.protocol),
+        time_s,
+        force_n,
+        indentation_m,
+        Ball(options.radius_m, options.poisson_ratio, stiffness),
+        label=path.name,
+        source=path.name,
+    )
+
+
+def _lines(one: TissueTest) -> Iterator[str]:
+    """What a test says, for people."""
+    test, fit = one.test, one.fit
+    simulated = ", simulated, not measured" if test.simulated else ""
+    yield f"{test.label}: {test.protocol.value}{simulated}"
+    if fit is None:
+        yield f"  not fitted: {one.reason}"
+        return
+    yield (
+        f"  peak {1e3 * fit.peak_force_n:.1f} mN, {100 * fit.relaxed_share:.0f} % lost at the end of the hold; "
+        f"ramp {fit.ramp_s:.2f} s, hold {fit.hold_s:.1f} s, a/R {fit.contact_ratio:.2f}"
+    )
+    for at in (0.5, 1.0, 10.0, 60.0):
+        value, std = fit.modulus(at)
+        if math.isfinite(value):
+            yield f"  E({at:g} s)   {value:10.0f} Pa  +- {100 * std:.1f} %"
+    yield _constant("Einf", fit.equilibrium_pa, fit.equilibrium_std, fit.equilibrium_known.value)
+    for k, term in enumerate(fit.terms, start=1):
+        if term.known.value != "determined":
+            yield f"  E{k}, tau{k}   {term.known.value} (about {term.time_s:.2g} s)"
+            continue
+        yield _constant(f"E{k}", term.modulus_pa, term.modulus_std, "determined")
+        yield f"  tau{k}       {term.time_s:10.3g} s   +- {100 * term.time_std:.1f} %"
+    for text in fit.status:
+        yield f"  note: {text}"
+
+
+def _constant(name: str, value: float, std: float, known: str) -> str:
+    if known != "determined":
+        return f"  {name:8s} {known}"
+    return f"  {name:8s} {value:10.0f} Pa  +- {100 * std:.1f} %"
