@@ -326,7 +326,11 @@ def write_indentation(message: Any, test: Indentation) -> None:
     """Write a record into a message."""
     message.protocol = PROTOCOLS[test.protocol]
     for name in ("time_s", "force_n", "depth_m"):
-        fill(getattr(message, name), getattr(test, name))
+        values = getattr(message, name)
+        if isinstance(values, array.array):
+            fill(values, getattr(test, name))
+        else:
+            setattr(message, name, getattr(test, name))
     stiffness = test.ball.stiffness_n_per_m
     message.beam_stiffness_n_per_m = stiffness if math.isfinite(stiffness) else 0.0
     message.tip_radius_m = test.ball.radius_m

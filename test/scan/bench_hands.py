@@ -9,11 +9,13 @@ import numpy as np
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.recording.messages import write_indentation
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.hands import Measured, PointFailed
-from tactile_resonance.scan.messages import message_types
+from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.progress import Controls
+from tactile_resonance.scan.protocols import TOPIC, TYPE
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
@@ -50,6 +52,7 @@ class Bench:
         None  # of a position (3,); None: 254 Hz everywhere. With noise of the stated spread
     )
     at: object = None  # position of the point in contact
+    tests: object = None  # record of a point and of what is asked there; raises where it fails
     beside: Poles | None = None  # another mode, of lower frequency, reported before the main one
 
     def now_s(self):
@@ -111,6 +114,17 @@ class Bench:
         self.log.append(("measure", label, seed, blocks))
         self.measurements += label != "air"
         return measured
+
+    def test(self, point, asked, force_n, recording, check):
+        check()
+        assert not self.holding, "the tip was not drawn back before the test"
+        self.log.append(("test", point.index, asked, force_n))
+        if self.tests is None:
+            return
+        record = self.tests(point, asked)
+        message = make_message(TYPE)
+        write_indentation(message, record)
+        recording.write(f"/{TOPIC}", TYPE, time.time_ns(), to_cdr(message))
 
     def retract(self):
         self.holding = False

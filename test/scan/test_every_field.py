@@ -114,6 +114,7 @@ CHANGES = {
     "frame_id": ("base", {}),
     "force_n": (0.0105, {}),
     "hold": ("indentation", {}),
+    "protocols": ([{"kind": "creep", "hold_s": 5.0, "points": [2]}], {}),
     "sensor.band_low_hz": (210.0, {}),
     "sensor.band_high_hz": (310.0, {}),
     "sensor.order": (0, {}),
