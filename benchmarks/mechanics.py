@@ -30,7 +30,7 @@ from tactile_resonance.simulation.tissue.library import read_tissues
 RADIUS_M, BEAM_N_PER_M, RATE_HZ = 2.5e-3, 14.8, 500.0
 KINDS = ("brain, liver", "gelatine", "one term", "two terms", "three terms")
 TWO_SIDED_95 = 1.959964
-TISSUES = ("cortex", "white", "liver", "gel10", "gel16")
+TISSUES = ("cortex", "white", "liver", "gel10")
 FORCE_N, HOLD_S = 0.018, 180.0
 
 
@@ -150,7 +150,7 @@ def bench_tests() -> list[TissueTest]:
 
 def run(output: Path, quick: bool) -> str:
     """Table and figure."""
-    count = 100 if quick else 600
+    count = 60 if quick else 300
     with ProcessPoolExecutor(2) as pool:
         cases = list(tqdm(pool.map(case_of, range(count), chunksize=4), total=count))
     tests = bench_tests()

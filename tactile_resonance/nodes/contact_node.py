@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import math
 from collections.abc import Callable
 
 from rclpy.action.server import ServerGoalHandle
@@ -16,7 +14,6 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -30,20 +27,17 @@ from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.goal_thread import in_thread
+from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import (
     contact_feedback,
     contact_goal,
     contact_result,
-    indent_goal,
-    indent_result,
-    time_message,
 )
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
-from tactile_resonance.recording.messages import write_indentation
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
@@ -132,7 +126,7 @@ class ContactNode(ManagedNode):
             self._base_frame,
         )
         self._goal: ServerGoalHandle | None = None
-        self._recorder: IndentationRecorder | None = None  # of a goal of `indent`
+        self._test: IndentConduct | None = None  # under way
         self._finished: Future | None = None
         self._fault: ArmError | ForceError | None = None
         self._sound_ns: int | None = None  # of the last cycle without a fault
@@ -232,53 +226,39 @@ class ContactNode(ManagedNode):
         return "" if self._fault is None else str(self._fault)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        def make() -> ContactGoal:
+        def read() -> ContactGoal:
             return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
 
         try:
-            outcome = await self._outcome_of(goal, make)
+            outcome, _ = await self._outcome_of(goal, read)
         except _NotDoneError as error:
             return MakeContact.Result(cause=error.cause, message=str(error))
         _end(goal, outcome.reached)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
-        def make() -> ContactGoal:
-            asked, protocol = indent_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+        def read() -> IndentConduct:
             stiffness = self._settings.parameters.beam_n_per_m
-            self._recorder = IndentationRecorder(
-                asked,
-                protocol,
+            return IndentConduct(
+                goal.request,
+                self._base_frame,
                 Ball(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
-                self._force.info.name,
+                self._force.info,
                 simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
             )
-            return asked
 
         try:
-            outcome = await self._outcome_of(goal, make)
-            recorder, self._recorder = self._recorder, None
+            outcome, test = await self._outcome_of(goal, read)
         except _NotDoneError as error:
-            self._recorder = None
             return Indent.Result(cause=error.cause, message=str(error))
-        result = indent_result(outcome)
-        # nothing that was recorded is lost where the protocol was not done
-        with contextlib.suppress(ValueError):
-            write_indentation(result.record, recorder.record(outcome))
-            stamp_ns = self._arm.clock.ros_ns(recorder.begun_ns)
-            result.record.header.stamp = time_message(stamp_ns)
-        result.record.header.frame_id = self._base_frame
-        result.record.pose, result.record.hold_s = goal.request.pose.pose, goal.request.hold_s
-        moved_n, std_m = outcome.zero_change_n, outcome.surface_std_m
-        result.record.zero_moved_n = math.nan if moved_n is None else moved_n
-        result.record.depth_std_m = math.nan if std_m is None else std_m
+        result = test.result(outcome, self._arm.clock.ros_ns)
         _end(goal, result.done)
         return result
 
     async def _outcome_of(
-        self, goal: ServerGoalHandle, make: Callable[[], ContactGoal]
-    ) -> ContactResult:
-        """What became of a goal; where there is nothing it is aborted, and why is raised."""
+        self, goal: ServerGoalHandle, read: Callable[[], ContactGoal | IndentConduct]
+    ) -> tuple[ContactResult, ContactGoal | IndentConduct]:
+        """What became of a goal, and what it was; where there is nothing it is aborted, and why is raised."""
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
@@ -290,7 +270,8 @@ class ContactNode(ManagedNode):
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            asked = make()
+            what = read()
+            asked = what.goal if isinstance(what, IndentConduct) else what
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
@@ -298,12 +279,13 @@ class ContactNode(ManagedNode):
             goal.abort()
             raise _NotDoneError("refused", str(error)) from None
         self._goal, self._finished = goal, Future()
+        self._test = what if isinstance(what, IndentConduct) else None
         outcome: ContactResult | None = await self._finished
-        self._goal = self._finished = None
+        self._goal = self._finished = self._test = None
         if outcome is None:
             goal.abort()
             raise _NotDoneError("stopped", "contact_node was stopped")
-        return outcome
+        return outcome, what
 
     def _draw_back(self) -> None:
         if self._thread is not None:
@@ -337,7 +319,7 @@ class ContactNode(ManagedNode):
         self._forces.look()
         if self._goal is not None:
             controller = thread.controller
-            kind = MakeContact if self._recorder is None else Indent
+            kind = MakeContact if self._test is None else Indent
             feedback = contact_feedback(kind, controller.state.value, controller.estimate)
             self._goal.publish_feedback(feedback)
 
@@ -369,7 +351,7 @@ class ContactNode(ManagedNode):
             thread.retract()
         result = controller.result
         over = True
-        if self._recorder is not None:  # it ends with the tip drawn back
+        if self._test is not None:  # it ends with the tip drawn back
             over = controller.settled
         elif goal.is_cancel_requested:
             over = controller.state in (State.IDLE, State.FAULT)
@@ -409,8 +391,9 @@ class ContactNode(ManagedNode):
             return
         if self._touch is not None:
             self._touch.moved(cycle.state, thread.clock.ros_ns(cycle.time_ns))
-        if self._recorder is not None:
-            self._recorder.take(cycle)
+        test = self._test
+        if test is not None:
+            test.recorder.take(cycle)
         self._forces.take(cycle)
         self._topics.take(cycle, thread)
 
