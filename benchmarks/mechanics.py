@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from tactile_resonance.mechanics.course import course_of
 from tactile_resonance.mechanics.fit import Fit, Known, fit_indentation
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report.drawing import save_figure
 from tactile_resonance.report.mechanics_figure import draw_tests
@@ -69,12 +69,12 @@ def truth_of(seed: int, rng: np.random.Generator) -> tuple[str, Prony]:
     return KINDS[kind], Prony(float(einf), einf * rng.uniform(0.2, 1.2, terms), times)
 
 
-def record_of(truth: Prony, rng: np.random.Generator) -> tuple[Indentation, float, float]:
+def record_of(truth: Prony, rng: np.random.Generator) -> tuple[IndentationRecord, float, float]:
     """Relaxation with a surface that is off, a zero that drifts, and white noise; ramp and hold [s]."""
     stiffness = (np.inf, np.inf, BEAM_N_PER_M)[rng.integers(3)]
     ramp_s, hold_s = rng.choice([0.1, 0.2, 0.4]), rng.choice([30.0, 60.0, 180.0])
     noise_n = rng.choice([2e-4, 5e-4, 1e-3])
-    ball = Ball(RADIUS_M, stiffness_n_per_m=stiffness)
+    ball = BallTip(RADIUS_M, stiffness_n_per_m=stiffness)
     force_n = rng.uniform(0.01, 0.02)
     pressed = (force_n / ball.factor / truth.relaxation_modulus(ramp_s / 2)) ** (2 / 3)
     depth_m = float(pressed + 0.012 / stiffness)
@@ -94,7 +94,7 @@ def record_of(truth: Prony, rng: np.random.Generator) -> tuple[Indentation, floa
     forces = forces + zero + noise_n * rng.standard_normal(times.size)
     depths = np.concatenate([before * depth_m / ramp_s, depth, np.full(after.size, -2e-3)])
     depths = depths + 2e-5 * rng.standard_normal()
-    return Indentation(Protocol.RELAXATION, times, forces, depths, ball), ramp_s, hold_s
+    return IndentationRecord(Protocol.RELAXATION, times, forces, depths, ball), ramp_s, hold_s
 
 
 def errors_of(fit: Fit, truth: Prony) -> tuple[tuple[str, float], ...]:

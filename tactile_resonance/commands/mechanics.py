@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
-    from tactile_resonance.mechanics.indentation import Indentation
+    from tactile_resonance.mechanics.indentation import IndentationRecord
     from tactile_resonance.scan.tissue_tests import TissueTest
 
 COLUMNS = ("time_s", "force_n", "indentation_m")
@@ -99,10 +99,10 @@ def _tests(path: Path, options: argparse.Namespace) -> Iterator[TissueTest]:
     yield from tests
 
 
-def _read(path: Path, options: argparse.Namespace) -> Indentation:
+def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     """Record of a file."""
     from tactile_resonance.array_files import read_arrays
-    from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+    from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
     if options.radius_m is None:
         raise ValueError("--radius-m: not given; accepted is the radius of the ball [m]")
@@ -118,12 +118,12 @@ def _read(path: Path, options: argparse.Namespace) -> Indentation:
         raise ValueError(f"{path.name}: no {', '.join(missing)} among {', '.join(names)}")
     stiffness = math.inf if options.rigid else options.stiffness_n_per_m
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
-    return Indentation(
+    return IndentationRecord(
         Protocol(options.protocol),
         time_s,
         force_n,
         indentation_m,
-        Ball(options.radius_m, options.poisson_ratio, stiffness),
+        BallTip(options.radius_m, options.poisson_ratio, stiffness),
         label=path.name,
         source=path.name,
     )

@@ -11,7 +11,7 @@ from tactile_resonance.contact.goal import TOUCHING, ContactGoal, State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
 RECORDED = (State.APPROACH, *TOUCHING, State.RETRACT)
 
@@ -23,7 +23,7 @@ class IndentationRecorder:
     ----------
     goal : ContactGoal
     protocol : Protocol
-    ball : Ball
+    ball : BallTip
     source : str
         Of the forces.
     simulated : bool
@@ -35,7 +35,7 @@ class IndentationRecorder:
     """
 
     def __init__(
-        self, goal: ContactGoal, protocol: Protocol, ball: Ball, source: str, *, simulated: bool
+        self, goal: ContactGoal, protocol: Protocol, ball: BallTip, source: str, *, simulated: bool
     ) -> None:
         self._path, self._protocol, self._ball = TipPath(goal), protocol, ball
         self._source, self._simulated = source, simulated
@@ -54,7 +54,7 @@ class IndentationRecorder:
         zero_n = cycle.bias_n[2]
         self._forces.extend((w.time_ns, w.force_n[2] - zero_n) for w in cycle.wrenches)
 
-    def record(self, result: ContactResult | None) -> Indentation:
+    def record(self, result: ContactResult | None) -> IndentationRecord:
         """All so far.
 
         Raises
@@ -76,7 +76,7 @@ class IndentationRecorder:
         kept &= np.isfinite(forces[:, 1]) & (time_s >= arm_s[0]) & (time_s <= arm_s[-1])
         touched_s = float(time_s[np.argmax(depth_m >= 0)])
         self.begun_ns = begin_ns + round(1e9 * touched_s)
-        return Indentation(
+        return IndentationRecord(
             self._protocol,
             time_s[kept] - touched_s,
             forces[kept, 1],

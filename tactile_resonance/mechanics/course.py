@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from tactile_resonance.mechanics.indentation import Ball, FloatArray
+from tactile_resonance.mechanics.indentation import BallTip, FloatArray
 
 NEWTON_STEPS = 8
 """Of a cubic that is convex where it is solved: from above Newton's method comes down to the root."""
@@ -43,7 +43,7 @@ class Course:
 
 
 def course_of(
-    ball: Ball,
+    ball: BallTip,
     time_s: FloatArray,
     depth_m: FloatArray,
     turn: int,
@@ -55,7 +55,7 @@ def course_of(
 
     Parameters
     ----------
-    ball : Ball
+    ball : BallTip
     time_s : (N,) array
         Of the nodes, ascending.
     depth_m : (N,) or (P, N) array
@@ -162,7 +162,7 @@ def _press(c, bending, time, depth, turn, einf, moduli, times, force, delta):
             delta[p, n] = now
 
 
-def sphere_share(ball: Ball, depth_m: float) -> float:
+def sphere_share(ball: BallTip, depth_m: float) -> float:
     """Force of a sphere over that of Hertz's paraboloid at a depth (Sneddon 1965), 1 for small ones.
 
     NaN where the sphere is in to its equator.
@@ -181,7 +181,7 @@ def sphere_share(ball: Ball, depth_m: float) -> float:
     return float(force / (4 / 3 * wanted**1.5))
 
 
-def layer_share(ball: Ball, depth_m: float, thickness_m: float) -> float:
+def layer_share(ball: BallTip, depth_m: float, thickness_m: float) -> float:
     """Force on a layer bonded to what is rigid over that of a half-space, ``nu`` 0.5.
 
     Dimitriadis et al., Biophys. J. 82 (2002) 2798, equation 11.

@@ -26,7 +26,7 @@ from scipy.special import fdtrc
 
 from tactile_resonance.fields import require
 from tactile_resonance.mechanics.course import course_of, layer_share, sphere_share
-from tactile_resonance.mechanics.indentation import Indentation, Means, means_of
+from tactile_resonance.mechanics.indentation import IndentationRecord, Means, means_of
 from tactile_resonance.mechanics.prony import Prony
 
 FloatArray = NDArray[np.float64]
@@ -175,13 +175,13 @@ class Fit:
 
 
 def fit_indentation(
-    test: Indentation, *, most_terms: int = MOST_TERMS, thickness_m: float = np.nan
+    test: IndentationRecord, *, most_terms: int = MOST_TERMS, thickness_m: float = np.nan
 ) -> Fit:
     """Fit a Prony series to a test.
 
     Parameters
     ----------
-    test : Indentation
+    test : IndentationRecord
     most_terms : int
         1 (the standard linear solid) to 6.
     thickness_m : float
@@ -248,7 +248,7 @@ class _Problem:
     drift [N/s].
     """
 
-    def __init__(self, test: Indentation, means: Means) -> None:
+    def __init__(self, test: IndentationRecord, means: Means) -> None:
         self._ball, self._means, self._test = test.ball, means, test
         self._nodes = _nodes(means)
         time, depth, at, turn = self._nodes

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Ball:
+class BallTip:
     """What presses.
 
     Attributes
@@ -55,7 +55,7 @@ class Protocol(str, Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Indentation:
+class IndentationRecord:
     """A record of one test.
 
     Attributes
@@ -64,7 +64,7 @@ class Indentation:
     time_s, force_n, depth_m : (n,) arrays
         Ascending times; force along the normal, compression positive; way of the robot past the surface,
         negative above it. Of the ball, where it is held rigidly.
-    ball : Ball
+    ball : BallTip
     depth_std_m, force_std_n : float
         Standard deviations of the zeros of depth and force; NaN: unknown, the record has to show them. 0:
         exact.
@@ -80,7 +80,7 @@ class Indentation:
     time_s: FloatArray
     force_n: FloatArray
     depth_m: FloatArray
-    ball: Ball
+    ball: BallTip
     depth_std_m: float = np.nan
     force_std_n: float = np.nan
     noise_n: float = np.nan
@@ -158,7 +158,7 @@ class Means:
         return self.end_s - self.begin_s - self.ramp_s
 
 
-def means_of(test: Indentation) -> Means:
+def means_of(test: IndentationRecord) -> Means:
     """Means over parts of a record that are short where it changes fast.
 
     Raises
@@ -229,7 +229,7 @@ LARGEST = 3.5
 """Deviations of the largest of some thousand normal variables."""
 
 
-def _noise_of(test: Indentation) -> float:
+def _noise_of(test: IndentationRecord) -> float:
     """Standard deviation of one force: what neighbours differ by (von Neumann 1941).
 
     Of means over some samples, where there are many: those of a filter are alike.

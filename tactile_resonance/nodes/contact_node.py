@@ -19,7 +19,7 @@ from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.mechanics.indentation import Ball
+from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.contact_parameters import ContactSettings, contact_parameters
 from tactile_resonance.nodes.contact_thread import ContactThread
@@ -242,7 +242,7 @@ class ContactNode(ManagedNode):
             return IndentConduct(
                 goal.request,
                 self._base_frame,
-                Ball(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
+                BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
                 self._force.info,
                 simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
             )

@@ -11,7 +11,7 @@ from tactile_resonance.action import Indent
 from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ForceInfo
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.mechanics.indentation import Ball
+from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.nodes.messages import indent_goal, indent_result, time_message
 from tactile_resonance.recording.messages import write_indentation
 
@@ -23,7 +23,7 @@ class IndentConduct:
     ----------
     request : Indent.Goal
     base_frame : str
-    ball : Ball
+    ball : BallTip
         With what holds it.
     force : ForceInfo
         Of the force source.
@@ -46,7 +46,7 @@ class IndentConduct:
         self,
         request: Indent.Goal,
         base_frame: str,
-        ball: Ball,
+        ball: BallTip,
         force: ForceInfo,
         *,
         simulated: bool,

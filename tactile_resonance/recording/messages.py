@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
@@ -300,7 +300,7 @@ PROTOCOLS = {Protocol.RELAXATION: 1, Protocol.CREEP: 2, Protocol.INDENTATION: 3}
 """Constants of ``msg/Indentation``."""
 
 
-def indentation_from_message(message: Any, label: str = "") -> Indentation:
+def indentation_from_message(message: Any, label: str = "") -> IndentationRecord:
     """Record of a mechanical test.
 
     Raises
@@ -309,12 +309,12 @@ def indentation_from_message(message: Any, label: str = "") -> Indentation:
         If its protocol is unknown, or it holds too few samples, or some that are not finite.
     """
     stiffness = message.beam_stiffness_n_per_m
-    return Indentation(
+    return IndentationRecord(
         protocol=key_of(PROTOCOLS, message.protocol, "protocol"),
         time_s=array_of(message.time_s),
         force_n=array_of(message.force_n),
         depth_m=array_of(message.depth_m),
-        ball=Ball(message.tip_radius_m, stiffness_n_per_m=stiffness or math.inf),
+        ball=BallTip(message.tip_radius_m, stiffness_n_per_m=stiffness or math.inf),
         force_std_n=message.force_std_n,
         label=label,
         source=message.force_source,
@@ -322,7 +322,7 @@ def indentation_from_message(message: Any, label: str = "") -> Indentation:
     )
 
 
-def write_indentation(message: Any, test: Indentation) -> None:
+def write_indentation(message: Any, test: IndentationRecord) -> None:
     """Write a record into a message."""
     message.protocol = PROTOCOLS[test.protocol]
     for name in ("time_s", "force_n", "depth_m"):

@@ -13,7 +13,7 @@ from typing import Any
 
 from tactile_resonance.files import write_whole
 from tactile_resonance.mechanics.fit import MOST_TERMS, Fit, fit_indentation
-from tactile_resonance.mechanics.indentation import Indentation
+from tactile_resonance.mechanics.indentation import IndentationRecord
 from tactile_resonance.recording.messages import indentation_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult
@@ -31,7 +31,7 @@ class TissueTest:
 
     Attributes
     ----------
-    test : Indentation
+    test : IndentationRecord
     fit : Fit or None
         None: see `reason`.
     reason : str
@@ -40,7 +40,7 @@ class TissueTest:
         Of the point; None: of a file.
     """
 
-    test: Indentation
+    test: IndentationRecord
     fit: Fit | None
     reason: str
     result: PointResult | None = None
@@ -97,7 +97,7 @@ def _known(value: float) -> float | None:
 
 
 def fitted(
-    test: Indentation,
+    test: IndentationRecord,
     result: PointResult | None = None,
     *,
     most_terms: int = MOST_TERMS,

@@ -4,7 +4,7 @@
 import numpy as np
 
 from tactile_resonance.mechanics.course import course_of
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
 RADIUS_M = 2.5e-3
 
@@ -28,7 +28,7 @@ def relaxation(
     rate_hz=500.0,
 ):
     """0.3 s above the surface, ramp, hold, half a second in air again."""
-    ball = Ball(RADIUS_M, stiffness_n_per_m=stiffness_n_per_m)
+    ball = BallTip(RADIUS_M, stiffness_n_per_m=stiffness_n_per_m)
     pressed = (force_n / ball.factor / series.relaxation_modulus(ramp_s / 2)) ** (2 / 3)
     depth_m = pressed + force_n / stiffness_n_per_m
     time = np.arange(0.0, ramp_s + hold_s, 1 / rate_hz)
@@ -43,4 +43,4 @@ def relaxation(
     zero = 1e-4 * rng.standard_normal() + 5e-6 * rng.standard_normal() * times
     forces = forces + zero + noise_n * rng.standard_normal(times.size)
     depths = depths + 2e-5 * rng.standard_normal()
-    return Indentation(Protocol.RELAXATION, times, forces, depths, ball, simulated=True)
+    return IndentationRecord(Protocol.RELAXATION, times, forces, depths, ball, simulated=True)

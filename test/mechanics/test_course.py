@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from tactile_resonance.mechanics.course import layer_share, sphere_share
-from tactile_resonance.mechanics.indentation import Ball
+from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.tissue.indenter import Indenter
@@ -19,7 +19,7 @@ from made_indentations import RADIUS_M, force_over
 
 SOLID = Prony(2e3, np.array([3e3]), np.array([0.7]))
 ELASTIC = Prony(5e3, np.array([]), np.array([]))
-BALL = Ball(RADIUS_M)
+BALL = BallTip(RADIUS_M)
 
 
 def test_the_force_of_a_step_is_the_relaxation_modulus_times_hertz():
@@ -96,7 +96,7 @@ def test_it_agrees_with_the_bench_over_ramp_hold_and_unloading(name, stiffness_n
     time = np.unique(time)
     depth = np.interp(time, [0, 0.2, 10.2, 10.6], [0, 1e-3, 1e-3, -2e-4])
     turn = int(np.searchsorted(time, 10.2 - 1e-9))
-    ball = Ball(RADIUS_M, stiffness_n_per_m=stiffness_n_per_m)
+    ball = BallTip(RADIUS_M, stiffness_n_per_m=stiffness_n_per_m)
     force, _ = force_over(ball, time, depth, tissue.prony, turn)
     bench = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=0.49)
     tip, exact = bench, 1e-4
@@ -114,7 +114,7 @@ def test_it_agrees_with_the_bench_over_ramp_hold_and_unloading(name, stiffness_n
 def test_behind_a_spring_the_ball_goes_on_while_the_robot_stands():
     time = np.concatenate([np.linspace(0, 0.2, 201), 0.2 + np.geomspace(1e-3, 30, 200)])
     depth = 1.5e-3 * np.minimum(time / 0.2, 1)
-    ball = Ball(RADIUS_M, stiffness_n_per_m=15.0)
+    ball = BallTip(RADIUS_M, stiffness_n_per_m=15.0)
     force, inside = force_over(ball, time, depth, SOLID)
     np.testing.assert_allclose(15.0 * (depth - inside), force, rtol=1e-6, atol=1e-12)
     assert (np.diff(inside[200:]) > 0).all()

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 from tactile_resonance.mechanics.fit import Known, fit_indentation
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -79,7 +79,7 @@ def test_a_record_without_its_ramp_is_refused():
 
 
 def test_creep_at_constant_force_gives_the_same_constants():
-    ball = Ball(RADIUS_M)
+    ball = BallTip(RADIUS_M)
     time = np.concatenate([np.linspace(0, 0.2, 101)[:-1], np.arange(0.2, 40, 0.01)])
     force = 0.01 * np.minimum(time / 0.2, 1.0)
     # the way that keeps the force, by bisection of the course itself
@@ -92,20 +92,22 @@ def test_creep_at_constant_force_gives_the_same_constants():
         passed = compliance(np.maximum(t - time[ramp], 0.0)) * rises[ramp] * (time[ramp] <= t)
         depth[i] = (passed.sum() / ball.factor) ** (2 / 3)
     noisy = force + 2e-4 * rng.standard_normal(time.size)
-    test = Indentation(Protocol.CREEP, time, noisy, depth, ball, force_std_n=0.0, depth_std_m=0.0)
+    test = IndentationRecord(
+        Protocol.CREEP, time, noisy, depth, ball, force_std_n=0.0, depth_std_m=0.0
+    )
     fit = fit_indentation(test, most_terms=2)
     assert fit.equilibrium_known is Known.DETERMINED
     assert np.all(np.abs(deviations(fit, STANDARD)) < 4)
 
 
 def test_load_and_unload_give_the_constants_too():
-    ball = Ball(RADIUS_M)
+    ball = BallTip(RADIUS_M)
     time = np.arange(0.0, 24.0, 0.01)
     depth = np.interp(time, [0, 2, 20, 24], [0, 1e-3, 1e-3, -1e-3])
     turn = int(np.flatnonzero(depth >= 1e-3 - 1e-12)[-1])
     force, _ = force_over(ball, time, depth, Prony(4e3, np.array([3e3]), np.array([5.0])), turn)
     noisy = force + 1e-4 * np.random.default_rng(4).standard_normal(time.size)
-    test = Indentation(Protocol.INDENTATION, time, noisy, depth, ball, force_std_n=0.0)
+    test = IndentationRecord(Protocol.INDENTATION, time, noisy, depth, ball, force_std_n=0.0)
     fit = fit_indentation(test, most_terms=2)
     assert fit.time_s[-1] > 21
     assert fit.chi_square / fit.dof < 1.5

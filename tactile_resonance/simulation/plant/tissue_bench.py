@@ -15,7 +15,7 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.mechanics.indentation import Ball, Indentation, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface
@@ -41,7 +41,7 @@ def indent_tissue(
     seed: int = 0,
     poisson_ratio: float = 0.49,
     progress: Callable[[str], None] = lambda text: None,
-) -> Indentation:
+) -> IndentationRecord:
     """Carry a test out as contact_node does, on tissue that was never touched and is known to be soft.
 
     Parameters
@@ -90,7 +90,7 @@ def indent_tissue(
     )
     hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
     goal = ContactGoal(touch, Aim(force_n, hold), hold_s=hold_s, unload_speed_m_s=unload_speed_m_s)
-    ball = Ball(radius_m, poisson_ratio, stiffness)
+    ball = BallTip(radius_m, poisson_ratio, stiffness)
     recorder = IndentationRecorder(goal, protocol, ball, bench.force.info.name, simulated=True)
     controller = ContactController(parameters, limits, under_sample=True)
     loop = ContactLoop(bench.arm, bench.force, bench.clock, controller, recorder.take)
