@@ -144,7 +144,7 @@ def _mechanics(output: Path) -> None:
 
     library, sensor = read_tissues(), sensor_named("bimorph")
     for protocol, hold_s, unload_speed_m_s, tissues in (
-        (Protocol.RELAXATION, 180.0, 0.0, ("cortex", "white", "liver", "gel10", "gel14")),
+        (Protocol.RELAXATION, 180.0, 0.0, ("cortex", "liver", "gel10")),
         (Protocol.CREEP, 60.0, 0.0, ("cortex", "liver", "gel10")),
         (Protocol.INDENTATION, 2.0, 5e-4, ("cortex", "liver", "gel10")),
     ):
@@ -163,5 +163,5 @@ def _mechanics(output: Path) -> None:
             for tissue in tissues
         ]
         title = f"{protocol.value.capitalize()} of tissue under a rigid ball of 5 mm"
-        save_figure(draw_tests(tests, title), output / f"{protocol.value}.png")
-    print(f"figures in {output}: relaxation.png, creep.png, indentation.png")
+        save_figure(draw_tests(tests, title), output / f"test_{protocol.value}.png")
+    print(f"figures in {output}: test_relaxation.png, test_creep.png, test_indentation.png")

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Relaxation as contact control carries it out on the bench, and the command that reads it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tactile_resonance import cli
+from tactile_resonance.mechanics.fit import fit_indentation
+from tactile_resonance.mechanics.indentation import Protocol
+from tactile_resonance.sensor import sensor_named
+from tactile_resonance.simulation.plant.tissue_bench import indent_tissue
+from tactile_resonance.simulation.tissue.library import read_tissues
+
+
+def relaxed(name, hold_s, **options):
+    tissue = read_tissues()[name]
+    asked = {"hold_s": hold_s, "force_n": 0.015, **options}
+    return tissue, indent_tissue(tissue, sensor_named("bimorph"), Protocol.RELAXATION, **asked)
+
+
+@pytest.mark.parametrize(
+    ("name", "hold_s", "least", "most"),
+    [("cortex", 40.0, 0.6, 0.8), ("liver", 60.0, 0.6, 0.8), ("gel12", 40.0, 0.1, 0.35)],
+)
+def test_brain_and_liver_lose_most_of_the_force_and_gelatine_does_not(name, hold_s, least, most):
+    tissue, record = relaxed(name, hold_s)
+    fit = fit_indentation(record)
+    assert least < fit.relaxed_share < most
+    for at in (1.0, 10.0):
+        value, std = fit.modulus(at)
+        assert abs(np.log(value / tissue.relaxation_modulus(at))) < 4 * std
+
+
+def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path, capsys):
+    tissue, record = relaxed("liver", 15.0, rigid=False)
+    path = tmp_path / "relax.csv"
+    columns = np.column_stack([record.time_s, record.force_n, record.depth_m])
+    np.savetxt(path, columns, delimiter=",", header="time_s,force_n,indentation_m", comments="")
+    command = ["mechanics", str(path), "--radius-m", "2.5e-3"]
+    assert cli.main(command) == 1
+    assert "--stiffness-n-per-m: got None with --rigid False" in capsys.readouterr().err
+    out, plot = tmp_path / "out.json", tmp_path / "out.png"
+    given = ["--stiffness-n-per-m", str(record.ball.stiffness_n_per_m)]
+    assert cli.main([*command, *given, "--json", str(out), "--plot", str(plot)]) == 0
+    printed = capsys.readouterr().out
+    assert "relaxation" in printed
+    assert "not determined: slower than the hold" in printed
+    (found,) = json.loads(out.read_text())
+    value, std = found["modulus_pa"]["1"]
+    assert abs(np.log(value / tissue.relaxation_modulus(1.0))) < 4 * std
+    assert found["modulus_pa"]["60"] == [None, None]
+    assert plot.stat().st_size > 20_000
+    # the stage's way taken for the ball's: softer than it is, by much
+    assert cli.main([*command, "--rigid", "--json", str(out)]) == 0
+    (wrong,) = json.loads(out.read_text())
+    assert wrong["modulus_pa"]["1"][0] < 0.7 * tissue.relaxation_modulus(1.0)
