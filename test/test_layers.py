@@ -13,7 +13,7 @@ TOOLS = {
     *("array_files", "rows_file", "strict_yaml"),
 }
 CORE = {
-    *("contact", "frf", "mechanics", "poles", "tissue"),
+    *("calibration", "contact", "frf", "mechanics", "poles", "tissue"),
     *("crest_factor", "multisine", "record", "sensor", "silent", "tones"),
 }
 MAY_IMPORT = {

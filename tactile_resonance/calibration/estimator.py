@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a record to the complex stiffness of the contact, through a sensor whose parameters are known.
+
+A record of P periods from rest has the discrete Fourier transform::
+
+    Y(k) = G(k) U(k) - sum_p x_p h_p(k),    h_p(k) = (1 - exp(p T)) / (L (1 - exp((p - j w_k) / fs)))
+
+over its L samples, with the poles p of the sensor on the contact and the steady state x_p that their states
+would have had at the first sample: exact for a periodic input that begins at rest. So nothing is waited for,
+and a transient carries information as the rest does. Where the state at the start is unknown, the x_p of
+poles about the band are estimated along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from tactile_resonance.calibration.contact import TissueContact, ContactStatus, slope_of
+from tactile_resonance.calibration.contact_record import ContactRecord, Start
+from tactile_resonance.calibration.fit import Calibration
+from tactile_resonance.calibration.law import ContactPrior, Law
+from tactile_resonance.calibration.model import ComplexArray, FloatArray, SensorModel
+from tactile_resonance.calibration.stiffness import ContactStiffness
+from tactile_resonance.fields import require
+from tactile_resonance.poles.result import (
+    Poles,
+    PolesStatus,
+    natural_frequency_and_damping,
+    natural_frequency_and_damping_jacobian,
+)
+
+CONTRADICTED = 1e-4
+"""Probability of so large residuals by chance, below which data contradict a calibration."""
+FEWEST_BETWEEN = 30
+"""Bins between lines from which the level of the noise is estimated."""
+_STEPS = 60
+_ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
+_NEAR = (0.2, 5.0)
+"""Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedEstimator:
+    """Records to contacts, through one known sensor.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Whose mode shapes at the tip are known.
+    tip_radius_m : float
+    law : Law
+    """
+
+    calibration: Calibration
+    tip_radius_m: float
+    law: Law = Law.STANDARD_LINEAR_SOLID
+
+    def __post_init__(self) -> None:
+        known, accepted = self.calibration.knows_tip(), "one with a mass or spring at the tip"
+        require(known, "calibration", self.calibration.message, accepted)
+        require(self.tip_radius_m > 0, "tip_radius_m", self.tip_radius_m, "above 0")
+
+    def __call__(
+        self,
+        record: ContactRecord,
+        force_n: float = float("nan"),
+        force_std_n: float = 0.0,
+    ) -> TissueContact:
+        """Contact and pole of a record.
+
+        Parameters
+        ----------
+        record : ContactRecord
+        force_n, force_std_n : float
+            Of the contact; NaN where unknown.
+        """
+        low, high = record.frequency_hz[0], record.frequency_hz[-1]
+        air_hz = self._mode_in_air(low, high)
+        prior = ContactPrior(self.law, self.tip_radius_m, air_hz, force_n, force_std_n)
+        fit = _Fit(self.calibration, record, prior)
+        p, converged = fit.solved(prior.start)
+        return fit.result(p, converged)
+
+    def _mode_in_air(self, low_hz: float, high_hz: float) -> float:
+        """Natural frequency of the mode that lies in the band, or nearest to it [Hz]."""
+        f = self.calibration.model.natural_rad_s / (2 * np.pi)
+        away = np.maximum(0, np.maximum(low_hz - f, f - high_hz))
+        return float(f[np.argmin(away)])
+
+
+class _Fit:
+    """Weighted residuals of one record by parameters of its contact, and by those of the sensor."""
+
+    def __init__(
+        self, calibration: Calibration, record: ContactRecord, prior: ContactPrior
+    ) -> None:
+        self.calibration, self.record, self.prior = calibration, record, prior
+        self.noise = calibration.noise_v_per_root_hz
+        self._excited = record.excited
+        self._s = np.asarray(2j * np.pi * record.frequency_hz, complex)  # (K,)
+        self._lines = 2j * np.pi * record.line_hz  # (F,)
+        self._u = np.zeros(record.frequency_hz.size, complex)
+        slots = np.rint(record.line_hz * record.duration_s).astype(int)
+        here = np.rint(record.frequency_hz * record.duration_s).astype(int)
+        _, into, of = np.intersect1d(here, slots, return_indices=True)
+        self._u[into] = record.u[of]
+        self.directions = 0  # of the unknown state at the start
+
+    @property
+    def _std(self) -> float:
+        """Of real and imaginary part of a bin [V]."""
+        variance = self.noise**2 * self.record.sample_rate_hz / 2 / self.record.samples
+        return float(np.sqrt(variance / 2))
+
+    def predicted(
+        self, sensor: SensorModel, contact: ContactStiffness
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """(..., K) bins of the sensor channel, and the poles (..., N)."""
+        record = self.record
+        stacked = (*np.shape(contact.elastic_n_per_m), self._s.size)
+        k = contact.at(np.broadcast_to(self._s, stacked))
+        steady = sensor.response(self._s, k) * self._u
+        poles = sensor.poles(contact)
+        if record.start is Start.UNKNOWN:
+            return steady, poles
+        residues = sensor.residues(poles, contact)
+        gain, delay = (np.asarray(x)[..., None] for x in (sensor.gain, sensor.delay_s))
+        # steady state of each pole's state at the first sample, positive and negative lines
+        upper = self._lines - poles[..., None]  # (..., N, F)
+        lower = self._lines.conj() - poles[..., None]
+        at_start = (record.u / upper).sum(axis=-1) + (record.u.conj() / lower).sum(axis=-1)
+        amplitude = gain * residues * at_start * np.exp(-poles * delay)
+        moving = steady - (amplitude[..., None] * self._decay(poles)).sum(axis=-2)
+        return moving - self._before(sensor), poles
+
+    def _decay(self, poles: ComplexArray) -> ComplexArray:
+        """(..., N, K) transforms of the decay of each pole over the record."""
+        rate_hz, samples = self.record.sample_rate_hz, self.record.samples
+        z = np.exp((poles[..., None] - self._s) / rate_hz)
+        left = 1 - np.exp(poles[..., None] * (samples / rate_hz))
+        return np.asarray(left / (1 - z) / samples)
+
+    def _before(self, sensor: SensorModel) -> ComplexArray:
+        """(..., K) feed-through of the input before it began, in samples that a delay leaves empty."""
+        rate_hz, samples = self.record.sample_rate_hz, self.record.samples
+        delay = np.asarray(sensor.delay_s)
+        longest = int(np.ceil(float(delay.max(initial=0.0)) * rate_hz - 1e-9))
+        out = np.zeros((*delay.shape, self._s.size), complex)
+        for n in range(max(0, longest)):
+            time = n / rate_hz - delay  # (...)
+            value = 2 * (self.record.u * np.exp(self._lines * time[..., None])).sum(axis=-1).real
+            value = np.where(time < 0, value * sensor.gain * sensor.feedthrough, 0.0)
+            out += value[..., None] * np.exp(-self._s * n / rate_hz) / samples
+        return out
+
+    def residual(self, p: FloatArray, sensor: SensorModel | None = None) -> FloatArray:
+        """(..., R) over standard deviations, priors last."""
+        sensor = self.calibration.model if sensor is None else sensor
+        gap, poles = self.predicted(sensor, self.prior.stiffness(p))
+        gap = (gap - self.record.y) / self._std
+        real = np.concatenate([gap.real, gap.imag], axis=-1)
+        if self.record.start is Start.UNKNOWN:
+            real = self._less_start(real, poles)
+        deviations = self.prior.deviations(p)
+        shape = (*real.shape[:-1], deviations.shape[-1])
+        return np.concatenate([real, np.broadcast_to(deviations, shape)], axis=-1)
+
+    def _less_start(self, real: FloatArray, poles: ComplexArray) -> FloatArray:
+        """Residuals without what any state of the poles about the band at the start would add."""
+        low, high = self.record.frequency_hz[[0, -1]] * 2 * np.pi * np.array(_NEAR)
+        out = np.empty_like(real)
+        for index in np.ndindex(real.shape[:-1]):
+            all_of = poles[index] if poles.ndim > 1 else poles
+            near = all_of[(all_of.imag > 0) & (np.abs(all_of) > low) & (np.abs(all_of) < high)]
+            h, conjugate = self._decay(near), self._decay(near.conj())
+            columns = np.concatenate([h + conjugate, 1j * (h - conjugate)])
+            columns = np.concatenate([columns.real, columns.imag], axis=-1).T
+            q, _ = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))
+            out[index] = real[index] - q @ (q.T @ real[index])
+            self.directions = q.shape[1]
+        return out
+
+    def jacobian(self, p: FloatArray) -> FloatArray:
+        """(R, 4) of the residual by the parameters."""
+        return slope_of(self.residual, p)
+
+    def solved(self, p: FloatArray) -> tuple[FloatArray, bool]:
+        """Levenberg and Marquardt; the level of the noise from bins between lines where there are enough."""
+        p, converged = self._descend(p)
+        between = ~self._excited
+        if np.count_nonzero(between) - self.directions / 2 < FEWEST_BETWEEN:
+            return p, converged
+        count = self._excited.size
+        real = self.residual(p)[: 2 * count].reshape(2, count)[:, between]
+        level = np.sum(real**2) / (2 * np.count_nonzero(between) - self.directions)
+        self.noise *= float(np.sqrt(level))
+        return self._descend(p)
+
+    def _descend(self, p: FloatArray) -> tuple[FloatArray, bool]:
+        residual, damping = self.residual(p), 1e-3
+        cost = residual @ residual
+        for _ in range(_STEPS):
+            jacobian = self.jacobian(p)
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+            while damping < 1e9:
+                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+                step *= min(1.0, 1.0 / np.abs(step).max())
+                tried = self.residual(p + step)
+                if tried @ tried <= cost:
+                    break
+                damping *= 10
+            else:
+                return p, True  # no step makes it better: at the minimum to within rounding
+            gained = cost - tried @ tried
+            p, residual, cost = p + step, tried, tried @ tried
+            damping = max(damping / 10, 1e-9)
+            if gained < _ENOUGH:
+                return p, True
+        return p, False
+
+    def result(self, p: FloatArray, converged: bool) -> TissueContact:
+        """Covariances, pole, judgement."""
+        residual, jacobian = self.residual(p), self.jacobian(p)
+        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
+        sensor = self.calibration.model
+        std = self.calibration.std
+        free = np.flatnonzero(std > 0)
+        moved = np.tile(sensor.values, (free.size, 1))  # one parameter by its deviation each
+        moved[np.arange(free.size), free] += std[free]
+        stack = SensorModel.of_values(moved)
+        stacked = np.tile(p, (free.size, 1))
+        change = (self.residual(stacked, stack) - residual).T  # (R, free)
+        by_sensor = -covariance @ jacobian.T @ change  # (4, free), per deviation
+        correlation = self.calibration.covariance[np.ix_(free, free)] / np.outer(
+            std[free], std[free]
+        )
+        total = covariance + by_sensor @ correlation @ by_sensor.T
+        pole = self._pole(p)
+
+        def of_mode(q: FloatArray, of: SensorModel) -> FloatArray:
+            """Pole and stiffness there, real and imaginary parts (..., 4)."""
+            contact = self.prior.stiffness(q)
+            poles = of.poles(contact)
+            near = np.argmin(np.abs(poles - pole), axis=-1)[..., None]
+            at = np.take_along_axis(poles, near, axis=-1)
+            k = contact.at(1j * np.abs(at))[..., 0]
+            return np.stack([at[..., 0].real, at[..., 0].imag, k.real, k.imag], axis=-1)
+
+        value = of_mode(p, sensor)
+        slope = slope_of(lambda q: of_mode(q, sensor), p)
+        direct = (of_mode(stacked, stack) - value).T  # (4, free)
+        whole = direct + slope @ by_sensor
+        noise = slope @ covariance @ slope.T
+        with_sensor = noise + whole @ correlation @ whole.T
+        squares = float(residual @ residual)
+        dof = residual.size - p.size - self.directions
+        status, message = ContactStatus.OK, ""
+        if not converged:
+            status, message = ContactStatus.NOT_CONVERGED, f"not converged in {_STEPS} steps"
+        elif special.chdtrc(dof, squares) < CONTRADICTED:
+            status = ContactStatus.CONTRADICTED
+            worst = int(np.argmax(np.abs(residual[-3:])))
+            message = (
+                f"residuals contradict the calibration: {squares:.0f}, {dof} expected (sensor changed, "
+                "something else on the tip, or a tissue unlike the law)"
+            )
+            if abs(residual[-3 + worst]) > 4:
+                message += f"; {('rise', 'time', 'radius')[worst]} beyond what any tissue has"
+        poles = self._poles(
+            p, value, noise[:2, :2], with_sensor[:2, :2], squares, dof, status, message
+        )
+        count = self._s.size
+        parts = residual[: 2 * count].reshape(2, count)
+        return TissueContact(
+            prior=self.prior,
+            parameters=p,
+            covariance=covariance,
+            total_covariance=total,
+            stiffness_n_per_m=complex(value[2], value[3]),
+            stiffness_covariance=noise[2:, 2:],
+            stiffness_total=with_sensor[2:, 2:],
+            poles=poles,
+            chi_square=squares,
+            degrees_of_freedom=dof,
+            noise_v_per_root_hz=self.noise,
+            residual=(parts[0] + 1j * parts[1]) / np.sqrt(2),
+            status=status,
+            message=message,
+        )
+
+    def _pole(self, p: FloatArray) -> complex:
+        """Pole of the band with the highest peak; nearest to the band where none lies in it."""
+        contact, sensor = self.prior.stiffness(p), self.calibration.model
+        poles = sensor.poles(contact)
+        poles = poles[poles.imag > 0]
+        residues = sensor.residues(poles, contact)
+        f = np.abs(poles) / (2 * np.pi)
+        low, high = self.record.frequency_hz[[0, -1]]
+        inside = (f >= low) & (f <= high)
+        if not inside.any():
+            return complex(poles[np.argmin(np.abs(f - self.prior.frequency_hz))])
+        peak = np.where(inside, np.abs(residues) / np.abs(poles.real), 0)
+        return complex(poles[np.argmax(peak)])
+
+    def _poles(
+        self,
+        p: FloatArray,
+        value: FloatArray,
+        noise: FloatArray,
+        total: FloatArray,
+        squares: float,
+        dof: int,
+        status: ContactStatus,
+        message: str,
+    ) -> Poles:
+        pole = np.array([complex(value[0], value[1])])
+        residue = self.calibration.model.residues(pole, self.prior.stiffness(p))
+        f0_hz, damping = natural_frequency_and_damping(pole)
+        turn = natural_frequency_and_damping_jacobian(pole)[0]
+        kinds = {
+            ContactStatus.OK: PolesStatus.OK,
+            ContactStatus.NOT_CONVERGED: PolesStatus.NOT_CONVERGED,
+        }
+        return Poles(
+            poles_rad_s=pole,
+            f0_hz=f0_hz,
+            damping_ratio=damping,
+            residues=residue,
+            covariance=(turn @ noise @ turn.T)[None],
+            total_covariance=(turn @ total @ turn.T)[None],
+            pole_covariance=noise[None],
+            band_hz=(float(self.record.frequency_hz[0]), float(self.record.frequency_hz[-1])),
+            lines=int(np.count_nonzero(self._excited)),
+            cost=squares,
+            expected_cost=float(dof),
+            variance_model="flat",
+            method=f"calibrated sensor, {self.prior.law.value}",
+            status=kinds.get(status, PolesStatus.MODEL_ERROR),
+            message=message,
+        )

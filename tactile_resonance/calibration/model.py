@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bimorph with a tip in modal parameters, in air or on any contact: response, poles, residues.
+
+With ``D_i = s^2 + 2 zeta_i w_i s + w_i^2``, ``A = sum chi_i^2 / D_i``, ``B = sum chi_i phi_i / D_i``,
+``C = sum phi_i^2 / D_i`` and the stiffness k(s) of the contact::
+
+    X = A - k B^2 / (1 + k C)
+    G = gain exp(-s delay) (gamma + X) / (1 + X + leak / s)
+
+chi is the modal force per volt over the root of the capacitance Ct: voltages alone do not show the two apart.
+The tip's receptance is C, so that phi has the scale of a known mass (``k = m s^2``) or spring at the tip.
+Modes above those that are listed add a constant to A, which gamma, chi and leak take up, and to B and C,
+where it is left out: what is excited must lie below the highest listed mode. Piezoelectric beam equations:
+Erturk & Inman, *Piezoelectric Energy Harvesting* (2011), chapter 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.calibration.stiffness import ContactStiffness
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+PER_MODE = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")
+SINGLE = ("feedthrough", "leak_rad_s", "gain", "delay_s")
+
+
+def parameter_names(modes: int) -> tuple[str, ...]:
+    """(4 modes + 4,) names of all parameters in the order of `SensorModel.values`."""
+    return (*(f"{name}[{i + 1}]" for name in PER_MODE for i in range(modes)), *SINGLE)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel:
+    """Parameters of one sensor, or of a stack of them: leading axes (...) of all fields.
+
+    Attributes
+    ----------
+    natural_rad_s : (..., n) float
+        Undamped natural frequencies in air, electrodes short-circuited [rad/s].
+    damping_ratio : (..., n) float
+    coupling_rad_s : (..., n) float
+        ``chi_i / sqrt(Ct)``, positive [rad/s].
+    tip_deflection : (..., n) float
+        Mass-normalised mode shapes at the tip, with the sign of chi positive [kg^-1/2].
+    feedthrough : (...) float
+        gamma, the limit of G at infinite frequency over `gain`.
+    leak_rad_s : (...) float
+        ``1 / (R Ct)`` [rad/s].
+    gain : (...) float
+        Of the sensor channel over the actuator channel.
+    delay_s : (...) float
+        Of the sensor channel behind the actuator channel [s].
+    """
+
+    natural_rad_s: FloatArray
+    damping_ratio: FloatArray
+    coupling_rad_s: FloatArray
+    tip_deflection: FloatArray
+    feedthrough: FloatArray
+    leak_rad_s: FloatArray
+    gain: FloatArray
+    delay_s: FloatArray
+
+    @property
+    def modes(self) -> int:
+        """Number n of modes."""
+        return self.natural_rad_s.shape[-1]
+
+    @property
+    def values(self) -> FloatArray:
+        """(..., 4 n + 4) all parameters, in the order of `parameter_names`."""
+        single = [np.asarray(getattr(self, name))[..., None] for name in SINGLE]
+        return np.concatenate([*(getattr(self, name) for name in PER_MODE), *single], axis=-1)
+
+    @classmethod
+    def of_values(cls, values: npt.ArrayLike) -> SensorModel:
+        """Return the sensor of (..., 4 n + 4) parameters."""
+        x = np.asarray(values, float)
+        n = (x.shape[-1] - len(SINGLE)) // len(PER_MODE)
+        per_mode = (x[..., i * n : (i + 1) * n] for i in range(len(PER_MODE)))
+        return cls(*per_mode, *np.moveaxis(x[..., 4 * n :], -1, 0))
+
+    def modal_sums(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """A, B and C at s [rad/s] of shape (..., S), each (..., S)."""
+        inverse = 1 / self._denominators(s)  # (..., S, n)
+        chi, phi = self.coupling_rad_s[..., None, :], self.tip_deflection[..., None, :]
+        weights = (chi**2, chi * phi, phi**2)
+        return tuple((inverse * weight).sum(axis=-1) for weight in weights)
+
+    def response(self, s: ComplexArray, stiffness: ComplexArray | float = 0.0) -> ComplexArray:
+        """(..., S) G at s [rad/s] on a contact of this stiffness there [N/m]; 0: in air."""
+        a, b, c = self.modal_sums(s)
+        x = a - stiffness * b**2 / (1 + stiffness * c)
+        gamma, leak, gain, delay = (np.asarray(getattr(self, name))[..., None] for name in SINGLE)
+        return gain * np.exp(-s * delay) * (gamma + x) / (1 + x + leak / s)
+
+    def poles(self, contact: ContactStiffness) -> ComplexArray:
+        """(..., N) all poles on a contact [rad/s], conjugates included, in no order.
+
+        Eigenvalues of the states ``w_i q_i``, ``q_i'``, ``sqrt(Ct) v`` and, of each relaxation, ``sqrt(K_j)
+        z_j``, whose squares are energies.
+        """
+        w, chi, phi = self.natural_rad_s, self.coupling_rad_s, self.tip_deflection
+        n, relaxing = self.modes, contact.relaxing_n_per_m
+        terms = relaxing.shape[-1]
+        size = 2 * n + 1 + terms
+        batch = np.broadcast_shapes(w.shape[:-1], relaxing.shape[:-1])
+        q, dq, v, z = slice(0, n), slice(n, 2 * n), 2 * n, slice(2 * n + 1, size)
+        a = np.zeros((*batch, size, size))
+        index = np.arange(n)
+        a[..., index, n + index] = w
+        a[..., n + index, index] = -w
+        a[..., n + index, n + index] = -2 * self.damping_ratio * w
+        a[..., dq, v] = -chi
+        a[..., v, dq] = chi
+        a[..., v, v] = -self.leak_rad_s
+        root, rate = np.sqrt(np.maximum(relaxing, 0)), 1 / contact.times_s
+        glassy = contact.elastic_n_per_m + relaxing.sum(axis=-1)
+        outer = phi[..., :, None] * phi[..., None, :]
+        a[..., dq, q] -= np.asarray(glassy)[..., None, None] * outer / w[..., None, :]
+        a[..., dq, dq] -= np.asarray(contact.viscous_ns_per_m)[..., None, None] * outer
+        a[..., dq, z] = phi[..., :, None] * root[..., None, :]
+        a[..., z, q] = (rate * root)[..., :, None] * (phi / w)[..., None, :]
+        last = 2 * n + 1 + np.arange(terms)
+        a[..., last, last] = -rate
+        # the mass: (I + m phi phi')^-1 by Sherman and Morrison
+        mass = np.asarray(contact.mass_kg)[..., None]
+        share = mass * phi / (1 + mass * (phi**2).sum(axis=-1, keepdims=True))
+        a[..., dq, :] -= share[..., :, None] * (phi[..., None, :] @ a[..., dq, :])
+        return np.linalg.eigvals(a).astype(complex)
+
+    def residues(self, poles: ComplexArray, contact: ContactStiffness) -> ComplexArray:
+        """(..., N) residues of ``G / (gain exp(-s delay))`` at poles (..., N) [rad/s]."""
+        a, b, c = self.modal_sums(poles)
+        da, db, dc = self._modal_slopes(poles)
+        k, dk = contact.at(poles), contact.slope(poles)
+        loop = 1 + k * c
+        dx = da - (2 * k * b * db + dk * b**2) / loop + k * b**2 * (dk * c + k * dc) / loop**2
+        gamma, leak = (np.asarray(getattr(self, name))[..., None] for name in SINGLE[:2])
+        return (gamma - 1 - leak / poles) / (dx - leak / poles**2)
+
+    def pole_near(
+        self, frequency_hz: float, contact: ContactStiffness
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """(...) pole [rad/s] and residue [rad/s] of the resonance that is nearest to a frequency [Hz]."""
+        poles = self.poles(contact)
+        away = np.where(poles.imag > 0, np.abs(np.abs(poles) / (2 * np.pi) - frequency_hz), np.inf)
+        pole = np.take_along_axis(poles, np.argmin(away, axis=-1)[..., None], axis=-1)
+        return pole[..., 0], self.residues(pole, contact)[..., 0]
+
+    def _denominators(self, s: ComplexArray) -> ComplexArray:
+        s = np.asarray(s)[..., None]  # (..., S, 1)
+        w, zeta = self.natural_rad_s[..., None, :], self.damping_ratio[..., None, :]
+        return np.asarray(s**2 + 2 * zeta * w * s + w**2)
+
+    def _modal_slopes(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Derivatives of A, B and C by s, each (..., S)."""
+        w, zeta = self.natural_rad_s[..., None, :], self.damping_ratio[..., None, :]
+        slope = -(2 * np.asarray(s)[..., None] + 2 * zeta * w) / self._denominators(s) ** 2
+        chi, phi = self.coupling_rad_s[..., None, :], self.tip_deflection[..., None, :]
+        weights = (chi**2, chi * phi, phi**2)
+        return tuple((slope * weight).sum(axis=-1) for weight in weights)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the fit of a calibration begins: peaks of responses, and how far a load moves them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import signal
+
+from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
+from tactile_resonance.calibration.model import ComplexArray, FloatArray, SensorModel
+from tactile_resonance.fields import require
+
+PEAK_HEIGHT = 0.15
+"""Of the highest peak of ``-w Im 1 / (1 - G)``, over its foot: what counts as a mode."""
+
+
+def start_channel(loopback: Sequence[CalibrationRecord]) -> tuple[float, float]:
+    """Gain and delay [s] of the first loop-back; 1 and 0 without."""
+    if not loopback:
+        return 1.0, 0.0
+    frf = loopback[0].frf
+    f, g = frf.frequency_hz, frf.g
+    steps = np.diff(f)
+    near = steps < 1.5 * steps.min()
+    turn = np.angle(np.sum((g[1:] * g[:-1].conj())[near]))
+    coarse = -turn / (2 * np.pi * steps[near].mean())
+    straight = g * np.exp(2j * np.pi * f * coarse)
+    fine = -np.polyfit(f, np.unwrap(np.angle(straight)), 1)[0] / (2 * np.pi)
+    return float(np.abs(g).mean()), float(coarse + fine)
+
+
+def start_in_air(
+    record: CalibrationRecord, gain: float, delay: float, modes: int | None
+) -> SensorModel:
+    """Peaks of ``1 / (1 - G)``, each with a local fit of one resonance on a straight line."""
+    s = record.s_rad_s
+    g = record.frf.g * np.exp(s * delay) / gain
+    sharp = 1 / (1 - g)
+    natural, damping, strength = _peaks(s, sharp, modes, record.name or "air")
+    # far above the modes G is gamma over 1 + a little; where it is not, the fit corrects
+    gamma = float(np.clip(np.median(g.real[-max(3, g.size // 50) :]), 1e-3, 0.5))
+    return SensorModel(
+        natural_rad_s=natural,
+        damping_ratio=damping,
+        coupling_rad_s=np.sqrt(strength * (1 - gamma)),
+        tip_deflection=np.zeros(natural.size),
+        feedthrough=np.array(gamma),
+        leak_rad_s=np.array(0.1 * abs(s[0])),
+        gain=np.array(gain),
+        delay_s=np.array(delay),
+    )
+
+
+def _peaks(
+    s: ComplexArray, h: ComplexArray, modes: int | None, name: str
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n,) natural frequencies [rad/s], damping ratios and strengths of resonances in a response."""
+    # a peak of chi^2 / (2 zeta w): chi goes as beta, w as beta^2, so that all peaks are about as high
+    size = -h.imag * np.abs(s)
+    found, traits = signal.find_peaks(size, prominence=PEAK_HEIGHT * size.max())
+    if modes is not None:
+        found = np.sort(found[np.argsort(-traits["prominences"])[:modes]])
+        require(found.size == modes, "modes", modes, f"{found.size}, as many as {name} shows")
+    require(found.size > 0, name, 0, "a response with a mode")
+    natural, damping, strength = np.array([_local_fit(s, h, at) for at in found]).T
+    return natural, damping, strength
+
+
+def _local_fit(s: ComplexArray, h: ComplexArray, at: int) -> tuple[float, float, float]:
+    """Natural frequency, damping ratio and strength of the resonance at a line.
+
+    ``h (s^2 + a s + b) = r + (c + d s)(s^2 + a s + b)`` is linear in a, b and what is multiplied out.
+    """
+    w = abs(s[at])
+    low, high = at - 3, at + 4
+    while high < s.size and abs(s[high]) < 1.03 * w:
+        high += 1
+    while low > 0 and abs(s[low]) > 0.97 * w:
+        low -= 1
+    part = slice(max(low, 0), high)
+    z, y = s[part] / w, h[part]
+    columns = np.stack([z * y, y, -np.ones_like(z), -z, -(z**2), -(z**3)], axis=1)
+    weight = 1 / np.abs(z**2 + 0.02 * z + 1)
+    rows, right = columns * weight[:, None], -(z**2) * y * weight
+    real = np.concatenate([rows.real, rows.imag]), np.concatenate([right.real, right.imag])
+    a, b, *rest = np.linalg.lstsq(*real, rcond=None)[0]
+    natural = np.sqrt(b) if 0.9 < b < 1.1 else 1.0
+    zeta = a / 2 / natural if 1e-4 < a / 2 < 0.3 else 0.01
+    pole = natural * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    numerator = np.polyval([*rest[::-1]], pole) if rest else 0.0
+    strength = numerator.real
+    if not strength > 0:
+        strength = -2 * zeta * h[at].imag
+    return float(natural * w), float(zeta), float(strength * w**2)
+
+
+def one_above(sensor: SensorModel, top_hz: float) -> SensorModel:
+    """The same with a mode above the band, where frequency and coupling of the last ones lead on to."""
+    n = sensor.modes
+    natural, coupling = sensor.natural_rad_s, sensor.coupling_rad_s
+    step = natural[-1] - natural[-2] if n > 1 else natural[-1]
+    return replace(
+        sensor,
+        natural_rad_s=np.append(natural, max(natural[-1] + step, 2.1 * np.pi * top_hz)),
+        damping_ratio=np.append(sensor.damping_ratio, np.median(sensor.damping_ratio)),
+        coupling_rad_s=np.append(coupling, coupling[-1]),
+        tip_deflection=np.zeros(n + 1),
+    )
+
+
+def start_tip(loaded: Sequence[CalibrationRecord], air: SensorModel, shown: int) -> FloatArray:
+    """(n,) mode shapes at the tip from how far the first load moves each peak that shows."""
+    record = loaded[0]
+    s = record.s_rad_s
+    g = record.frf.g * np.exp(s * air.delay_s) / air.gain
+    moved = _peaks(s, 1 / (1 - g), shown, record.name or record.load.value)[0]
+    natural = air.natural_rad_s[:shown]
+    of = (natural / moved) ** 2 - 1
+    if record.load is Load.SPRING:
+        of = moved**2 - natural**2
+    tip = np.sqrt(np.maximum(of, 1e-6 * np.abs(of).max()) / record.value)
+    return np.append(tip, np.full(air.modes - shown, tip[-1]))

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bench, its calibration from records, and one that is given."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
+from tactile_resonance.calibration.fit import Calibration, Fitted, calibrate
+from tactile_resonance.calibration.model import SensorModel
+from tactile_resonance.sensor import read_sensor
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.known_loads import (
+    another_sensor,
+    records_of_calibration,
+    true_sensor,
+)
+from tactile_resonance.simulation.tissue.library import read_tissues
+
+SKEW_S = 3e-6
+MASS_KG, MASS_STD_KG = 5e-5, 5e-8
+
+
+@pytest.fixture(scope="session")
+def library():
+    return read_tissues()
+
+
+@pytest.fixture(scope="session")
+def bench(library) -> SimulatedBench:
+    """A sensor a few percent off the one of config/sensors."""
+    return SimulatedBench(another_sensor(read_sensor(), seed=1), library.contact)
+
+
+@pytest.fixture(scope="session")
+def records(bench) -> list[CalibrationRecord]:
+    effects = BenchEffects(channel_skew_s=SKEW_S)
+    made, harmonics, rate_hz = records_of_calibration(
+        bench, masses_kg=[MASS_KG], springs_n_per_m=[20.0], effects=effects, seed=4
+    )
+    stds = {"mass": MASS_STD_KG, "spring": 0.1}
+    return [
+        CalibrationRecord.of_samples(
+            u,
+            y,
+            sample_rate_hz=rate_hz,
+            harmonics=harmonics,
+            load=Load(kind),
+            value=value,
+            value_std=stds.get(kind, 0.0),
+            name=kind,
+        )
+        for kind, value, u, y in made
+    ]
+
+
+@pytest.fixture(scope="session")
+def fitted(records) -> Fitted:
+    return calibrate(records)
+
+
+@pytest.fixture(scope="session")
+def truth(bench) -> SensorModel:
+    return true_sensor(bench, SKEW_S)
+
+
+@pytest.fixture(scope="session")
+def given(truth) -> Calibration:
+    """A calibration that is the truth."""
+    size = truth.values.size
+    noise = 5e-4 / np.sqrt(25e3)
+    known = np.ones(size, bool)
+    return Calibration(truth, np.zeros((size, size)), known, (10.0, 12e3), noise, 1.0)

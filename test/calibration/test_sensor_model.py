@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model of a known sensor against the bench's state space, which it shares no code with."""
+
+import numpy as np
+import pytest
+
+from tactile_resonance.calibration.model import SensorModel, parameter_names
+from tactile_resonance.calibration.stiffness import AIR, ContactStiffness
+from tactile_resonance.simulation.sensor.known_loads import true_sensor
+
+TISSUES = ("gel10", "gel16", "cortex", "liver", "tumour")
+
+
+def stiffness_of(contact) -> ContactStiffness:
+    return ContactStiffness(
+        contact.equilibrium_stiffness_n_per_m,
+        contact.prony_stiffness_n_per_m,
+        np.array(contact.tissue.prony_times_s),
+        contact.radiation_damping_ns_per_m,
+        contact.radiation_mass_kg,
+    )
+
+
+@pytest.mark.parametrize("tissue", TISSUES)
+def test_response_poles_and_residues_are_those_of_the_bench(bench, library, tissue):
+    coupled, model = bench.coupled(library[tissue]), true_sensor(bench)
+    contact = stiffness_of(coupled.contact)
+    s = 2j * np.pi * np.geomspace(5, 12e3, 200)
+    np.testing.assert_allclose(contact.at(s), coupled.contact.dynamic_stiffness(s), rtol=1e-12)
+    np.testing.assert_allclose(model.response(s, contact.at(s)), coupled.response(s), rtol=1e-10)
+    poles = model.poles(contact)
+    poles = poles[np.lexsort((poles.real, poles.imag))]
+    np.testing.assert_allclose(
+        np.sort_complex(poles), np.sort_complex(coupled.poles_rad_s), rtol=1e-8
+    )
+    for mode in coupled.modes:
+        residue = model.residues(np.array([mode.pole_rad_s]), contact)
+        np.testing.assert_allclose(residue, mode.residue_rad_s, rtol=1e-6)
+
+
+def test_in_air_the_contact_is_not_there(bench):
+    model, air = true_sensor(bench), bench.coupled(None)
+    s = 2j * np.pi * np.geomspace(5, 12e3, 50)
+    np.testing.assert_allclose(model.response(s), air.response(s), rtol=1e-10)
+    np.testing.assert_allclose(model.response(s, AIR.at(s)), air.response(s), rtol=1e-10)
+    pole, _ = model.pole_near(250.0, AIR)
+    np.testing.assert_allclose(pole, air.mode_near(250.0).pole_rad_s, rtol=1e-9)
+
+
+def test_a_delay_and_a_gain_multiply_the_response(bench):
+    here, later = true_sensor(bench), true_sensor(bench, 1e-5)
+    s = 2j * np.pi * np.array([100.0, 5e3])
+    np.testing.assert_allclose(later.response(s), here.response(s) * np.exp(-s * 1e-5))
+
+
+def test_parameters_in_one_array_and_back_also_stacked(bench):
+    model = true_sensor(bench)
+    values = np.stack([model.values, 1.01 * model.values])
+    stack = SensorModel.of_values(values)
+    np.testing.assert_array_equal(stack.values, values)
+    assert len(parameter_names(model.modes)) == values.shape[1]
+    contact = ContactStiffness(50.0, np.array([20.0]), np.array([1e-3]))
+    both = stack.poles(contact)
+    for one, found in zip(values, both, strict=True):
+        alone = SensorModel.of_values(one).poles(contact)
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(alone), rtol=1e-10)
