@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from tactile_resonance.calibration.contact import TissueContact, ContactStatus, slope_of
+from tactile_resonance.calibration.contact import ContactStatus, TissueContact, slope_of
 from tactile_resonance.calibration.contact_record import ContactRecord, Start
 from tactile_resonance.calibration.fit import Calibration
 from tactile_resonance.calibration.law import ContactPrior, Law
@@ -258,9 +258,7 @@ class _Fit:
         squares = float(residual @ residual)
         dof = residual.size - p.size - self.directions
         status, message = ContactStatus.OK, ""
-        if not converged:
-            status, message = ContactStatus.NOT_CONVERGED, f"not converged in {_STEPS} steps"
-        elif special.chdtrc(dof, squares) < CONTRADICTED:
+        if special.chdtrc(dof, squares) < CONTRADICTED:
             status = ContactStatus.CONTRADICTED
             worst = int(np.argmax(np.abs(residual[-3:])))
             message = (
@@ -268,7 +266,9 @@ class _Fit:
                 "something else on the tip, or a tissue unlike the law)"
             )
             if abs(residual[-3 + worst]) > 4:
-                message += f"; {('rise', 'time', 'radius')[worst]} beyond what any tissue has"
+                message += f"; {self.prior.expected[worst]} beyond what any tissue has"
+        elif not converged:
+            status, message = ContactStatus.NOT_CONVERGED, f"not converged in {_STEPS} steps"
         poles = self._poles(
             p, value, noise[:2, :2], with_sensor[:2, :2], squares, dof, status, message
         )

@@ -29,7 +29,7 @@ LOG_RADIUS_STD = 0.5
 """Of the contact radius where no force is known."""
 STRICT_HERTZ = 0.4
 """Contact over ball radius up to which Hertz's force is within 7 % of a rigid sphere's (Sneddon 1965)."""
-_TIMES_S = 1 / (2 * np.pi * np.geomspace(2.0, 2e5, 11))
+_TIMES_S = 1 / (2 * np.pi * np.geomspace(5.0, 1e5, 9))
 
 
 class Law(str, Enum):
@@ -60,11 +60,11 @@ class ContactPrior:
     force_std_n: float = 0.0
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """(4,) of the parameters: logarithms, but for an exponent."""
+    def expected(self) -> tuple[str, str, str]:
+        """What there are expectations of, in the order of `deviations`."""
         if self.law is Law.POWER_LAW:
-            return ("log modulus", "exponent", "log radius", "log radiation")
-        return ("log modulus", "log rise", "log time", "log radius")
+            return ("exponent", "contact radius", "radiation")
+        return ("rise of the modulus", "time constant", "contact radius")
 
     @property
     def start(self) -> FloatArray:
@@ -127,7 +127,7 @@ def _radiated(modulus: FloatArray, radius: FloatArray) -> tuple[FloatArray, Floa
 
 
 def _power(exponent: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(...) and (..., J) of ``(s / (2 pi j 250 Hz))^exponent`` in relaxations: between tabulated exponents."""
+    """(...) and (..., J) of ``(s / (2 pi 250 Hz))^exponent`` in relaxations: between tabulated exponents."""
     grid, table = _power_table()
     at = np.asarray(exponent)
     k = np.clip(np.searchsorted(grid, at) - 1, 0, grid.size - 2)
@@ -149,5 +149,5 @@ def _power_table() -> tuple[FloatArray, FloatArray]:
         weight = 1 / np.abs(wanted)
         a, b = basis * weight[:, None], wanted * weight
         real = np.concatenate([a.real, a.imag]), np.concatenate([b.real, b.imag])
-        rows.append(optimize.nnls(*real)[0])
+        rows.append(optimize.nnls(*real, maxiter=1000)[0])
     return grid, np.array(rows)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of a calibrated sensor: written by `tactile_resonance calibrate`, read by whoever estimates a contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance.calibration.fit import Calibration
+from tactile_resonance.calibration.model import PER_MODE, SINGLE, SensorModel
+from tactile_resonance.fields import (
+    check_above_zero,
+    check_not_negative,
+    read_dataclass,
+    read_yaml,
+    require,
+)
+from tactile_resonance.strict_yaml import dump_yaml
+
+FORMAT = "tactile_resonance sensor calibration 1"
+_HEADER = """\
+# A calibrated sensor: `tactile_resonance calibrate` wrote this. Rows of `covariance` and entries of `determined` are
+# those of natural_rad_s, damping_ratio, coupling_rad_s, tip_deflection (a mode each), feedthrough, leak_rad_s, gain,
+# delay_s. What the records do not determine has a wide deviation, and is no statement.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedSensor:
+    """Content of a file.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    tip_radius_m : float
+        Of the ball.
+    tip_mass_kg, tip_mass_std_kg : float
+        NaN where not determined.
+    about : dict
+        What else a reader should know: sensor, date, records.
+    """
+
+    calibration: Calibration
+    tip_radius_m: float
+    tip_mass_kg: float
+    tip_mass_std_kg: float
+    about: dict[str, Any]
+
+    def as_text(self) -> str:
+        """Content of the file."""
+        made, model = self.calibration, self.calibration.model
+        content = {
+            "format": FORMAT,
+            **self.about,
+            "tip_radius_m": self.tip_radius_m,
+            "tip_mass_kg": _or_none(self.tip_mass_kg),
+            "tip_mass_std_kg": _or_none(self.tip_mass_std_kg),
+            "band_hz": list(made.band_hz),
+            "noise_v_per_root_hz": _or_none(made.noise_v_per_root_hz),
+            "excess": made.excess,
+            "message": made.message,
+            **{name: getattr(model, name).tolist() for name in (*PER_MODE, *SINGLE)},
+            "determined": made.determined.tolist(),
+            "covariance": made.covariance.tolist(),
+        }
+        return _HEADER + dump_yaml(content)
+
+
+def read_calibration(path: Path) -> CalibratedSensor:
+    """Read a file that `tactile_resonance calibrate` wrote.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or is something else; names field, value and what is accepted.
+    """
+    content = read_yaml(path)
+    form = content.get("format")
+    accepted = f"{FORMAT!r}, as tactile_resonance calibrate writes it"
+    require(form == FORMAT, f"{path}: format", form, accepted)
+    known = set(_File.__dataclass_fields__)
+    file = read_dataclass(_File, {k: v for k, v in content.items() if k in known}, f"{path.name}:")
+    about = {k: v for k, v in content.items() if k not in known and k != "format"}
+    nan = float("nan")
+    model = SensorModel(
+        *(np.asarray(getattr(file, name)) for name in PER_MODE),
+        *(np.asarray(getattr(file, name)) for name in SINGLE),
+    )
+    calibration = Calibration(
+        model,
+        file.covariance,
+        np.array(file.determined),
+        file.band_hz,
+        nan if file.noise_v_per_root_hz is None else file.noise_v_per_root_hz,
+        file.excess,
+        file.message,
+    )
+    return CalibratedSensor(
+        calibration,
+        file.tip_radius_m,
+        nan if file.tip_mass_kg is None else file.tip_mass_kg,
+        nan if file.tip_mass_std_kg is None else file.tip_mass_std_kg,
+        about,
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+@dataclass(frozen=True, eq=False)
+class _File:
+    tip_radius_m: float
+    band_hz: tuple[float, float]
+    noise_v_per_root_hz: float | None
+    excess: float
+    message: str
+    natural_rad_s: npt.NDArray[np.float64]
+    damping_ratio: npt.NDArray[np.float64]
+    coupling_rad_s: npt.NDArray[np.float64]
+    tip_deflection: npt.NDArray[np.float64]
+    feedthrough: float
+    leak_rad_s: float
+    gain: float
+    delay_s: float
+    determined: tuple[bool, ...]
+    covariance: npt.NDArray[np.float64]
+    tip_mass_kg: float | None = None
+    tip_mass_std_kg: float | None = None
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "tip_radius_m", "noise_v_per_root_hz", "excess", "gain")
+        check_not_negative(self, "leak_rad_s")
+        modes = self.natural_rad_s.size
+        require(modes > 0, "natural_rad_s", [], "a list of one mode or more")
+        for name in PER_MODE:
+            of = getattr(self, name)
+            require(of.shape == (modes,), name, of.tolist(), f"a list of {modes} numbers")
+            good = name == "tip_deflection" or bool(np.all(of > 0))
+            require(good, name, of.tolist(), "numbers above 0")
+        rising = bool(np.all(np.diff(self.natural_rad_s) > 0))
+        require(rising, "natural_rad_s", self.natural_rad_s.tolist(), "ascending frequencies")
+        size = 4 * modes + 4
+        require(len(self.determined) == size, "determined", len(self.determined), f"{size} entries")
+        shape = self.covariance.shape
+        require(shape == (size, size), "covariance", shape, f"{size} rows of {size} numbers")
+        good = bool(np.allclose(self.covariance, self.covariance.T, rtol=1e-6, atol=0))
+        good = good and bool(np.all(np.diag(self.covariance) >= 0))
+        require(good, "covariance", "another matrix", "a symmetric one with variances, 0 or above")

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a calibrated sensor is still as it was, from its poles in air.
+
+Warmer or colder, all modes of a beam move by one common relative factor, for its modulus and length change as a
+whole. A crack, a clamp that loosens, glue or dirt at the tip move each mode differently, or their damping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+from scipy import special
+
+from tactile_resonance.calibration.fit import Calibration
+from tactile_resonance.calibration.model import FloatArray, SensorModel
+from tactile_resonance.calibration.stiffness import AIR
+from tactile_resonance.poles.result import natural_frequency_and_damping
+
+SIGNIFICANT = 1e-4
+"""Probability of a deviation by chance below which it counts."""
+LEAST_SHIFT, LEAST_DAMPING = 2e-4, 5e-5
+"""Relative shift of a frequency, and change of a damping ratio, below which none counts however significant."""
+MOST_SHIFT = 0.01
+"""Relative shift that a temperature may cause: of a PZT bimorph some 50 K."""
+
+
+class SensorState(str, Enum):
+    """What became of a calibrated sensor."""
+
+    AS_CALIBRATED = "as calibrated"
+    TEMPERATURE = "all modes shifted alike: temperature"
+    SHIFTED = "one mode shifted: temperature or damage, one mode does not tell"
+    CHANGED = "changed"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class Validity:
+    """A sensor against its calibration.
+
+    Attributes
+    ----------
+    state : SensorState
+    shift, shift_std : float
+        Common relative shift of the frequencies in air; NaN where unknown.
+    frequency_shifts, damping_changes : (m,) float
+        Of each mode that was measured: relative, and as they are.
+    message : str
+        With the figures.
+    """
+
+    state: SensorState
+    shift: float
+    shift_std: float
+    frequency_shifts: FloatArray
+    damping_changes: FloatArray
+    message: str
+
+    @property
+    def usable(self) -> bool:
+        """Whether the calibration may be used, where the shift is taken along."""
+        return self.state in (SensorState.AS_CALIBRATED, SensorState.TEMPERATURE)
+
+
+def poles_in_air(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) f0 [Hz] and damping ratio of all modes in air, and their covariance (n, 2, 2)."""
+    model, free = calibration.model, np.flatnonzero(calibration.std > 0)
+    std = calibration.std[free]
+    moved = np.tile(model.values, (free.size + 1, 1))
+    moved[np.arange(free.size), free] += std
+    poles = SensorModel.of_values(moved).poles(AIR)  # (free + 1, N)
+    own = poles[-1][poles[-1].imag > 0]
+    own = own[np.argsort(np.abs(own))]
+    near = np.argmin(np.abs(poles[:, None, :] - own[:, None]), axis=-1)
+    each = np.take_along_axis(poles[:, None, :], near[..., None], axis=-1)[..., 0]
+    f0_hz, damping = natural_frequency_and_damping(each)  # (free + 1, n)
+    values = np.stack([f0_hz, damping], axis=-1)
+    slope = values[:-1] - values[-1]  # (free, n, 2), per deviation
+    correlation = calibration.covariance[np.ix_(free, free)] / np.outer(std, std)
+    return values[-1], np.einsum("ina,ij,jnb->nab", slope, correlation, slope)
+
+
+def check_in_air(
+    calibration: Calibration,
+    estimates: Sequence[FloatArray],
+    covariances: Sequence[FloatArray],
+) -> Validity:
+    """Compare measured poles in air with those of the calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    estimates : sequence of (2,) float
+        f0 [Hz] and damping ratio of one mode or more.
+    covariances : sequence of (2, 2) float
+        NaN where unknown.
+    """
+    expected, own = poles_in_air(calibration)
+    measured = np.asarray(estimates, float).reshape(-1, 2)
+    noise = np.asarray(covariances, float).reshape(-1, 2, 2)
+    known = np.isfinite(measured).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))
+    nothing = np.empty(0)
+    if not known.any():
+        text = "no poles in air with a covariance"
+        return Validity(SensorState.UNKNOWN, np.nan, np.nan, nothing, nothing, text)
+    measured, noise = measured[known], noise[known]
+    mode = np.argmin(np.abs(np.log(measured[:, :1] / expected[:, 0])), axis=1)
+    at, covariance = expected[mode], own[mode] + noise
+    shifts = measured[:, 0] / at[:, 0] - 1
+    shift_var = covariance[:, 0, 0] / at[:, 0] ** 2 + (LEAST_SHIFT / 4) ** 2
+    changes = measured[:, 1] - at[:, 1]
+    damping_var = covariance[:, 1, 1] + (LEAST_DAMPING / 4) ** 2
+    weight = 1 / shift_var
+    shift, shift_std = float(weight @ shifts / weight.sum()), float(weight.sum() ** -0.5)
+    apart = float(np.sum((shifts - shift) ** 2 * weight))
+    damped = float(np.sum(changes**2 / damping_var))
+    unlike = mode.size > 1 and special.chdtrc(mode.size - 1, apart) < SIGNIFICANT
+    # materials damp a little more when warm: only what is large counts as damage
+    damaged = special.chdtrc(mode.size, damped) < SIGNIFICANT and bool(
+        np.any(np.abs(changes) > np.maximum(LEAST_DAMPING, 0.1 * at[:, 1]))
+    )
+    moved = special.chdtrc(1, (shift / shift_std) ** 2) < SIGNIFICANT and abs(shift) > LEAST_SHIFT
+    figures = "; ".join(
+        f"mode {k + 1} at {f:.2f} Hz: {1e2 * s:+.3f} %, damping {c:+.2g}"
+        for k, f, s, c in zip(mode, at[:, 0], shifts, changes, strict=True)
+    )
+    if unlike or damaged or abs(shift) > MOST_SHIFT:
+        state = SensorState.CHANGED
+    elif moved:
+        state = SensorState.TEMPERATURE if mode.size > 1 else SensorState.SHIFTED
+    else:
+        state = SensorState.AS_CALIBRATED
+    return Validity(state, shift, shift_std, shifts, changes, f"{state.value} ({figures})")
+
+
+def at_shift(calibration: Calibration, shift: float, shift_std: float) -> Calibration:
+    """The calibration of a sensor all of whose modes moved by a relative shift, uncertain to a deviation."""
+    model, n = calibration.model, calibration.model.modes
+    moved = replace(model, natural_rad_s=model.natural_rad_s * (1 + shift))
+    covariance = calibration.covariance.copy()
+    covariance[:n, :n] += shift_std**2 * np.outer(model.natural_rad_s, model.natural_rad_s)
+    return replace(calibration, model=moved, covariance=covariance)
