@@ -77,6 +77,7 @@ def _parser() -> OneLineParser:
     from tactile_resonance.commands import (
         analyze,
         benchmark,
+        calibrate,
         calibrate_table,
         check_robot,
         compare,
@@ -100,9 +101,9 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(plan, scan, live, analyze, reidentify, references, compare),
-        *(mechanics, report, figures, benchmark, calibrate_table, simulate_ur, simulate_cell),
-        *(check_robot, compile),
+        *(plan, scan, live, analyze, reidentify, calibrate, references),
+        *(compare, mechanics, report, figures, benchmark, calibrate_table, simulate_ur),
+        *(simulate_cell, check_robot, compile),
     ):
         command.add_parser(commands)
     return parser

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a calibrated sensor: written by `tactile_resonance calibrate`, read by whoever estimates a contact."""
+"""The file of a calibrated sensor, which `tactile_resonance calibrate` writes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from tactile_resonance.strict_yaml import dump_yaml
 
 FORMAT = "tactile_resonance sensor calibration 1"
 _HEADER = """\
-# A calibrated sensor: `tactile_resonance calibrate` wrote this. Rows of `covariance` and entries of `determined` are
-# those of natural_rad_s, damping_ratio, coupling_rad_s, tip_deflection (a mode each), feedthrough, leak_rad_s, gain,
-# delay_s. What the records do not determine has a wide deviation, and is no statement.
+# A calibrated sensor: `tactile_resonance calibrate` wrote this. Rows of `covariance`, entries of `determined`:
+# those of natural_rad_s, damping_ratio, coupling_rad_s, tip_deflection (a mode each), feedthrough,
+# leak_rad_s, gain, delay_s. What the records do not determine has a wide deviation, and is no statement.
 """
 
 

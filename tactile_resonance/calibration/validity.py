@@ -137,9 +137,17 @@ def check_in_air(
 
 
 def at_shift(calibration: Calibration, shift: float, shift_std: float) -> Calibration:
-    """The calibration of a sensor all of whose modes moved by a relative shift, uncertain to a deviation."""
+    """The calibration of a sensor all of whose modes moved by a relative shift, uncertain to a deviation.
+
+    A modulus that changes by twice the shift changes the piezoelectric coupling as well, by about as much and in
+    a direction that is not known: a common factor of the couplings is that uncertain.
+    """
     model, n = calibration.model, calibration.model.modes
     moved = replace(model, natural_rad_s=model.natural_rad_s * (1 + shift))
     covariance = calibration.covariance.copy()
     covariance[:n, :n] += shift_std**2 * np.outer(model.natural_rad_s, model.natural_rad_s)
+    coupled = slice(2 * n, 3 * n)
+    covariance[coupled, coupled] += (2 * shift) ** 2 * np.outer(
+        model.coupling_rad_s, model.coupling_rad_s
+    )
     return replace(calibration, model=moved, covariance=covariance)

@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from tactile_resonance.cantilever import mode_shape
 from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.beam import mode_shape, sensor_modes
+from tactile_resonance.simulation.sensor.beam import sensor_modes
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.changing_contact import (
     ContactHistory,

@@ -7,13 +7,12 @@ import mpmath
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.sensor.beam import (
+from tactile_resonance.cantilever import (
     cantilever_eigenvalues,
     frequency_equation,
-    mass_per_length,
     mode_shape,
-    sensor_modes,
 )
+from tactile_resonance.simulation.sensor.beam import mass_per_length, sensor_modes
 
 
 def test_bare_cantilever_has_textbook_eigenvalues():
