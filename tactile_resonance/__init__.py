@@ -17,6 +17,7 @@ __path__ = __import__("pkgutil").extend_path(__path__, __name__)
 _HOMES = {
     "front": ("estimate_frf", "identify_poles", "read_record", "read_run"),
     "analysis": ("Analysis", "analyse"),
+    "contact_analysis": ("estimate_contact",),
     "multisine": ("Excitation", "Grid", "design_multisine"),
     "frf.result": ("FRF", "FrfStatus"),
     "poles.identify": ("identify_batch", "identify_spectra"),

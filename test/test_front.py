@@ -16,6 +16,7 @@ from test.recording import stores
 MODULES = (
     "tactile_resonance",
     "tactile_resonance.analysis",
+    "tactile_resonance.contact_analysis",
     "tactile_resonance.front",
     "tactile_resonance.multisine",
     "tactile_resonance.poles.identify",

@@ -21,6 +21,7 @@ MAY_IMPORT = {
     **dict.fromkeys(CORE, CORE | TOOLS),
     "recording": CORE | TOOLS,
     "analysis": CORE | TOOLS | {"recording"},
+    "contact_analysis": CORE | TOOLS | {"recording", "analysis"},
     "front": CORE | TOOLS | {"recording", "analysis"},
     "scan": CORE | TOOLS | {"recording"},
     "drivers": CORE | TOOLS | {"recording"},

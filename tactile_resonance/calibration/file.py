@@ -73,6 +73,10 @@ class CalibratedSensor:
 def read_calibration(path: Path) -> CalibratedSensor:
     """Read a file that `tactile_resonance calibrate` wrote.
 
+    Parameters
+    ----------
+    path : path
+
     Raises
     ------
     ValueError

@@ -139,8 +139,8 @@ def check_in_air(
 def at_shift(calibration: Calibration, shift: float, shift_std: float) -> Calibration:
     """The calibration of a sensor all of whose modes moved by a relative shift, uncertain to a deviation.
 
-    A modulus that changes by twice the shift changes the piezoelectric coupling as well, by about as much and in
-    a direction that is not known: a common factor of the couplings is that uncertain.
+    A modulus that changes by twice the shift changes the piezoelectric coupling as well, by about as much and
+    in a direction that is not known: a common factor of the couplings is that uncertain.
     """
     model, n = calibration.model, calibration.model.modes
     moved = replace(model, natural_rad_s=model.natural_rad_s * (1 + shift))

@@ -17,6 +17,7 @@ from tactile_resonance.analysis import (
     analyse,
     analysis_as_json,
 )
+from tactile_resonance.commands.analyze_contact import analyze_contacts
 from tactile_resonance.fields import band
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
@@ -24,6 +25,7 @@ from tactile_resonance.front import read_record
 from tactile_resonance.poles.order_choice import CANDIDATES
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.recording.recording import Recording
 from tactile_resonance.silent import silent_record
 
 MOST_HARMONICS = 10**7
@@ -42,6 +44,8 @@ OPTIONS = {
     "numerator_order": "--numerator-order",
     "poles_method": "--method",
     "channel_delay_s": "--channel-delay",
+    "force_n": "--force",
+    "relaxed_ratio": "--relaxed-ratio",
 }
 """Fields of the library, as its messages begin with them, that an option gives."""
 
@@ -141,6 +145,31 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         action="store_true",
         help="the record was taken without drive and needs no period: name its tones (hum) and its noise level",
     )
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="of `tactile_resonance calibrate`: stiffness of the contact, moduli and pole through this sensor; "
+        "of a run without --measurement, of all its points",
+    )
+    parser.add_argument(
+        "--force",
+        type=float,
+        metavar="N",
+        help="of the contact, with --calibration (default: a run's own; else unknown)",
+    )
+    parser.add_argument(
+        "--from-rest",
+        action="store_true",
+        help="with --calibration: the sensor was at rest at the first sample; one period is then enough",
+    )
+    parser.add_argument(
+        "--relaxed-ratio",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="with --calibration: modulus at the mode over that under the held force (default: 1)",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
     parser.set_defaults(run=run)
@@ -199,17 +228,9 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Nothing is written unless all went well."""
     _check_outputs(options)
-    recording = read_record(
-        options.record,
-        options.measurement,
-        u=options.u,
-        y=options.y,
-        sample_rate_hz=options.sample_rate,
-        samples_per_period=options.samples_per_period,
-        periods=options.periods,
-        segments=options.segments,
-        excited_harmonics=options.harmonics,
-    )
+    if options.calibration is not None:
+        return analyze_contacts(options, lambda key: _recording(options, key), as_text)
+    recording = _recording(options)
     rate_hz = recording.sample_rate_hz
     band_hz = None if options.band is None else band(options.band, most_hz=rate_hz / 2)
     if options.silent:
@@ -259,6 +280,20 @@ def _run(options: argparse.Namespace) -> int:
         write_whole(path, content)
     print(as_text(analysis))
     return 0
+
+
+def _recording(options: argparse.Namespace, measurement_id: int | None = None) -> Recording:
+    return read_record(
+        options.record,
+        options.measurement if measurement_id is None else measurement_id,
+        u=options.u,
+        y=options.y,
+        sample_rate_hz=options.sample_rate,
+        samples_per_period=options.samples_per_period,
+        periods=options.periods,
+        segments=options.segments,
+        excited_harmonics=options.harmonics,
+    )
 
 
 def as_text(analysis: Analysis) -> str:

@@ -11,8 +11,8 @@ from pathlib import Path
 NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot"),
     *("twist", "cell", "recording", "pipeline", "live", "load"),
-    *("truth", "skip", "references", "report", "mechanics", "stability"),
-    *("hostile", "overview"),
+    *("truth", "skip", "references", "report", "mechanics", "calibrate"),
+    *("stability", "hostile", "overview"),
 )
 WITH_FULL = ("contact",)
 """Those with a larger grid than they run by default."""

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records to contacts through the front door and the command."""
+
+import json
+
+import numpy as np
+import pytest
+from calibration.played import BAND_HZ, SKEW_S, excitation
+
+import tactile_resonance as tr
+from tactile_resonance.calibration.file import CalibratedSensor
+from tactile_resonance.cli import main
+from tactile_resonance.simulation.sensor.acquisition import BenchEffects
+from tactile_resonance.simulation.sensor.bench import BenchRun
+from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.tissue.hertz import hertz_contact
+
+FORCE_N = 0.01
+
+
+@pytest.fixture(scope="module")
+def sensor_file(fitted, bench, tmp_path_factory):
+    path = tmp_path_factory.mktemp("sensor") / "mine.yaml"
+    nan = float("nan")
+    content = CalibratedSensor(fitted.calibration, bench.sensor.tip.radius_m, nan, nan, {})
+    path.write_text(content.as_text())
+    return path
+
+
+def recording_on(bench, contact, duration_s, periods, seed=1) -> tr.Recording:
+    signal = excitation(duration_s)
+    effects = BenchEffects(channel_skew_s=SKEW_S)
+    run = BenchRun(bench.sensor, couple(bench.sensor, contact), seed, effects, False)
+    block = run.block(signal, periods)
+    return tr.make_recording(
+        block.actuator.volts(),
+        block.sensor.volts(),
+        sample_rate_hz=signal.sample_rate_hz,
+        samples_per_period=signal.samples_per_period,
+        excited_harmonics=signal.harmonics,
+    )
+
+
+def contact_on(bench, library, tissue="gel16"):
+    return hertz_contact(library[tissue], bench.sensor.tip.radius_m, bench.contact)
+
+
+@pytest.mark.parametrize(("duration_s", "periods", "rest"), [(0.02, 1, True), (0.1, 6, False)])
+def test_the_front_door_gives_the_contact(bench, library, sensor_file, duration_s, periods, rest):
+    contact = contact_on(bench, library)
+    recording = recording_on(bench, contact, duration_s, periods)
+    found = tr.estimate_contact(
+        recording, sensor_file, band_hz=BAND_HZ, force_n=FORCE_N, from_rest=rest
+    )
+    k = complex(contact.dynamic_stiffness(2j * np.pi * found.poles.f0_hz[0]))
+    off = found.contact.stiffness_n_per_m - k
+    assert abs(off) < 4 * np.sqrt(np.trace(found.contact.stiffness_total))
+    assert found.black_box is None
+    assert found.moduli.status.value == "ok"
+    assert found.warnings == ()
+
+
+def test_one_period_needs_a_known_start(bench, library, sensor_file):
+    recording = recording_on(bench, contact_on(bench, library), 0.02, 1)
+    with pytest.raises(ValueError, match="periods: got 1; accepted is two periods or more, or from"):
+        tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ)
+
+
+def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, sensor_file):
+    from dataclasses import replace
+
+    contact = contact_on(bench, library)
+    wet = replace(contact, radiation_mass_kg=contact.radiation_mass_kg + 2e-5)
+    recording = recording_on(bench, wet, 0.1, 6)
+    found = tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ, force_n=FORCE_N)
+    assert found.black_box is not None
+    assert found.poles is found.black_box.poles
+    assert any("contradict the calibration" in text for text in found.warnings)
+    assert any("without the calibration" in text for text in found.warnings)
+    true = couple(bench.sensor, wet).mode_near(250.0)
+    assert abs(found.poles.main.f0_hz - true.f0_hz) < 0.2
+
+
+def test_the_command_prints_and_writes_the_contact(bench, library, sensor_file, tmp_path, capsys):
+    recording = recording_on(bench, contact_on(bench, library), 0.1, 4)
+    record, output = tmp_path / "record.npz", tmp_path / "contact.json"
+    np.savez(
+        record,
+        u=recording.u[0],
+        y=recording.y[0],
+        sample_rate_hz=recording.sample_rate_hz,
+        samples_per_period=recording.u.shape[-1],
+        excited_harmonics=recording.excited_harmonics,
+    )
+    arguments = ["analyze", str(record), "--calibration", str(sensor_file), "--force", "0.01"]
+    arguments += ["--band", "200", "620", "--json", str(output)]
+    assert main([*arguments, "--from-rest"]) == 0
+    text = capsys.readouterr().out
+    assert "contact: k'" in text
+    assert "moduli: storage" in text
+    content = json.loads(output.read_text())
+    k = complex(*content["stiffness_n_per_m"])
+    true = complex(contact_on(bench, library).dynamic_stiffness(2j * np.pi * content["at_hz"]))
+    assert abs(k - true) < 4 * np.sqrt(np.trace(content["stiffness_total_covariance"]))
+    assert content["status"] == "ok"
+    assert content["moduli"]["storage_pa"] > 1e4
+    assert main([*arguments, "--plot", str(tmp_path / "a.png")]) == 1
+    assert "--plot" in capsys.readouterr().err
+    assert main(["analyze", str(record), "--calibration", str(record)]) == 1
+    assert "record.npz" in capsys.readouterr().err
