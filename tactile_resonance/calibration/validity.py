@@ -17,6 +17,7 @@ from scipy import special
 from tactile_resonance.calibration.fit import Calibration
 from tactile_resonance.calibration.model import FloatArray, SensorModel
 from tactile_resonance.calibration.stiffness import AIR
+from tactile_resonance.fields import require
 from tactile_resonance.poles.result import natural_frequency_and_damping
 
 SIGNIFICANT = 1e-4
@@ -134,6 +135,25 @@ def check_in_air(
     else:
         state = SensorState.AS_CALIBRATED
     return Validity(state, shift, shift_std, shifts, changes, f"{state.value} ({figures})")
+
+
+def as_of_today(calibration: Calibration, found: Validity) -> Calibration:
+    """The calibration with the shift taken along where there is one.
+
+    That of one mode, which may be damage, makes all frequencies uncertain by as much as it is.
+
+    Raises
+    ------
+    ValueError
+        If the sensor changed otherwise.
+    """
+    accepted = "a sensor as calibrated, or warmer: calibrate it again"
+    require(found.state is not SensorState.CHANGED, "calibration", found.message, accepted)
+    if found.state is SensorState.TEMPERATURE:
+        return at_shift(calibration, found.shift, found.shift_std)
+    if found.state is SensorState.SHIFTED:
+        return at_shift(calibration, found.shift, abs(found.shift))
+    return calibration
 
 
 def at_shift(calibration: Calibration, shift: float, shift_std: float) -> Calibration:

@@ -6,11 +6,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from tactile_resonance.analysis import Analysis
-from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.validity import as_of_today
 from tactile_resonance.contact_analysis import (
     ContactAnalysis,
     contact_content,
@@ -41,6 +44,8 @@ def analyze_contacts(
         if getattr(options, name):
             raise ValueError(f"--{name}: not with --calibration")
     sensor = read_calibration(options.calibration)
+    if (options.record / "run.json").is_file():
+        sensor = _as_of_run(options.record, sensor)
     contents = {}
     for key, label, (force_n, force_std_n) in _pressed(options):
         found = estimate_contact(
@@ -59,6 +64,16 @@ def analyze_contacts(
         content = next(iter(contents.values())) if one else contents
         write_whole(options.json, json.dumps(content, indent=1, allow_nan=False).encode())
     return 0
+
+
+def _as_of_run(run: Path, sensor: CalibratedSensor) -> CalibratedSensor:
+    """The sensor as the run found it in air, which is printed."""
+    content = read_run(run)
+    from tactile_resonance.scan.references import calibration_in_air
+
+    found = calibration_in_air(content, sensor.calibration)
+    print(f"sensor in air: {found.message}")
+    return replace(sensor, calibration=as_of_today(sensor.calibration, found))
 
 
 def _pressed(

@@ -9,6 +9,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.calibration.fit import Calibration
+from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
@@ -145,15 +147,34 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
     ValueError
         If its file is damaged.
     """
+    found = _poles_of(run, name)
+    return None if found is None else reference_of(found)
+
+
+def _poles_of(run: RunContent, name: str) -> Poles | None:
     found = None
     for file in run.files:
         if not file.name.endswith(f"-{name}.mcap"):
             continue
         for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES_TYPE):
             if topic.rsplit("/", 1)[-1] == "poles":
-                poles, _ = poles_from_message(message)
-                found = reference_of(poles)
+                found, _ = poles_from_message(message)
     return found
+
+
+def calibration_in_air(run: RunContent, calibration: Calibration) -> Validity:
+    """A calibrated sensor against the poles in air that a run began with, in all its bands.
+
+    Raises
+    ------
+    ValueError
+        If the file of the reference is damaged.
+    """
+    found = _poles_of(run, BEFORE)
+    modes = [] if found is None else [band.main for band in found.bands]
+    return check_in_air(
+        calibration, [mode.estimate for mode in modes], [mode.covariance for mode in modes]
+    )
 
 
 def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
