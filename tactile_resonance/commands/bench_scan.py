@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
+from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.processes import ENDING, NodeProcesses, free_domain_id, may_take_priority
 from tactile_resonance.simulation.plant.defaults import PRIORITY
 
@@ -49,6 +50,8 @@ class Job:
         On the wall clock; else in simulated time, as fast as this machine computes.
     notes : str
         Of the session, in place of the scene's.
+    calibration : Path or None
+        Of the sensor, for poles_node.
     """
 
     scene: Path
@@ -58,11 +61,18 @@ class Job:
     resume: bool = False
     real_time: bool = False
     notes: str = ""
+    calibration: Path | None = None
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of all three commands."""
     add_robot_host(parser)
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="of `tactile_resonance calibrate`: poles through this sensor where the data do not contradict it",
+    )
     parser.add_argument(
         "--real-time",
         action="store_true",
@@ -125,7 +135,16 @@ def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
         options.seed,
         real_time=options.real_time,
         notes=options.notes,
+        calibration=checked_calibration(options.calibration),
     )
+
+
+def checked_calibration(path: Path | None) -> Path | None:
+    """The file, whole; raises ``ValueError`` where it is no calibration."""
+    if path is None:
+        return None
+    read_calibration(path)
+    return path.resolve()
 
 
 def run_job(job: Job) -> int:
@@ -237,6 +256,8 @@ def node_parameters(
     nodes = plan_bringup(arguments, {}, priority=may_take_priority(PRIORITY)).nodes
     nodes["fake_hardware_node"]["seed"] = job.seed
     nodes["excitation_node"]["record_folder"] = work / "records"
+    if job.calibration is not None:
+        nodes["poles_node"]["calibration"] = str(job.calibration)
     if classes:
         nodes["pole_map_node"]["classes_file"] = job.scene
     return nodes

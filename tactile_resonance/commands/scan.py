@@ -11,6 +11,7 @@ from tactile_resonance.commands.bench_scan import (
     Job,
     add_options,
     add_scene_options,
+    checked_calibration,
     new_job,
     run_job,
 )
@@ -59,4 +60,7 @@ def _resume(options: argparse.Namespace) -> int:
 
     run = resumed_run(ScanGoal(run_directory=str(options.output.resolve()), resume=True))
     host, real_time = options.robot_host, options.real_time
-    return run_job(Job(run / "scene.yaml", run, host, resume=True, real_time=real_time))
+    sensor = checked_calibration(options.calibration)
+    return run_job(
+        Job(run / "scene.yaml", run, host, resume=True, real_time=real_time, calibration=sensor)
+    )

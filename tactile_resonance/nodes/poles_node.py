@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from tactile_resonance import msg
+from tactile_resonance.calibration.estimator import CalibratedEstimator
+from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.calibration.frf_poles import calibrated_poles
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
@@ -13,6 +18,7 @@ from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.poles.tables import compiled
+from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import origin_from_message
 
 PARAMETERS = (
@@ -47,6 +53,13 @@ PARAMETERS = (
         "the FRF brings the bins.",
         choices=POLES_METHODS,
     ),
+    Parameter(
+        "calibration",
+        "",
+        "File of `tactile_resonance calibrate`: poles of the first band through this sensor, from rest; where "
+        "data contradict it, or lines outside of the band are excited, as without. Empty: none.",
+        read_only=True,
+    ),
 )
 
 
@@ -62,6 +75,11 @@ class PolesNode(ManagedNode):
     def configure(self) -> None:
         """Topics in and out; the compiled fits are loaded before the first FRF is here."""
         compiled()
+        (calibration,) = values(self, "calibration")
+        self._sensor = None
+        if calibration:
+            known = read_calibration(Path(calibration))
+            self._sensor = CalibratedEstimator(known.calibration, known.tip_radius_m)
         self._publisher = self.publish_on(msg.Poles, "poles", POLES)
         self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 
@@ -69,18 +87,23 @@ class PolesNode(ManagedNode):
         origin = origin_from_message(message)
         try:
             frf, _ = frf_from_message(message)
-            poles = self._identify(frf)
+            poles = self._identify(frf, origin.contact)
         except Exception as error:  # a reader waits for an answer to every FRF
             reason = self.health.failed(f"FRF of measurement {origin.measurement_id}", error)
             poles = Poles(status=PolesStatus.FAILED, message=reason)
         self._publisher.publish(poles_to_message(poles, origin))
 
-    def _identify(self, frf: FRF) -> Poles:
+    def _identify(self, frf: FRF, contact: Contact) -> Poles:
         low_hz, high_hz, order, terms, method = values(
             self, "band_low_hz", "band_high_hz", "order", "residual_terms", "method"
         )
         bands = frf.bands or (PoleBand(low_hz, high_hz, order, terms),)
-        return poles_of_bands(frf, bands, method)
+        if self._sensor is None:
+            return poles_of_bands(frf, bands, method)
+        force_n, force_std_n = contact.force_n, contact.force_std_n
+        if not (force_n > 0 and force_std_n >= 0):
+            force_n, force_std_n = float("nan"), 0.0
+        return calibrated_poles(frf, bands, self._sensor, force_n, force_std_n, method)
 
 
 def main() -> None:

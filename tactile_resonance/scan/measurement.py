@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from tactile_resonance.contact.force_spread import SHORTEST_S
+from tactile_resonance.fields import require
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Separate
@@ -24,6 +25,10 @@ ODD_RANDOM_SHARE = 3 / 8
 """Of all lines: odd ones, three of four."""
 MOST_S = 3.2
 """Of vibration at a point, where the plan chooses period and blocks: eight periods of 0.4 s."""
+CALIBRATED_S, CALIBRATED_MOST_S = 0.02, 0.8
+"""Of a block, and of all at a point, through a calibrated sensor: `benchmark calibrate`."""
+FEWEST_CALIBRATED = 5
+"""Lines of a block: four parameters of a contact, three of them with priors."""
 REFERENCE_S = 0.8
 """Of vibration in a reference, at least: two periods of 0.4 s (arXiv 1805.00682)."""
 
@@ -73,6 +78,8 @@ class MeasurementDesign:
         Over each period, in place of random phases.
     silent : bool
         Nothing is played.
+    air : MeasurementDesign or None
+        What a reference in air is of, where it is something else: a pole there is fitted without a calibration.
     """
 
     bands: tuple[PoleBand, ...]
@@ -87,6 +94,7 @@ class MeasurementDesign:
     skipped: tuple[Skipped, ...]
     sweep: bool = False
     silent: bool = False
+    air: MeasurementDesign | None = None
 
     @property
     def block_s(self) -> float:
@@ -95,7 +103,9 @@ class MeasurementDesign:
 
     @property
     def of_reference(self) -> MeasurementDesign:
-        """The same with as many blocks as a reference has."""
+        """The same, or that for air, with as many blocks as a reference has."""
+        if self.air is not None:
+            return self.air.of_reference
         return replace(self, periods=_of_reference(self.blocks, self.block_s))
 
 
@@ -115,6 +125,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
                 f"sensor.band: got {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
                 f"{F_MIN_HZ:g} to {top_hz:g} Hz"
             )
+    if use.calibrated:
+        return _design_calibrated(scene, top_hz)
     whole_hz = ((F_MIN_HZ, top_hz),)
     # even distortion of a band falls outside of it: what is to show there must be excited there
     distortion = Output.DISTORTION in outputs
@@ -173,6 +185,47 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         lines=lines,
         skipped=tuple(skipped),
         sweep=use.samples_per_period is None and not distortion,
+    )
+
+
+def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
+    """Short blocks for poles through a calibrated sensor; in air as without one.
+
+    Raises
+    ------
+    ValueError
+        If the scene wants what such blocks do not hold.
+    """
+    use = scene.sensor
+    wanted = [output.value for output in scene.outputs if output in (Output.DISTORTION, Output.FRF)]
+    accepted = "none of distortion, frf with sensor.calibrated: only lines of the band are excited"
+    require(not wanted, "outputs", wanted, accepted)
+    further = [list(band.ends_hz) for band in use.further_bands]
+    accepted = "none with sensor.calibrated: its transient is known of one band alone"
+    require(not further, "sensor.further_bands", further, accepted)
+    accepted = "none with sensor.calibrated, whose blocks are too short for it"
+    require(scene.gate is None, "gate", scene.gate, accepted)
+    plain = replace(use, calibrated=False, samples_per_period=None)
+    air = design_measurement(replace(scene, sensor=plain, blocks=None))
+    samples = use.samples_per_period or math.ceil(CALIBRATED_S * use.sample_rate_hz)
+    spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
+    ends_hz = use.bands[0].ends_hz
+    lines = lines_of(ends_hz, spacing_hz)
+    accepted = f"{FEWEST_CALIBRATED} excited lines or more, {spacing_hz:g} Hz apart"
+    require(lines >= FEWEST_CALIBRATED, "sensor.band", list(ends_hz), accepted)
+    least = 1 if isinstance(scene.precision, Separate) else BlockLimits().least
+    blocks = scene.blocks or BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
+    of_whole = lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)
+    return replace(
+        air,
+        stretches_hz=(ends_hz,),
+        level_v=use.level_v * math.sqrt(lines / of_whole),
+        samples=samples,
+        blocks=blocks,
+        periods=blocks.most,
+        lines=lines,
+        sweep=True,
+        air=air,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tactile_resonance.contact.force_spread import SHORTEST_S
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
-from tactile_resonance.scan.measurement import MeasurementDesign, design_measurement
+from tactile_resonance.scan.measurement import CALIBRATED_S, MeasurementDesign, design_measurement
 from tactile_resonance.scan.period import LEAST_DISTANCE, lines_wanted, mains_distances, mains_in
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
@@ -67,6 +67,8 @@ def plan_rows(plan: Plan) -> Rows:
         ("measured", f"{design.blocks.least} to {design.blocks.most} blocks a point"),
         ("until", _wanted(scene)),
     ]
+    if scene.sensor.calibrated:
+        rows.append(("sensor", "calibrated: poles through the parameter calibration of poles_node"))
     for band in design.bands:
         order = (
             "one to three modes, as the data choose" if band.order == 0 else f"order {band.order}"
@@ -118,6 +120,8 @@ def _period(plan: Plan) -> str:
     design = plan.measurement
     if plan.scene.sensor.samples_per_period is not None:
         return "as the scene says"
+    if plan.scene.sensor.calibrated:
+        return f"{1e3 * CALIBRATED_S:g} ms: of a calibrated sensor the transient is known"
     gated = f", and at least {SHORTEST_S:g} s for the gate"
     needed = max(design.bands, key=lambda band: lines_wanted(band) / (band.high_hz - band.low_hz))
     return (

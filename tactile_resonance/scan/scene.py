@@ -119,6 +119,8 @@ class SensorUse:
         it, however few are.
     heading_rad : float
         Direction of the beam from clamp to tip, seen from above, from the x axis [rad].
+    calibrated : bool
+        Poles come through the calibrated sensor of poles_node (its parameter ``calibration``): short blocks.
     """
 
     name: str = "bimorph"
@@ -131,6 +133,7 @@ class SensorUse:
     samples_per_period: Annotated[int | None, _read_period] = 20_000
     level_v: float = 1.0
     heading_rad: float = 0.0
+    calibrated: bool = False
 
     def __post_init__(self) -> None:
         known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))

@@ -124,6 +124,7 @@ CHANGES = {
     "sensor.samples_per_period": (10000, {}),
     "sensor.level_v": (0.5, {}),
     "sensor.heading_rad": (0.5, {}),
+    "sensor.calibrated": (True, {"gate": None}),
     "surface.plane.point_m": ([0.0, 0.0, 1e-3], {}),
     "surface.plane.normal": ([0.0, 0.1, 1.0], {}),
     "surface.touch.points_m": ([[0.0, 0.0], [0.01, 0.0], [0.0, 0.012]], TOUCHED),
