@@ -41,11 +41,11 @@ GROUPS = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")
 DURATIONS = ((0.01, 1), (0.02, 1), (0.1, 1), (0.1, 4))
 """Period [s] and periods of a record from rest."""
 PREFACE = (
-    "`tools/run.sh tactile_resonance benchmark calibrate`. Everything is simulated: sensors whose parameters of",
+    "`tools/run.sh tactile_resonance benchmark calibrate`. All is simulated: sensors whose parameters of",
     "beam, tip and electronics are 3 % (standard deviation) off `config/sensors/bimorph.yaml`, noise and",
     "converters on. Each is calibrated from four periods of 2 s in air, with a mass of 50 mg that weighs",
-    "0.1 % (standard deviation) other than it says, and of a loop-back, its channels 2 us apart. The truth is for",
-    "comparison alone. Contacts and decisions: on the same sensors with channels that are not apart.",
+    "0.1 % (standard deviation) other than it says, and of a loop-back, its channels 2 us apart. The truth is",
+    "for comparison alone. Contacts and decisions: on the same sensors with channels that are not apart.",
 )
 
 

@@ -216,8 +216,11 @@ def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
     least = 1 if isinstance(scene.precision, Separate) else BlockLimits().least
     blocks = scene.blocks or BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
     of_whole = lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)
+    text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
+    named = f"only poles from {ends_hz[0]:g} to {ends_hz[1]:g} Hz are wanted"
     return replace(
         air,
+        skipped=(Skipped(text, named), *air.skipped[1:]),
         stretches_hz=(ends_hz,),
         level_v=use.level_v * math.sqrt(lines / of_whole),
         samples=samples,

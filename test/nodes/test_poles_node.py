@@ -232,3 +232,49 @@ def test_bins_of_two_realisations_give_what_their_records_give(node, monkeypatch
     assert np.array(both.total_covariance) == pytest.approx(total, rel=1e-5)
     error = expected.damping_ratio[0] - 0.02
     assert abs(error) < 4 * np.sqrt(total[3])
+
+
+def test_a_calibrated_sensor_is_read_and_used(tmp_path, monkeypatch):
+    """The pole of a block of 20 ms from rest; a file that is none keeps the node from being configured."""
+    from tactile_resonance.calibration.file import CalibratedSensor
+    from tactile_resonance.calibration.fit import Calibration
+    from tactile_resonance.frf.measurement import MeasurementFrf
+    from tactile_resonance.poles.structure import PoleBand
+    from tactile_resonance.simulation.sensor.bench import SimulatedBench
+    from tactile_resonance.simulation.sensor.known_loads import true_sensor
+    from tactile_resonance.simulation.tissue.library import read_tissues
+
+    bench, path = SimulatedBench.from_configuration(), tmp_path / "sensor.yaml"
+    model = true_sensor(bench)
+    size = model.values.size
+    known = Calibration(
+        model, np.zeros((size, size)), np.ones(size, bool), (10.0, 12e3), 3.2e-6, 1.0
+    )
+    path.write_text(CalibratedSensor(known, 0.0025, 7.7e-5, 1e-7, {}).as_text())
+    signal = design_multisine(
+        samples_per_period=1000,
+        band_hz=(200.0, 620.0),
+        level_v=0.21,
+        sweep=True,
+        bands=(PoleBand(200.0, 620.0, 2, 6),),
+    )
+    tissue = read_tissues()["gel10"]
+    frf = MeasurementFrf(0).add(bench.start(tissue, seed=1).block(signal), signal)
+    message = frf_to_message(frf, Origin(measurement_id=7), 0.21, False)
+    for file, good in ((path, True), (tmp_path / "none.yaml", False)):
+        arguments = ["--ros-args", "-p", f"calibration:={file}"]
+        with initialised(domain_id=free_domain_id(os.environ), args=arguments):
+            node = PolesNode()
+            node.trigger_configure()
+            if not good:
+                assert not hasattr(node, "_publisher")
+            else:
+                published = []
+                monkeypatch.setattr(node._publisher, "publish", published.append)
+                node._on_frf(message)
+                poles = published[0]
+                assert poles.status == msg.Poles.STATUS_OK, poles.message
+                mode = bench.coupled(tissue).mode_near(250.0)
+                assert abs(poles.f0_hz[0] - mode.f0_hz) < 0.4
+                assert "calibrated sensor" in poles.method
+            node.destroy_node()
