@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
+from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.model import (
     PER_MODE,
     ComplexArray,
     FloatArray,
     SensorModel,
-    parameter_names,
 )
 from tactile_resonance.calibration.start import one_above, start_channel, start_in_air, start_tip
 from tactile_resonance.fields import require
@@ -39,52 +39,6 @@ MOST_STEPS, STEPS_ABOVE = 200, 20
 """Of the fit; of that with a mode above the band, which needs many where there is none."""
 NOTABLE = 2.0
 """Mean square of residuals over that of noise from which a reader is told."""
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Parameters of one sensor, with what is known of them.
-
-    Attributes
-    ----------
-    model : SensorModel
-    covariance : (p, p) float
-        Of `SensorModel.values`.
-    determined : (p,) bool
-        Which the records determine; the others keep a value and a wide deviation.
-    band_hz : (float, float)
-        First and last line in air.
-    noise_v_per_root_hz : float
-        Of the sensor channel, one-sided; NaN where unknown.
-    excess : float
-        Mean square of the residuals over that of noise, of the record where it is largest; 1 where none is
-        larger.
-    message : str
-        What a reader should know; empty where there is nothing to say.
-    """
-
-    model: SensorModel
-    covariance: FloatArray
-    determined: npt.NDArray[np.bool_]
-    band_hz: tuple[float, float]
-    noise_v_per_root_hz: float
-    excess: float
-    message: str = ""
-
-    @property
-    def std(self) -> FloatArray:
-        """(p,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(p,) of the parameters."""
-        return parameter_names(self.model.modes)
-
-    def knows_tip(self, modes: int = 2) -> bool:
-        """Whether the first mode shapes at the tip are determined, without which no contact is."""
-        n = self.model.modes
-        return bool(self.determined[3 * n : 3 * n + min(modes, n)].all())
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 from scipy import special
 
-from tactile_resonance.calibration.fit import Calibration
+from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.model import FloatArray, SensorModel
 from tactile_resonance.calibration.stiffness import AIR
 from tactile_resonance.fields import require

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
-from tactile_resonance.calibration.fit import Calibration, Fitted, calibrate
+from tactile_resonance.calibration.fit import Fitted, calibrate
 from tactile_resonance.calibration.tip_mass import tip_mass
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.fields import number, require
