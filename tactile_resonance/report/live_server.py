@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import queue
+import sys
 import threading
 from collections.abc import Callable
 from http import HTTPStatus
@@ -117,6 +118,11 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     live: LiveServer
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A reader that has gone is no error."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -5,8 +5,10 @@ import http.client
 import json
 import math
 import socket
+import struct
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -267,6 +269,23 @@ def test_readers_are_bounded_and_one_that_is_slow_begins_anew(served):
     filling.join(60)
     assert not filling.is_alive(), "a slow reader keeps the scan waiting"
     assert server.readers == 0
+
+
+def test_a_reader_that_goes_leaves_no_word(served, capfd):
+    _, server = served
+    for path in ("/", "/events"):
+        for _ in range(3):
+            with socket.create_connection((LOOPBACK, port_of(server)), WITHIN_S) as raw:
+                raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset
+                raw.sendall(f"GET {path} HTTP/1.1\r\nHost: {LOOPBACK}:{port_of(server)}\r\n\r\n".encode())
+                raw.recv(10)
+    deadline = time.monotonic() + WITHIN_S
+    while server.readers and time.monotonic() < deadline:
+        server.publish("now", {})
+        time.sleep(0.05)
+    assert server.readers == 0
+    assert ask(server).status == 200
+    assert capfd.readouterr().err == ""
 
 
 def test_the_live_page_shows_points_as_they_come(served, tmp_path):
