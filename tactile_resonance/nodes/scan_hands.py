@@ -216,6 +216,10 @@ class NodeHands:
             raise PointDisturbed(text, "place unknown")
         return measured
 
+    def offers_tests(self) -> bool:
+        """Whether a node offers the action `indent`."""
+        return self._tip is not None and self._tip.offers_tests()
+
     def test(
         self,
         point: ScanPoint,

@@ -157,20 +157,14 @@ class TipContact:
             finally:
                 self.retract(TOUCH_RETRACT_WITHIN_S)
 
+    def offers_tests(self) -> bool:
+        """Whether a node offers the action `indent`: ideal contact does not."""
+        return self._tests.client.wait_for_server(self._time.patience_s(OFFERED_WITHIN_S))
+
     def test(
         self, pose: PoseStamped, asked: ProtocolRequest, force_n: float, check: Check, poll: Poll
     ) -> Indent.Result:
-        """Carry a mechanical test out, and leave the tip free.
-
-        Raises
-        ------
-        ScanEnded
-            If no node offers the action: ideal contact does not.
-        """
-        if not self._tests.client.wait_for_server(self._time.patience_s(OFFERED_WITHIN_S)):
-            raise ScanEnded(
-                "protocols: no node offers the action indent; accepted are none without contact_node"
-            )
+        """Carry a mechanical test out, and leave the tip free."""
         goal = Indent.Goal(
             protocol=PROTOCOLS[asked.kind],
             pose=pose,

@@ -192,6 +192,10 @@ class Hands(Protocol):
         """
         ...
 
+    def offers_tests(self) -> bool:
+        """Whether `test` can be carried out by what is there."""
+        ...
+
     def test(
         self,
         point: ScanPoint,

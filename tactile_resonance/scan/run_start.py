@@ -115,6 +115,7 @@ def start_run(
         return _resumed(resumed_run(goal), frames, hands)
     new = new_run(goal, frames, files, forces=hands.free_air)
     scene = _placed(new.wanted.plan.scene, frames, hands)
+    _require_tests(scene, hands)
     radius_m = sensor_named(scene.sensor.name).tip.radius_m
 
     def find(point: ScanPoint, force_n: float, count: int) -> Touch:
@@ -157,6 +158,7 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         require(began in (None, table), "table_in_base", table, accepted)
         scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
+        _require_tests(scene, hands)
         scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
         points = run.content.places or run.content.points
         return StartedRun(plan_points(scene, points), run, int(facts["seed"]))
@@ -179,6 +181,12 @@ def _require_force(scene: ScanScene, forces: bool) -> None:
     require(scene.gate is None or forces, "gate", scene.gate, accepted)
     asked = [str(each) for each in scene.protocols]
     require(not asked or forces, "protocols", asked, accepted)
+
+
+def _require_tests(scene: ScanScene, hands: Hands) -> None:
+    asked = [str(each) for each in scene.protocols]
+    accepted = "none where no node offers the action indent: ideal contact does not"
+    require(not asked or hands.offers_tests(), "protocols", asked, accepted)
 
 
 def _frames_of(facts: Mapping[str, Any], scene: ScanScene, frames: Frames) -> dict[str, Pose]:

@@ -52,6 +52,7 @@ class Bench:
         None  # of a position (3,); None: 254 Hz everywhere. With noise of the stated spread
     )
     at: object = None  # position of the point in contact
+    testing: bool = True
     tests: object = None  # record of a point and of what is asked there; raises where it fails
     beside: Poles | None = None  # another mode, of lower frequency, reported before the main one
 
@@ -114,6 +115,9 @@ class Bench:
         self.log.append(("measure", label, seed, blocks))
         self.measurements += label != "air"
         return measured
+
+    def offers_tests(self):
+        return self.testing
 
     def test(self, point, asked, force_n, recording, check):
         check()

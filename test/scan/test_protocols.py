@@ -21,7 +21,7 @@ from tactile_resonance.scan.plan_text import plan_rows
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.scan.run_start import new_run
+from tactile_resonance.scan.run_start import new_run, start_run
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.tissue_tests import fits_at, fits_of
 
@@ -138,3 +138,8 @@ def test_a_scan_that_does_not_move_the_tip_refuses_tests(tmp_path):
     frames = Frames("table", "base", Pose.at_origin())
     with pytest.raises(ValueError, match=r"protocols: got \['relaxation.*none where scan_node's"):
         new_run(goal, frames, GoalFiles("", ["/"]), forces=False)
+    # with contact that is moved, and no node that carries tests out
+    how = {"seed": 1, "tip_use": None, "tell": lambda _: None, "check": lambda: None}
+    with pytest.raises(ValueError, match="protocols: got .* none where no node offers the action"):
+        start_run(goal, frames, GoalFiles("", ["/"]), Bench(testing=False), **how)
+    assert not (tmp_path / "run").exists()
