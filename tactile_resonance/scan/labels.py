@@ -54,15 +54,19 @@ def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
     ValueError
         If a column is unknown, a tissue or a run is missing, or two rows are of one point.
     """
-    reader = csv.DictReader(io.StringIO(read_text(path)), skipinitialspace=True)
-    columns = reader.fieldnames or []
+    try:
+        reader = csv.DictReader(io.StringIO(read_text(path)), skipinitialspace=True)
+        rows, columns = list(reader), reader.fieldnames or []
+    except csv.Error as error:
+        raise ValueError(f"{path.name}: cannot be read as CSV: {error}") from error
     for name in columns:
         require(name in _COLUMNS, f"{path.name}: column", name, f"one of {', '.join(_COLUMNS)}")
     require("tissue" in columns, f"{path.name}: columns", columns, "tissue among them")
     names = [run.path.resolve().name for run in runs]
     labels: dict[tuple[str, int | None], Label] = {}
-    for number, row in enumerate(reader, start=2):
+    for number, row in enumerate(rows, start=2):
         where = f"{path.name}, line {number}: "
+        require(None not in row, f"{where}cells", row.get(None), f"{len(columns)} of them")
         values = {key: (row.get(key) or "").strip() for key in _COLUMNS}
         if not values["run"] and len(names) == 1:
             values["run"] = names[0]

@@ -231,6 +231,8 @@ def test_labels_of_points_places_and_what_is_left_out(tmp_path):
         ("tissue,batch\ngel,1\n", "column: got 'batch'; accepted is one of run, index, tissue"),
         ("run,tissue\nthree,gel\n", "line 2: run: got 'three'; accepted is one of one"),
         ("index,tissue\n-1,gel\n", "line 2: index: got '-1'"),
+        ("index,tissue\n0,gel,fat\n", "line 2: cells: got .'fat'.; accepted is 2 of them"),
+        ('tissue\n"' + "x" * 200_000, "labels.csv: cannot be read as CSV: field larger"),
         ("index,tissue\n0,unknown\n", "line 2: tissue: got 'unknown'"),
         ("index,tissue\n0,gel\n0,gel\n", "line 3: index: got '0'; accepted is one row"),
     ],
