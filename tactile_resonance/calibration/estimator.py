@@ -292,18 +292,12 @@ class _Fit:
         )
 
     def _pole(self, p: FloatArray) -> complex:
-        """Pole of the band with the highest peak; nearest to the band where none lies in it."""
-        contact, sensor = self.prior.stiffness(p), self.calibration.model
-        poles = sensor.poles(contact)
+        """Pole of the mode that is meant: nearest to that of the band in air, which tissue moves by a tenth."""
+        poles = self.calibration.model.poles(self.prior.stiffness(p))
         poles = poles[poles.imag > 0]
-        residues = sensor.residues(poles, contact)
-        f = np.abs(poles) / (2 * np.pi)
-        low, high = self.record.frequency_hz[[0, -1]]
-        inside = (f >= low) & (f <= high)
-        if not inside.any():
-            return complex(poles[np.argmin(np.abs(f - self.prior.frequency_hz))])
-        peak = np.where(inside, np.abs(residues) / np.abs(poles.real), 0)
-        return complex(poles[np.argmax(peak)])
+        return complex(
+            poles[np.argmin(np.abs(np.abs(poles) / (2 * np.pi) - self.prior.frequency_hz))]
+        )
 
     def _poles(
         self,
