@@ -83,7 +83,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     start = start_in_air(air[0], gain, delay, modes)
 
     def without_loads(start: SensorModel, steps: int) -> tuple[SensorModel, float]:
-        problem = _Problem([*air, *loopback], start.modes, free_gain=bool(loopback), free_tip=False)
+        problem = _Records([*air, *loopback], start.modes, free_gain=bool(loopback), free_tip=False)
         solved = problem.solved(problem.start(start), steps)
         return SensorModel.of_values(solved.values), float(np.sum(solved.residual**2))
 
@@ -95,7 +95,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
         first = further
     if loaded:
         first = replace(first, tip_deflection=start_tip(loaded, first, shown))
-    problem = _Problem(records, first.modes, free_gain=bool(loopback), free_tip=bool(loaded))
+    problem = _Records(records, first.modes, free_gain=bool(loopback), free_tip=bool(loaded))
     begun = problem.solved(problem.start(first))
     # what repeats in every period, as the steps of a converter do, no variance over periods shows
     excess = np.maximum(1.0, problem.mean_squares(begun.residual))
@@ -113,7 +113,7 @@ class _Solved:
     residual: FloatArray
 
 
-class _Problem:
+class _Records:
     """Residuals and their derivatives by logarithms of what is above 0, and by the others in their units."""
 
     def __init__(
@@ -282,7 +282,7 @@ def derivatives(
 
 
 def _fitted(
-    problem: _Problem, solved: _Solved, excess: FloatArray, has_loopback: bool, has_tip: bool
+    problem: _Records, solved: _Solved, excess: FloatArray, has_loopback: bool, has_tip: bool
 ) -> Fitted:
     n = problem.modes
     residuals, start, notes = [], 0, []
