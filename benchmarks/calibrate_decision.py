@@ -72,11 +72,12 @@ class Called:
 @lru_cache(maxsize=64)
 def wanted(seed: int) -> tuple[Separate, NominalContact]:
     """Classes and nominal contact of a sensor: its poles on castings, under other forces."""
-    bench = calibrated(seed).bench
+    at = calibrated(seed)
+    bench = at.bench
     force_n = bench.contact.force_n
 
     def pole(percent: float, at_n: float = force_n) -> FloatArray:
-        return pole_of(bench.coupled(library().gelatine(percent), force_n=at_n))
+        return pole_of(bench.coupled(library().gelatine(percent), force_n=at_n), at.mode_hz)
 
     classes, slopes = [], []
     for name, percent in zip(NAMES, PERCENT, strict=True):
@@ -118,14 +119,15 @@ def decide_point(task: tuple[int, int, int, float, bool]) -> Called:
         if decision.stop:
             break
     referred = refer_to_nominal(main.estimate, main.covariance, pressed, nominal)
-    there = pole_of(at.bench.coupled(tissue, force_n=stated_n, hold_time_s=nominal.age_s))
+    nominally = at.bench.coupled(tissue, force_n=stated_n, hold_time_s=nominal.age_s)
+    there, true = (pole_of(of, at.mode_hz) for of in (nominally, point.at(point.time_s / 2)))
     return Called(
         NAMES[which],
         decision.called,
         point.time_s,
         decision.verdict,
         contradicted,
-        squared(main.estimate - point.truth(), main.covariance),
+        squared(main.estimate - true, main.covariance),
         squared(referred.compared - there, referred.covariance),
     )
 

@@ -101,7 +101,7 @@ class SimulatedPoint:
         return convert(volts, scale_v, self._bench.sensor.acquisition.adc_bits)
 
 
-def pole_of(coupled: CoupledBimorph) -> FloatArray:
-    """(2,) f0 [Hz] and damping ratio of the mode near 250 Hz."""
-    mode = coupled.mode_near(250.0)
+def pole_of(coupled: CoupledBimorph, near_hz: float = 250.0) -> FloatArray:
+    """(2,) f0 [Hz] and damping ratio of the mode near a frequency."""
+    mode = coupled.mode_near(near_hz)
     return np.array([mode.f0_hz, mode.damping_ratio])
