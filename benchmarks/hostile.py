@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.hostile_targets import Target, targets
 
-INPUTS, QUICK_INPUTS = 1_000_000, 5_000
+FULL_INPUTS, INPUTS, QUICK_INPUTS = 1_000_000, 100_000, 5_000
 WITHIN_S = 5.0
 MEMORY_BYTES = 6 << 30
 TOO_LONG, REPEATS = f"no answer within {WITHIN_S:g} s", 2
@@ -202,9 +202,9 @@ def _tried_apart(name: str, inputs: int, seed: int) -> Answers:
         return found
 
 
-def run(output: Path, quick: bool) -> str:
+def run(output: Path, quick: bool, full: bool = False) -> str:
     """Try all readers, write ``hostile.md`` and inputs with a wrong answer into `output`; return the page."""
-    inputs = QUICK_INPUTS if quick else INPUTS
+    inputs = FULL_INPUTS if full else QUICK_INPUTS if quick else INPUTS
     with TemporaryDirectory() as folder:
         jobs = [(of.name, max(20, round(of.share * inputs)), SEED) for of in targets(Path(folder))]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # each waits for a process
@@ -225,7 +225,8 @@ def _page(done: Sequence[Answers]) -> str:
     lines = [
         "# Hostile inputs",
         "",
-        f"`tools/run.sh tactile_resonance benchmark hostile`. {about} Memory: {MEMORY_BYTES >> 30} GiB.",
+        f"`tools/run.sh tactile_resonance benchmark hostile` (`--full`: a million). {about} Memory: "
+        f"{MEMORY_BYTES >> 30} GiB.",
         "",
         f"{sum(of.inputs for of in done)} inputs, {sum(of.accepted for of in done)} accepted. "
         f"**Wrong answers: {wrong}.**",

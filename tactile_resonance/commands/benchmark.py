@@ -14,7 +14,7 @@ NAMES = (
     *("truth", "skip", "references", "report", "mechanics", "calibrate"),
     *("stability", "hostile", "overview"),
 )
-WITH_FULL = ("contact",)
+WITH_FULL = ("contact", "hostile")
 """Those with a larger grid than they run by default."""
 PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 """Tables of `poles`, each of which can be renewed alone."""
