@@ -304,18 +304,19 @@ def _draw(methods: Sequence[Method], scalings: Sequence[Scaling], path: Path) ->
     figure = new_figure(12, 4.8)
     left, right = figure.subplots(1, 2)
     fft_s, front = methods[0].time_s, _front(methods)
-    for method in methods[1:]:
-        if not np.isfinite(method.error).all():
-            continue
+    rated = [method for method in methods[1:] if np.isfinite(method.error).all()]
+    for number, method in enumerate(rated, start=1):
         at = method.time_s / fft_s, float(method.error.max())
-        left.plot(*at, "o", color="tab:blue" if method in front else "tab:grey", markersize=4)
-        left.annotate(method.name, at, fontsize=5.5, xytext=(3, 3), textcoords="offset points")
+        colour = "tab:blue" if method in front else "tab:grey"
+        left.plot(*at, "o", color=colour, markersize=4, label=f"{number} {method.name}")
+        left.annotate(str(number), at, fontsize=7, xytext=(3, 3), textcoords="offset points")
     left.plot(
         [m.time_s / fft_s for m in front], [m.error.max() for m in front], drawstyle="steps-post"
     )
     left.set(xscale="log", yscale="log", title="Poles: run time against error, simulated")
     left.set_xlabel("time per point over the FFT of its record")
     left.set_ylabel("error over the Cramer-Rao bound")
+    left.legend(fontsize=5.5, loc="upper center", ncols=2, handlelength=0)
     for of in scalings:
         right.plot(of.size, 1e3 * of.time_s, "o-", markersize=3, label=f"{of.name}, slope {of.slope:.2f}")
     right.set(xscale="log", yscale="log", title="Scaling", xlabel="size", ylabel="processor time [ms]")
