@@ -88,8 +88,9 @@ def run(output: Path, quick: bool) -> str:
     values = [*_frf_values(quick), *_pole_values(methods), *_coverage(), *_decision(), *_stability()]
     scalings = _scalings(2 if quick else ROUNDS)
     worse = _worse(values)
-    text = _page(values, methods, scalings, worse)
     output.mkdir(parents=True, exist_ok=True)
+    pages = [name for name in NAMES if (output / f"{name}.md").exists()]
+    text = _page(values, methods, scalings, worse, pages)
     (output / "README.md").write_text(text, encoding="utf-8")
     kept = {of.name: round(of.value, 6) for of in values}
     (output / "overview.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
@@ -250,6 +251,7 @@ def _page(
     methods: Sequence[Method],
     scalings: Sequence[Scaling],
     worse: Sequence[str],
+    pages: Sequence[str],
 ) -> str:
     fft_s = methods[0].time_s
     page = "| {} | {} | [`benchmark {page}`]({page}.md) |"
@@ -289,7 +291,7 @@ def _page(
         "",
         "## Pages",
         "",
-        *(f"- [{name}]({name}.md): {_about(name)}" for name in NAMES if name != "overview"),
+        *(f"- [{name}]({name}.md): {_about(name)}" for name in pages),
         "",
     ])  # fmt: skip
 
