@@ -318,6 +318,7 @@ def _draw(methods: Sequence[Method], scalings: Sequence[Scaling], path: Path) ->
     left.set(xscale="log", yscale="log", title="Poles: run time against error, simulated")
     left.set_xlabel("time per point over the FFT of its record")
     left.set_ylabel("error over the Cramer-Rao bound")
+    left.set_ylim(top=100 * max(of.error.max() for of in rated))  # the legend hides none
     left.legend(fontsize=5.5, loc="upper center", ncols=2, handlelength=0)
     for of in scalings:
         right.plot(of.size, 1e3 * of.time_s, "o-", markersize=3, label=f"{of.name}, slope {of.slope:.2f}")
