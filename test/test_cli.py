@@ -47,7 +47,44 @@ def test_compile_says_that_nothing_is_missing(capsys):
     """The tests before have compiled, or set-up has."""
     assert cli.main(["compile"]) == 0
     assert cli.main(["compile"]) == 0
-    assert capsys.readouterr().out.count("pole fits: ") == 2
+    assert capsys.readouterr().out.count("fits: ") == 2
+
+
+def test_what_compile_has_compiled_is_all_that_mechanical_tests_need(tmp_path):
+    """With a cache of its own: first it is empty, then a first fit in another process compiles nothing."""
+    code = """
+import sys
+from dataclasses import replace
+
+import numpy as np
+from numba.core import event
+
+from tactile_resonance.mechanics import course
+from tactile_resonance.mechanics.fit import fit_indentation
+from tactile_resonance.mechanics.prony import Prony
+
+print(course.compiled())
+"""
+    fits = """
+sys.path.insert(0, sys.argv[1])
+from made_indentations import relaxation
+
+solid, rng = Prony(3e3, np.array([2e3]), np.array([1.5])), np.random.default_rng(1)
+with event.install_recorder("numba:compile") as heard:
+    for stiffness in (np.inf, 15.0):
+        test = relaxation(solid, rng, hold_s=3.0, stiffness_n_per_m=stiffness)
+        for array in (test.time_s, test.force_n, test.depth_m):
+            array.setflags(write=False)
+        fit_indentation(test)
+print(len(heard.buffer))
+"""
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    folder = str(ROOT / "test" / "mechanics")
+    for text, wanted in ((code, lambda first: first > 0), (code + fits, lambda *all_: all_ == (0, 0))):
+        done = subprocess.run(
+            [sys.executable, "-c", text, folder], env=env, capture_output=True, text=True, check=True
+        )
+        assert wanted(*map(int, done.stdout.split())), done.stdout
 
 
 def test_files_and_folders_taken_for_each_other_are_named(tmp_path, capsys):

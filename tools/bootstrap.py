@@ -113,12 +113,12 @@ def wanted_build(packages_key: Stamp) -> Stamp:
 
 
 def wanted_fits(packages_key: Stamp) -> Stamp:
-    """What numba's cache of the pole fits depends on: it looks at the place and date of the source."""
-    source = ROOT / build.FITS
+    """What numba's cache of the fits depends on: it looks at the place and date of each source."""
+    sources = [ROOT / name for name in build.FITS]
     return {
         "packages": digest([json.dumps(packages_key)]),
-        "source": contents([source]),
-        "date": str(source.stat().st_mtime_ns),
+        "source": contents(sources),
+        "date": " ".join(str(source.stat().st_mtime_ns) for source in sources),
     }
 
 

@@ -18,7 +18,7 @@ COLCON_BUILD = BUILD / NAMED / "tactile_resonance"
 INSTALL = ROOT / f"install{BESIDE}"
 INTERFACES = ("msg", "srv", "action")
 INSTALLED = ("tactile_resonance", "config", "launch")
-FITS = "tactile_resonance/poles/likelihood.py"
+FITS = ("tactile_resonance/poles/likelihood.py", "tactile_resonance/mechanics/course.py")
 
 # What cmake looks for, in its order.
 _COMPILERS = {
@@ -81,9 +81,9 @@ def build(anew: bool) -> None:
 
 
 def compile_fits() -> None:
-    """Compile the cost of the pole fits into numba's cache, so that no first use has to."""
-    with step("compiling the pole fits (about a minute)"):
-        failure = "the pole fits could not be compiled"
+    """Compile the kernels of the fits into numba's cache, so that no first use has to."""
+    with step("compiling the fits (about a minute)"):
+        failure = "the fits could not be compiled"
         run([ROOT / "tools" / "run.sh", "tactile_resonance", "compile"], "kernels.log", failure)
 
 

@@ -15,6 +15,7 @@ stands.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import njit
@@ -65,15 +66,28 @@ def course_of(
     equilibrium_pa : (P,) array
     moduli_pa, times_s : (P, terms) arrays
     """
-    einf = np.atleast_1d(np.asarray(equilibrium_pa, float))
-    moduli, times = (np.ascontiguousarray(np.atleast_2d(v), float) for v in (moduli_pa, times_s))
-    time = np.ascontiguousarray(time_s, float)
-    depth = np.ascontiguousarray(np.broadcast_to(depth_m, (einf.size, time.size)), float)
+    einf = np.atleast_1d(_own(equilibrium_pa))
+    moduli, times = (np.atleast_2d(_own(v)) for v in (moduli_pa, times_s))
+    time = _own(time_s)
+    depth = _own(np.broadcast_to(depth_m, (einf.size, time.size)))
     force, delta = np.zeros_like(depth), np.zeros_like(depth)
     k = ball.stiffness_n_per_m
     bending = 1 / k if np.isfinite(k) else 0.0
     _press(ball.factor, bending, time, depth, turn, einf, moduli, times, force, delta)
     return Course(force, delta)
+
+
+def _own(values: ArrayLike) -> FloatArray:
+    """A copy: views and arrays that are read-only would each be a kernel more to compile."""
+    return np.array(values, float, order="C")
+
+
+@cache
+def compiled() -> int:
+    """How many kernels were not in the cache and had to be compiled: some five seconds, once."""
+    nodes = np.arange(3.0)
+    course_of(BallTip(1.0), nodes, nodes, 2, [1.0], [[1.0]], [[1.0]])
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in (_pressed, _press))
 
 
 @njit(cache=True)
