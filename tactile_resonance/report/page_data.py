@@ -22,6 +22,7 @@ from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface
 
 if TYPE_CHECKING:
     from tactile_resonance.report.boundary import RunBoundary
+    from tactile_resonance.scan.tissue_tests import TissueTest
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -30,6 +31,7 @@ LOW, HIGH = ("#{:02x}{:02x}{:02x}".format(*rgb) for rgb in (LOW_RGB, HIGH_RGB))
 """Colours of the lowest and the highest value, those of rviz and `pole_map.png`."""
 _DIGITS = 6  # of arrays; results of points keep all
 _MODEL_POINTS = 120
+_MOST_MEANS = 160  # of a mechanical test
 _ACROSS_HALF_WIDTHS = 6.0  # about a pole, in which half of the model's points lie
 
 
@@ -269,6 +271,21 @@ def model_response(
     return modes(at_hz) + real + 1j * imaginary
 
 
+def mechanics_entry(one: TissueTest) -> dict[str, Any]:
+    """A mechanical test as `mechanics --json` writes it, with its curve: means of the force, model, depth."""
+    entry, fit = one.as_json(), one.fit
+    if fit is None:
+        return {**entry, "curve": None}
+    kept = _evenly(np.arange(fit.time_s.size), _MOST_MEANS)
+    curve = {
+        "t_s": listed(fit.time_s[kept]),
+        "measured_mn": listed(MN * fit.measured_n[kept]),
+        "model_mn": listed(MN * fit.force_n[kept]),
+        "depth_mm": listed(MM * fit.indentation_m[kept]),
+    }
+    return {**entry, "curve": curve}
+
+
 def map_entry(surface: MapSurface | None, boundary: RunBoundary | None) -> dict[str, Any]:
     """What lies between the points: kriged natural frequency, and a boundary."""
     entry: dict[str, Any] = {"surface": None, "boundary": None}
@@ -321,6 +338,10 @@ def page_data(
     notes = ["Hover or click a point of a map, or a row of a table."]
     if detailed < measured:
         notes.append(f"FRFs and forces of {detailed} of {measured} points are in this page.")
+    tested = sum(run["tested"] for run in runs)
+    tests_shown = sum(bool(each["tests"]) for run in runs for each in run["details"].values())
+    if tests_shown < tested:
+        notes.append(f"Mechanical tests of {tests_shown} of {tested} points are in this page.")
     if lines:
         notes.append(
             f"Of the lines of an FRF those of the bands and some others are shown: {lines[0]}."

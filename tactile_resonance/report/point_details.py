@@ -4,24 +4,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.report.page_data import MN, frf_entry, listed, pole_entry, poles_entries
+from tactile_resonance.report.page_data import (
+    MN,
+    frf_entry,
+    listed,
+    mechanics_entry,
+    pole_entry,
+    poles_entries,
+)
 from tactile_resonance.scan.bench_truth import PointTruth, truth_of_point, truths_of
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
+from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import EXCITATION
 from tactile_resonance.scan.run_content import RunContent, file_of
+
+if TYPE_CHECKING:
+    from tactile_resonance.scan.tissue_tests import TissueTest
 
 FRF_TYPE = "tactile_resonance/msg/FRF"
 STATE_TYPE = "tactile_resonance/msg/ContactState"
 MOST_DETAILED = 400
 """Points of a run whose FRFs are in a page."""
+MOST_TESTED = 100
+"""Points of a run whose mechanical tests are in a page: each is fitted for it."""
 _LINES_OF_A_PAGE = 60_000  # of all FRFs together
 _LINES_OF_A_POINT = 600
 _MOST_FORCES = 400  # of a point: 16 s of the topic
@@ -41,6 +54,8 @@ class PointDetails:
         Times [s] after the first, and forces [N], while it was measured.
     truth : PointTruth or None
         What the simulated bench knew.
+    tests : tuple of TissueTest
+        Mechanical ones, with their fits.
     problem : str
         Why the file was not read, as where an earlier version recorded it; empty: it was.
     """
@@ -49,6 +64,7 @@ class PointDetails:
     poles: Poles | None = None
     force: tuple[tuple[float, float], ...] = ()
     truth: PointTruth | None = None
+    tests: tuple[TissueTest, ...] = ()
     problem: str = ""
 
     def entry(self, most_lines: int) -> dict[str, Any]:
@@ -58,6 +74,7 @@ class PointDetails:
             "poles": [] if self.poles is None else poles_entries(self.poles),
             "force": force_entry(self.force),
             "truth": None if self.truth is None else truth_entry(self.truth),
+            "tests": [mechanics_entry(one) for one in self.tests],
         }
 
 
@@ -75,10 +92,14 @@ def truth_entry(truth: PointTruth) -> dict[str, Any]:
 
 def detailed(results: Sequence[PointResult], most: int = MOST_DETAILED) -> list[PointResult]:
     """Points that were measured, at most so many of them, spread evenly over the run."""
-    measured = [r for r in results if r.outcome is PointOutcome.DONE and r.measurement_id]
-    if len(measured) <= most:
-        return measured
-    return [measured[k] for k in np.linspace(0, len(measured) - 1, most).round().astype(int)]
+    done = (r for r in results if r.outcome is PointOutcome.DONE and r.measurement_id)
+    return _spread(list(done), most)
+
+
+def _spread(results: Sequence[PointResult], most: int) -> list[PointResult]:
+    if len(results) <= most:
+        return list(results)
+    return [results[k] for k in np.linspace(0, len(results) - 1, most).round().astype(int)]
 
 
 def lines_each(points: int) -> int:
@@ -87,11 +108,20 @@ def lines_each(points: int) -> int:
 
 
 def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDetails]:
-    """By point, of those that are `detailed`; a file that cannot be read has its problem instead."""
-    found = {}
-    for result in detailed(run.latest, most):
+    """By point, of those that are `detailed` or tested; a file that cannot be read has its problem instead."""
+    counts, found = run.messages_at(TEST_TYPE), {}
+    tested = _spread([r for r in run.latest if r.index in counts], min(most, MOST_TESTED))
+    with_tests = {result.index for result in tested}
+    wanted = with_tests.union(result.index for result in detailed(run.latest, most))
+    for result in (r for r in run.latest if r.index in wanted):
         try:
             found[result.index] = read_details(run, result)
+            if result.index in with_tests:
+                # only here: what is compiled for the fits takes a second to load
+                from tactile_resonance.scan.tissue_tests import fits_at
+
+                tests = fits_at(run, result)
+                found[result.index] = replace(found[result.index], tests=tests)
         except ValueError as error:
             found[result.index] = PointDetails(problem=str(error))
     return found

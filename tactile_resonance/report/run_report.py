@@ -25,6 +25,7 @@ from tactile_resonance.report.run_tables import Truths
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.point_times import budget_sentence
 from tactile_resonance.scan.pole_map import PoleMap
+from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import NOT_CHECKED, RECORDING, RunContent
@@ -142,6 +143,7 @@ def run_entry(
     return {
         "name": name,
         "simulated": any(result.simulated for result in run.latest),
+        "tested": len(run.messages_at(TEST_TYPE)),
         "force_mn": None if scene is None else 1e3 * scene.force_n,
         "bands": [
             {
@@ -185,6 +187,7 @@ def warnings_of(
     off: list[PointResult] = []
     if scene is not None:
         off = [r for r in measured if _force_is_off(r, scene.force_n)]
+    not_tested = _not_tested(run, scene, details or {})
     for what, points, why in (
         ("failed", [r for r in results if r.outcome is PointOutcome.FAILED], lambda r: r.reason),
         (
@@ -194,6 +197,11 @@ def warnings_of(
         ),
         ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
         ("force not quiet at first", [r for r in measured if r.gate], lambda r: r.gate),
+        (
+            "mechanical test failed",
+            [r for r in results if r.index in not_tested],
+            lambda r: not_tested[r.index],
+        ),
         (
             "tissue unknown",
             [r for r in measured if r.tissue_class == UNKNOWN],
@@ -215,6 +223,24 @@ def warnings_of(
 
 def _health(run: RunContent, scene: ScanScene | None) -> tuple[SensorHealth, str]:
     return sensor_health(run, scene.drift_limits if scene else DriftLimits())
+
+
+def _not_tested(
+    run: RunContent, scene: ScanScene | None, details: Mapping[int, PointDetails]
+) -> dict[int, str]:
+    """Why mechanical tests failed, by point: they were not carried out, or could not be fitted."""
+    counts, why = run.messages_at(TEST_TYPE), {}
+    for result in run.latest:
+        asked = () if scene is None else scene.protocols
+        wanted = sum(each.concerns(result.index) for each in asked)
+        reasons = []
+        if result.outcome is PointOutcome.DONE and counts.get(result.index, 0) < wanted:
+            reasons.append(result.reason or "no record")
+        tests = details[result.index].tests if result.index in details else ()
+        reasons += [f"{t.test.protocol.value}: {t.reason}" for t in tests if t.fit is None]
+        if reasons:
+            why[result.index] = "; ".join(reasons)
+    return why
 
 
 def _force_is_off(result: PointResult, force_n: float) -> bool:

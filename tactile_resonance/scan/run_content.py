@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -75,6 +76,14 @@ class RunContent:
         """Finished files, in the order in which they were recorded."""
         files = sorted(self.files, key=lambda file: (file.start_ns, file.name))
         return [self.path / RECORDING / file.name for file in files]
+
+    def messages_at(self, type_name: str) -> dict[int, int]:
+        """How many messages of a type the latest attempt at a point holds, by index; none: left out."""
+        counts = Counter[str]()
+        for file in self.files:
+            counts[file.name] += sum(t.count for t in file.topics if t.type_name == type_name)
+        names = {result.index: file_of(self.path, result).name for result in self.latest}
+        return {index: counts[name] for index, name in names.items() if counts[name]}
 
     def with_file(self, file: FileContent, result: PointResult | None) -> RunContent:
         """The same with one finished file more."""

@@ -126,11 +126,9 @@ def fits_at(run: RunContent, result: PointResult, **options: Any) -> tuple[Tissu
 
 def fits_of(run: RunContent, **options: Any) -> Iterator[TissueTest]:
     """Tests of the latest attempt at each point that has some, as the index of the run tells."""
-    tested = {
-        file.name for file in run.files if any(topic.type_name == TYPE for topic in file.topics)
-    }
+    tested = run.messages_at(TYPE)
     for result in run.latest:
-        if file_of(run.path, result).name in tested:
+        if result.index in tested:
             yield from fits_at(run, result, **options)
 
 

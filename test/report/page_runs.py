@@ -2,6 +2,7 @@
 """Runs on the simulated bench whose files hold what nodes record: FRF, poles, truth, force, result."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ import tactile_resonance as tr
 from tactile_resonance.configuration import share_path
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.result import STATUSES, Poles, PolesStatus
-from tactile_resonance.recording.messages import POLES_STATUS
+from tactile_resonance.recording.messages import POLES_STATUS, write_indentation
 from tactile_resonance.report.point_details import FRF_TYPE, STATE_TYPE
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
+from tactile_resonance.scan.protocols import TYPE as INDENTATION_TYPE
 from tactile_resonance.scan.recorded import EXCITATION
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
@@ -43,8 +45,11 @@ def quoted(text):
     return '"' + text.replace('"', '\\"').replace("\u2028", "\\u2028") + '"'
 
 
-def scan(scene_path, folder, failed=(), most=None):
-    """Measure the points of a scene, all but those that fail; returns the FRFs and poles by point."""
+def scan(scene_path, folder, failed=(), most=None, tests=None, reasons=None):
+    """Measure the points of a scene, all but those that fail; returns the FRFs and poles by point.
+
+    Of some points mechanical tests, by index, and reasons why others were not carried out.
+    """
     scene, phantoms = read_scan_scene(scene_path), read_scene(read_tissues(), scene_path)
     design, bench, known = make_plan(scene).measurement, SimulatedBench.from_configuration(), {}
     with begin(scene_path, folder) as run:
@@ -58,7 +63,11 @@ def scan(scene_path, folder, failed=(), most=None):
                     continue
                 result = measure(scene, phantoms, design, bench, point, recording.attempt)
                 known[point.index] = record(recording, result, phantoms, bench, design)
-                recording.finish(result)
+                for test in (tests or {}).get(point.index, ()):
+                    message = make_message(INDENTATION_TYPE)
+                    write_indentation(message, test)
+                    recording.write("/left/indentation", INDENTATION_TYPE, result.time_ns, to_cdr(message))
+                recording.finish(replace(result, reason=(reasons or {}).get(point.index, "")))
     return known
 
 

@@ -15,14 +15,19 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
+from tactile_resonance.mechanics.indentation import Protocol
+from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report import point_details
 from tactile_resonance.report.page_data import as_json, model_response, s_plane
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
 from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.tissue_tests import fits_at
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "mechanics"))
+from made_indentations import relaxation
 from page_runs import BAND_HZ, HOSTILE, scan, write_scene
 
 from browser import browser
@@ -318,3 +323,96 @@ def test_a_page_of_nothing_and_of_failures_alone_opens(tmp_path):
 def test_the_page_of_a_usual_run_is_small(hostile):
     folder, _ = hostile
     assert (folder / "report.html").stat().st_size < 8 * MB
+
+
+REFUSED = f"relaxation: contact: refused {HOSTILE}"
+
+
+@pytest.fixture(scope="module")
+def tested(tmp_path_factory):
+    """Four points: two tests, one that was refused, one that cannot be fitted, none; the page is written."""
+    folder = tmp_path_factory.mktemp("tested")
+    scene = write_scene(folder / "scene.yaml", tissue=HOSTILE)
+    asked = "{kind: relaxation, hold_s: 8, points: [1, 2, 3]}, {kind: creep, hold_s: 8, points: [1]}"
+    scene.write_text(scene.read_text() + f"\nprotocols: [{asked}]\n")
+    rng = np.random.default_rng(5)
+    good = relaxation(Prony(3e3, np.array([2e3]), np.array([1.5])), rng, hold_s=8.0, noise_n=5e-5)
+    slow = Prony(3e3, np.array([2e3, 2e3]), np.array([0.8, 60.0]))
+    other = replace(relaxation(slow, rng, hold_s=8.0, noise_n=5e-5), protocol=Protocol.CREEP)
+    begun = good.time_s > 1.0  # in contact
+    cut = {name: getattr(good, name)[begun] for name in ("time_s", "force_n", "depth_m")}
+    tests = {0: (good, other), 2: (replace(good, **cut),)}
+    scan(scene, folder / "run", most=4, tests=tests, reasons={1: REFUSED})
+    assert main(["report", str(folder / "run")]) == 0
+    return folder / "run"
+
+
+def test_the_page_holds_the_fits_of_mechanical_tests(tested):
+    run = read_run(tested)
+    (entry,) = data_of(tested)["runs"]
+    assert entry["tested"] == 2
+    assert [len(entry["details"][str(k)]["tests"]) for k in range(4)] == [2, 0, 1, 0]
+    found = fits_at(run, run.latest[0])
+    assert [one.test.protocol for one in found] == [Protocol.RELAXATION, Protocol.CREEP]
+    for shown, one in zip(entry["details"]["0"]["tests"], found, strict=True):
+        curve = shown.pop("curve")
+        assert shown == json.loads(json.dumps(one.as_json()))  # to the last digit
+        kept = np.searchsorted(one.fit.time_s, np.array(curve["t_s"]) - 1e-4)
+        assert 50 < kept.size <= 160
+        assert (kept[0], kept[-1]) == (0, one.fit.time_s.size - 1)
+        for name, values in (
+            ("t_s", one.fit.time_s),
+            ("measured_mn", 1e3 * one.fit.measured_n),
+            ("model_mn", 1e3 * one.fit.force_n),
+            ("depth_mm", 1e3 * one.fit.indentation_m),
+        ):
+            np.testing.assert_allclose(curve[name], values[kept], rtol=2e-5, atol=1e-9)
+    # the hold of 8 s shows a term of 1.5 s, and not one of 60 s
+    knowns = [[t["known"] for t in test["terms"]] for test in entry["details"]["0"]["tests"]]
+    assert knowns[0] == ["determined"]
+    assert "not determined: slower than the hold" in knowns[1]
+    (unfitted,) = entry["details"]["2"]["tests"]
+    assert unfitted["curve"] is None
+    assert "a record that begins before the touch" in unfitted["reason"]
+
+
+def test_mechanical_tests_that_failed_are_a_warning(tested, hostile):
+    run = read_run(tested)
+    (line,) = [w for w in warnings_of(run, None, point_details.details_of(run)) if "mechanical" in w]
+    wanted = f"mechanical test failed, 2 of 4 points: 2 ({REFUSED}), 3 (relaxation: depth_m: got "
+    assert line.startswith(wanted)
+    assert not [w for w in warnings_of(read_run(hostile[0])) if "mechanical" in w]
+
+
+def test_many_mechanical_tests_are_thinned_out_and_the_page_says_so(tested, monkeypatch):
+    monkeypatch.setattr(point_details, "MOST_TESTED", 1)
+    run = read_run(tested)
+    details = point_details.details_of(run)
+    assert [index for index, each in details.items() if each.tests] == [0]
+    assert set(details) == {0, 1, 2, 3}
+    data = json.loads(Page(as_page(run, [], [], details, {})).scripts["data"])
+    assert "Mechanical tests of 1 of 2 points are in this page." in data["note"]
+
+
+def test_a_click_shows_mechanical_tests_where_a_run_has_some(tested, hostile):
+    drawn = "document.querySelectorAll('.js-plotly-plot').length"
+    text = "document.querySelector('.two > :last-child').innerText"
+    with browser() as page:
+        address = (tested / "report.html").as_uri()
+        page.show(f"{address}#point=1", "document.querySelectorAll('.two h3').length === 2")
+        shown = page.value(text)
+        assert "mechanical tests: means of the force" in shown
+        run = read_run(tested)
+        for one in fits_at(run, run.latest[0]):
+            value, std = one.fit.modulus(1.0)
+            assert f"{value:.0f} Pa" in shown
+            assert f"± {100 * std:#.2g} %" in shown
+        assert "not determined: slower than the hold" in shown
+        for point, wanted in ((3, "not fitted: depth_m"), (4, "no mechanical test of this point")):
+            page.value(f"document.querySelector('tr[data-point=\"{point - 1}\"]').click()")
+            page.wait(f"document.querySelector('h2').textContent === 'point {point}'")
+            assert wanted in page.value(text)
+        assert page.value("document.querySelectorAll('script').length") == 3
+        page.show((hostile[0] / "report.html").as_uri(), f"{drawn} === 7")
+        assert "mechanical" not in page.value("document.body.innerText")
+        assert page.console == []

@@ -171,7 +171,8 @@
   // ---- details: each panel draws what it finds in the entries [{run, point, detail}]
 
   const PANELS = [drawFrf, drawPlane, drawForce];
-  let heading, facts, panels;
+  const TESTED = [drawTests, listTests]; // only where a run has mechanical tests
+  let heading, facts, panels; // panels: {show, place}
 
   // one run: its maps and the facts on the left, what a point holds on the right; several: maps side by side above
   function addPanels(parent) {
@@ -183,7 +184,8 @@
     page.runs.forEach((run) => run.bands.forEach((_, band) => addMap(above || left, run, band)));
     heading = make(left, "h2");
     facts = make(left, "div", "facts");
-    panels = PANELS.map(() => make(right, "div", "plot"));
+    const shown = [...PANELS, ...(page.runs.some((run) => run.tested) ? TESTED : [])];
+    panels = shown.map((show) => ({ show, place: make(right, "div", show === listTests ? "facts" : "plot") }));
     drawMaps();
   }
 
@@ -200,7 +202,7 @@
     entries.forEach(({ run, point, detail }) => ((detail && detail.poles) || []).forEach((pole) => {
       if (pole.message && !point.reason.includes(pole.message)) make(facts, "p", "note", `${nameOf(run, point)}, ${pole.band_hz.join(" to ")} Hz: ${pole.message}`);
     }));
-    PANELS.forEach((panel, k) => panel(panels[k], entries));
+    panels.forEach(({ show, place }) => show(place, entries));
   }
 
   const nothing = (place, title, why) => draw(place, [], { title, xaxis: { visible: false }, yaxis: { visible: false },
@@ -297,6 +299,57 @@
       return [...lines, { ...wide, y0: point.force_mn - half, y1: point.force_mn + half, fillcolor: colour, opacity: 0.15 }];
     });
     draw(place, traces, { title, shapes, xaxis: axis("time [s]"), yaxis: axis("force [mN]"), showlegend: there.length > 1 });
+  }
+
+  const testsOf = (entries) => entries.flatMap(({ run, point, detail }) => ((detail && detail.tests) || []).map((test) => ({
+    test, name: (entries.length > 1 ? `${nameOf(run, point)}, ` : "") + test.protocol })));
+
+  function drawTests(place, entries) {
+    const all = testsOf(entries), fitted = all.filter(({ test }) => test.curve);
+    const title = "mechanical tests: means of the force and the fit; depth" + (all.some(({ test }) => test.simulated) ? " (simulated)" : "");
+    if (!fitted.length) return nothing(place, title, all.length ? "could not be fitted" : "no mechanical test of this point in the page");
+    const traces = fitted.flatMap(({ test, name }, n) => {
+      const curve = test.curve, colour = COLOURS[n % COLOURS.length], common = { type: "scatter", x: curve.t_s, legendgroup: `${n}` };
+      return [
+        { ...common, mode: "markers", y: curve.measured_mn, name: plain(name), marker: { size: 4, color: colour } },
+        { ...common, mode: "lines", y: curve.model_mn, name: "fit", showlegend: n === 0, hoverinfo: "skip", line: { color: "black", width: 1 } },
+        { ...common, mode: "lines", y: curve.depth_mm, yaxis: "y2", name: plain(name), showlegend: false, line: { color: colour, width: 1 } },
+      ];
+    });
+    // most of a relaxation is soon over; of unloading the end matters
+    const scale = fitted.some(({ test }) => test.protocol === "indentation") ? "linear" : "log";
+    return draw(place, traces, { title, xaxis: axis("time from the touch [s]", { anchor: "y2", type: scale }),
+      yaxis: axis("force [mN]", { domain: [0.36, 1] }), yaxis2: axis("depth [mm]", { domain: [0, 0.28] }) });
+  }
+
+  // [constant, value, relative deviation] of a fit; what the record does not determine says so
+  function constantsOf(test) {
+    const percent = (std) => `± ${(100 * std).toPrecision(2)} %`;
+    const pascal = (value) => `${value.toFixed(0)} Pa`;
+    const found = Object.entries(test.modulus_pa).filter(([, [value]]) => value !== null).sort((a, b) => a[0] - b[0])
+      .map(([at, [value, std]]) => [`E(${at} s)`, pascal(value), percent(std)]);
+    const [value, std, known] = test.equilibrium_pa;
+    found.push(known === "determined" ? ["Einf", pascal(value), percent(std)] : ["Einf", known, ""]);
+    test.terms.forEach((term, k) => {
+      if (term.known !== "determined") return found.push([`E${k + 1}, tau${k + 1}`, `${term.known} (about ${term.time_s.toPrecision(2)} s)`, ""]);
+      return found.push([`E${k + 1}`, pascal(term.modulus_pa), percent(term.modulus_std)], [`tau${k + 1}`, `${term.time_s.toPrecision(3)} s`, percent(term.time_std)]);
+    });
+    return found;
+  }
+
+  function listTests(place, entries) {
+    place.replaceChildren();
+    testsOf(entries).forEach(({ test, name }) => {
+      if (!test.curve) return make(place, "p", "note", `${name}: not fitted: ${test.reason}`);
+      make(place, "h3", "", `${name}: peak ${(1e3 * test.peak_force_n).toFixed(1)} mN, ramp ${test.ramp_s.toFixed(2)} s, ` +
+        `hold ${test.hold_s.toFixed(1)} s` + (test.protocol === "relaxation" ? `, ${(100 * test.relaxed_share).toFixed(0)} % lost` : ""));
+      const table = make(place, "table");
+      constantsOf(test).forEach((cells) => {
+        const row = make(table, "tr");
+        cells.forEach((cell) => make(row, "td", "text", cell));
+      });
+      return make(place, "p", "note", test.status.length ? test.status.join("; ") : "status: nothing limits the result");
+    });
   }
 
   // ---- the whole page
