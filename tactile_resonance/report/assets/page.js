@@ -317,8 +317,8 @@
       ];
     });
     // most of a relaxation is soon over; of unloading the end matters
-    const scale = fitted.some(({ test }) => test.protocol === "indentation") ? "linear" : "log";
-    return draw(place, traces, { title, xaxis: axis("time from the touch [s]", { anchor: "y2", type: scale }),
+    const scale = fitted.some(({ test }) => test.protocol === "indentation") ? {} : { type: "log", dtick: 1 };
+    return draw(place, traces, { title, xaxis: axis("time from the touch [s]", { anchor: "y2", ...scale }),
       yaxis: axis("force [mN]", { domain: [0.36, 1] }), yaxis2: axis("depth [mm]", { domain: [0, 0.28] }) });
   }
 
@@ -348,7 +348,7 @@
         const row = make(table, "tr");
         cells.forEach((cell) => make(row, "td", "text", cell));
       });
-      return make(place, "p", "note", test.status.length ? test.status.join("; ") : "status: nothing limits the result");
+      return make(place, "p", "note", `status: ${test.status.join("; ") || "no remark"}`);
     });
   }
 
