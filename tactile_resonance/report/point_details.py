@@ -123,7 +123,9 @@ def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDet
                 tests = fits_at(run, result)
                 found[result.index] = replace(found[result.index], tests=tests)
         except ValueError as error:
-            found[result.index] = PointDetails(problem=str(error))
+            found[result.index] = replace(
+                found.get(result.index, PointDetails()), problem=str(error)
+            )
     return found
 
 

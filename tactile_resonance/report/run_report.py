@@ -173,7 +173,9 @@ def warnings_of(
         told.append(NOT_CHECKED.format(run.unchecked))
     unread = [each.problem for each in (details or {}).values() if each.problem]
     if unread:
-        told.append(f"FRF and force of {len(unread)} points cannot be read: {unread[0]}")
+        told.append(
+            f"FRF, force or mechanical tests of {len(unread)} points cannot be read: {unread[0]}"
+        )
     if scene is None:
         told.append("scene.yaml cannot be read: plan and outcome cannot be compared")
     if len(results) < len(run.points):

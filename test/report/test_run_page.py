@@ -21,6 +21,7 @@ from tactile_resonance.report import point_details
 from tactile_resonance.report.page_data import as_json, model_response, s_plane
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
 from tactile_resonance.report.run_report import as_page, warnings_of
+from tactile_resonance.scan import tissue_tests
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.tissue_tests import fits_at
@@ -222,7 +223,8 @@ def test_a_file_of_a_version_that_cannot_be_read_costs_its_details_alone(hostile
     monkeypatch.setattr(point_details, "read_messages_of_type", refuse)
     details = point_details.details_of(run)
     told = warnings_of(run, None, details)
-    wanted = f"FRF and force of {len(details)} points cannot be read: point-00000-00.mcap: recorded"
+    problem = "cannot be read: point-00000-00.mcap: recorded"
+    wanted = f"FRF, force or mechanical tests of {len(details)} points {problem}"
     assert wanted in " ".join(told)
     data = as_page(run, [], [], details, {})
     (entry,) = json.loads(Page(data).scripts["data"])["runs"]
@@ -382,6 +384,21 @@ def test_mechanical_tests_that_failed_are_a_warning(tested, hostile):
     wanted = f"mechanical test failed, 2 of 4 points: 2 ({REFUSED}), 3 (relaxation: depth_m: got "
     assert line.startswith(wanted)
     assert not [w for w in warnings_of(read_run(hostile[0])) if "mechanical" in w]
+
+
+def test_a_test_that_cannot_be_read_costs_itself_alone(tested, monkeypatch):
+    why = "depth_m: got -1.0; accepted is a largest one above 0"
+
+    def refuse(message, label):
+        raise ValueError(why)
+
+    monkeypatch.setattr(tissue_tests, "indentation_from_message", refuse)
+    run = read_run(tested)
+    details = point_details.details_of(run)
+    assert [details[k].tests for k in (0, 2)] == [(), ()]
+    assert details[0].frf is not None
+    (line,) = [w for w in warnings_of(run, None, details) if "cannot be read" in w]
+    assert line == f"FRF, force or mechanical tests of 2 points cannot be read: {why}"
 
 
 def test_many_mechanical_tests_are_thinned_out_and_the_page_says_so(tested, monkeypatch):
