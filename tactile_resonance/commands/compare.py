@@ -69,31 +69,34 @@ def run(options: argparse.Namespace) -> int:
     """Compare, group, write both files."""
     import numpy as np
 
-    from tactile_resonance.commands.references import print_left_out
-    from tactile_resonance.front import read_run
+    from tactile_resonance.commands.references import print_left_out, read_runs
+    from tactile_resonance.fields import require
     from tactile_resonance.report.compare_figure import draw_comparison
     from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.scan.labels import nominal_of, read_nominal, referred
+    from tactile_resonance.scan.labels import nominal_of, read_nominal, referred, run_names
     from tactile_resonance.scan.point_result import PointKind
     from tactile_resonance.tissue.clusters import find_clusters
     from tactile_resonance.tissue.differences import differences_from_rest, pairs_that_differ
     from tactile_resonance.tissue.references import read_classes, read_sources
     from tactile_resonance.tissue.spread import within_preparation
 
-    runs = [read_run(path) for path in options.runs]
+    good = all(0 <= each < np.inf for each in options.spread or ())
+    require(good, "--spread", options.spread, "two finite numbers, 0 or above")
+    runs = read_runs(options.runs)
+    names = run_names(runs)
     if options.nominal:
         nominal: NominalContact | None = read_nominal(options.nominal)
     else:
         nominal = read_classes(options.library)[1] if options.library else nominal_of(runs)
     kept, rows, left_out = [], [], Counter[str]()
-    for content in runs:
+    for name, content in zip(names, runs, strict=True):
         for result in content.latest:
             if result.kind is PointKind.TISSUE:
                 at = referred(result, nominal)
                 if isinstance(at, str):
                     left_out[at] += 1
                 else:
-                    kept.append((content.path.resolve().name, result))
+                    kept.append((name, result))
                     rows.append(at)
     if not rows:
         raise ValueError(f"points: {dict(left_out)}, expected one with poles or more")

@@ -114,7 +114,7 @@ def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.trial import leave_out, reliability
 
     _check_level(options.unknown_level)
-    runs = _read_runs(options.runs)
+    runs = read_runs(options.runs)
     nominal = read_nominal(options.nominal) if options.nominal else nominal_of(runs)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     spreads = spreads_of(points, options.pool)
@@ -170,7 +170,7 @@ def _check(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.trial import call_points, reliability
 
     _check_level(options.unknown_level)
-    runs = _read_runs(options.runs)
+    runs = read_runs(options.runs)
     classes, nominal = read_classes(options.library)
     if options.nominal:
         nominal = read_nominal(options.nominal)
@@ -194,7 +194,7 @@ def _variance(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.labels import labelled_frfs
     from tactile_resonance.scan.reidentify import scene_band
 
-    runs = _read_runs(options.runs)
+    runs = read_runs(options.runs)
     band_hz = scene_band(options.runs[0]).ends_hz
     g, lines_hz, groups, left_out = labelled_frfs(runs, _labels(options.labels, runs))
     inside = (lines_hz >= band_hz[0]) & (lines_hz <= band_hz[1])
@@ -220,7 +220,8 @@ def _check_level(level: float) -> None:
     require(0 < level < 1, "--unknown-level", level, "a number above 0, below 1")
 
 
-def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
+def read_runs(paths: Sequence[Path]) -> list[RunContent]:
+    """Runs, of which what is damaged is printed."""
     from tactile_resonance.front import read_run
 
     runs = [read_run(path) for path in paths]

@@ -52,7 +52,7 @@ def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
     Raises
     ------
     ValueError
-        If a column is unknown, a tissue or a run is missing, or two rows are of one point.
+        If a column is unknown or there twice, a tissue, run or point is missing, or two rows are of one point.
     """
     try:
         reader = csv.DictReader(io.StringIO(read_text(path)), skipinitialspace=True)
@@ -62,7 +62,9 @@ def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
     for name in columns:
         require(name in _COLUMNS, f"{path.name}: column", name, f"one of {', '.join(_COLUMNS)}")
     require("tissue" in columns, f"{path.name}: columns", columns, "tissue among them")
-    names = [run.path.resolve().name for run in runs]
+    require(len(set(columns)) == len(columns), f"{path.name}: columns", columns, "each once")
+    names = run_names(runs)
+    indexes = {name: {p.index for p in r.points} for name, r in zip(names, runs, strict=True)}
     labels: dict[tuple[str, int | None], Label] = {}
     for number, row in enumerate(rows, start=2):
         where = f"{path.name}, line {number}: "
@@ -75,15 +77,32 @@ def read_labels(path: Path, runs: Sequence[RunContent]) -> LabelOf:
         require(not index or index.isdecimal(), f"{where}index", index, "that of results.csv")
         tissue = values["tissue"]
         require(bool(tissue) and tissue != UNKNOWN, f"{where}tissue", tissue, "a name")
-        key = values["run"], int(index) if index else None
-        require(key not in labels, f"{where}index", index, "one row for each point")
-        labels[key] = Label(tissue, values["preparation"], values["position"])
+        for key in ("tissue", "preparation", "position"):
+            require(values[key].isprintable(), f"{where}{key}", values[key], "text of one line")
+        point = values["run"], int(index) if index else None
+        known = point[1] is None or point[1] in indexes[values["run"]]
+        require(known, f"{where}index", index, f"that of a point of {values['run']}")
+        require(point not in labels, f"{where}index", index, "one row for each point")
+        labels[point] = Label(tissue, values["preparation"], values["position"])
 
     def of(run: RunContent, result: PointResult) -> Label | None:
         name = run.path.resolve().name
         return labels.get((name, result.index)) or labels.get((name, None))
 
     return of
+
+
+def run_names(runs: Sequence[RunContent]) -> list[str]:
+    """Names of the runs' folders, by which labels and tables name them.
+
+    Raises
+    ------
+    ValueError
+        If two are alike.
+    """
+    names = [run.path.resolve().name for run in runs]
+    require(len(set(names)) == len(names), "runs", names, "folders of different names")
+    return names
 
 
 def read_nominal(path: Path) -> NominalContact:
@@ -126,8 +145,7 @@ def reference_points(
     ValueError
         If two runs have one name, or no point is left.
     """
-    names = [run.path.resolve().name for run in runs]
-    require(len(set(names)) == len(names), "runs", names, "folders of different names")
+    names = run_names(runs)
     rows, left_out = [], Counter[str]()
     for run, name in zip(runs, names, strict=True):
         for result in run.latest:
@@ -179,12 +197,11 @@ def labelled_frfs(
     Raises
     ------
     ValueError
-        If no point is left.
+        If two runs have one name, or no point is left.
     """
     g, groups, left_out = [], [], Counter[str]()
     frequency_hz: np.ndarray = np.empty(0)
-    for run in runs:
-        name = run.path.resolve().name
+    for run, name in zip(runs, run_names(runs), strict=True):
         for result in run.latest:
             label = label_of(run, result)
             if label is None or result.kind is not PointKind.TISSUE:

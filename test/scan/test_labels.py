@@ -235,6 +235,10 @@ def test_labels_of_points_places_and_what_is_left_out(tmp_path):
         ('tissue\n"' + "x" * 200_000, "labels.csv: cannot be read as CSV: field larger"),
         ("index,tissue\n0,unknown\n", "line 2: tissue: got 'unknown'"),
         ("index,tissue\n0,gel\n0,gel\n", "line 3: index: got '0'; accepted is one row"),
+        ("index,tissue\n,gel\n2,fat\n", "line 3: index: got '2'; accepted is that of a point of one"),
+        ("tissue,tissue\ngel,fat\n", "columns: got .'tissue', 'tissue'.; accepted is each once"),
+        ('tissue\n"gel\nfat"\n', "line 2: tissue: got 'gel.nfat'; accepted is text of one line"),
+        ("tissue,position\ngel,a\0b\n", "line 2: position: got .*; accepted is text of one line"),
     ],
 )
 def test_wrong_labels_are_refused(tmp_path, text, message):
@@ -262,7 +266,18 @@ def test_refusals(tmp_path, capsys):
         reference_points(contents, lambda run, result: None, None)
     with pytest.raises(ValueError, match="nothing was measured.*one labelled point of two blocks"):
         labelled_frfs(contents, label_of)
+    with pytest.raises(ValueError, match="runs: .*folders of different names"):
+        labelled_frfs([contents[0], contents[0]], label_of)
+    compare = ["compare", run, "--output", tmp_path / "x"]
+    assert "runs: got ['one', 'one']" in called(["compare", run, *compare[1:]], capsys, status=1)
+    message = called([*compare, "--spread", "-1", "1e-3"], capsys, status=1)
+    assert "--spread: got [-1.0, 0.001]; accepted is two finite numbers" in message
+    assert not list(tmp_path.glob("x.*"))
     arguments = ["references", "build", run, "--labels", "scene", "--output", tmp_path / "x.yaml"]
+    damaged = next((other / "recording").glob("point-00001*"))
+    damaged.write_bytes(damaged.read_bytes()[:50])
+    printed = called(["compare", other, "--output", tmp_path / "y"], capsys)
+    assert "two: damaged: " in printed
     empty = tmp_path / "empty.yaml"
     empty.write_text("name: x\n")
     message = called([*arguments, "--nominal", empty], capsys, status=1)
