@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, fit, print, write."""
+    from tactile_resonance.mechanics.fit import check_options
+
+    check_options(options.terms, options.thickness_m)  # before a run's mechanics.csv is written anew
     tests = [one for path in options.paths for one in _tests(path, options)]
     if not tests:
         raise ValueError(
@@ -96,6 +100,8 @@ def _tests(path: Path, options: argparse.Namespace) -> Iterator[TissueTest]:
     tests = list(fits_of(content, most_terms=terms, thickness_m=thickness_m))
     if tests:
         write_fits(content.path, tests)
+    else:
+        print(f"{path}: no mechanical test")
     yield from tests
 
 
@@ -116,6 +122,8 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     missing = [name for name in COLUMNS if name not in arrays]
     if missing:
         raise ValueError(f"{path.name}: no {', '.join(missing)} among {', '.join(names)}")
+    for name in COLUMNS:
+        require(arrays[name].dtype.kind != "c", f"{path.name}: {name}", "complex numbers", "real ones")
     stiffness = math.inf if options.rigid else options.stiffness_n_per_m
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
     return IndentationRecord(

@@ -192,7 +192,7 @@ def fit_indentation(
     ValueError
         If the record has no contact, or goes back before its end, or no series fits.
     """
-    require(most_terms in range(1, 7), "most_terms", most_terms, "1 to 6")
+    check_options(most_terms, thickness_m)
     means = means_of(test)
     problem = _Problem(test, means)
     solved: list[_Solution] = []
@@ -209,6 +209,13 @@ def fit_indentation(
     chosen = _enough(solved[:most_terms], means.time_s.size)
     further = solved[chosen + 1] if chosen + 1 < len(solved) else None
     return problem.result(solved[chosen], further, solved[:most_terms], thickness_m)
+
+
+def check_options(most_terms: int, thickness_m: float) -> None:
+    """Raise ``ValueError`` where `fit_indentation` does not take these."""
+    require(most_terms in range(1, 7), "most_terms", most_terms, "1 to 6")
+    good = math.isnan(thickness_m) or 0 < thickness_m < math.inf
+    require(good, "thickness_m", thickness_m, "a number above 0")
 
 
 def _enough(solved: list[_Solution], count: int) -> int:
@@ -262,6 +269,8 @@ class _Problem:
         self._scale_pa = peak / (c * most**1.5)
         self._small_pa = 1e-2 * self._scale_pa
         self._tried_s = means.ramp_s / 15, 2 * means.hold_s
+        free = means.free_time_s
+        self._shows_drift = bool((free < means.begin_s).any() and (free > means.end_s).any())
 
     def solve(self, terms: int, fewer: _Solution | None) -> _Solution | None:
         """Best of several starts; None where none converges."""
@@ -388,7 +397,7 @@ class _Problem:
         before = bool((shown < means.begin_s).any())
         if not before:
             priors.append(zero / (max(test.force_std_n, 1e-9) if test.force_std_n >= 0 else 1e-9))
-        if not (before and (shown > means.end_s).any()):
+        if not self._shows_drift:
             priors.append(drift * means.end_s / 1e-9)
         return np.concatenate(
             [
@@ -488,7 +497,7 @@ class _Problem:
             ratio,
             sphere,
             layer,
-            _status(best.chi_square / dof, ratio, sphere, layer),
+            _status(best.chi_square / dof, ratio, sphere, layer, self._shows_drift),
         )
 
 
@@ -521,11 +530,20 @@ def _moved(best: _Solution, further: _Solution) -> FloatArray:
     return moved
 
 
-def _status(reduced: float, ratio: float, sphere: float, layer: float) -> tuple[str, ...]:
+def _status(
+    reduced: float, ratio: float, sphere: float, layer: float, shows_drift: bool
+) -> tuple[str, ...]:
     said = []
+    if not shows_drift:
+        said.append(
+            "the record does not begin and end in air: its force is taken not to drift, and deviations leave "
+            "a drift out"
+        )
     if reduced > 2:
         said.append(f"the series leaves {np.sqrt(reduced):.1f} times the noise of the forces")
-    if not abs(sphere - 1) < HERTZ_OFF:
+    if np.isnan(sphere):
+        said.append(f"a/R {ratio:.2f}: deeper than the ball's radius, where no model here holds")
+    elif not abs(sphere - 1) < HERTZ_OFF:
         said.append(f"a/R {ratio:.2f}: a sphere's force is {sphere:.2f} times that of Hertz")
     if not np.isnan(layer) and layer - 1 > LAYER_OFF:
         said.append(f"thin: a layer's force is {layer:.2f} times that of Hertz")

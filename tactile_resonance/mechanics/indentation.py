@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_resonance.fields import check_within, require
+from tactile_resonance.fields import check_above_zero, check_within, require
 
 FloatArray = NDArray[np.float64]
 
@@ -33,8 +33,9 @@ class BallTip:
     stiffness_n_per_m: float = np.inf
 
     def __post_init__(self) -> None:
-        for name in ("radius_m", "stiffness_n_per_m"):
-            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        check_above_zero(self, "radius_m")
+        stiffness = self.stiffness_n_per_m
+        require(stiffness > 0, "stiffness_n_per_m", stiffness, "a number above 0")
         check_within(self, poisson_ratio=(0, 0.5))
 
     @property
@@ -92,13 +93,15 @@ class IndentationRecord:
         count = self.time_s.size
         for name in ("time_s", "force_n", "depth_m"):
             values = getattr(self, name)
-            good = (
-                values.shape == (count,) and count >= MOST_FEW and bool(np.isfinite(values).all())
-            )
-            accepted = f"at least {MOST_FEW} finite numbers, as many of each"
+            good = values.shape == (count,) and count >= MOST_FEW
+            accepted = f"at least {MOST_FEW} numbers, as many of each"
             require(good, name, f"shape {values.shape}", accepted)
-        rising = bool((np.diff(self.time_s) > 0).all())
-        require(rising, "time_s", "times that do not ascend", "ascending times")
+            wrong = np.flatnonzero(~np.isfinite(values))
+            got = f"{values[wrong[0]]} at sample {wrong[0]}" if wrong.size else ""
+            require(not wrong.size, name, got, "finite numbers")
+        back = np.flatnonzero(np.diff(self.time_s) <= 0)
+        got = f"{self.time_s[back[0] + 1]:g} s after {self.time_s[back[0]]:g} s" if back.size else ""
+        require(not back.size, "time_s", got, "ascending times")
         require(
             self.depth_m.max() > 0, "depth_m", float(self.depth_m.max()), "a largest one above 0"
         )
@@ -164,7 +167,8 @@ def means_of(test: IndentationRecord) -> Means:
     Raises
     ------
     ValueError
-        If the record begins in contact, or the robot goes back before the end of the hold.
+        If the record begins in contact, no force rises, the robot goes back before the end of the hold, or
+        one of relaxation or creep holds for less than its ramp.
     """
     time, force, depth = test.time_s, test.force_n, test.depth_m
     smooth = min(SMOOTH, time.size // 4)
@@ -185,8 +189,16 @@ def means_of(test: IndentationRecord) -> Means:
     noise = _noise_of(test)
     # of many means the largest one is more than the force by several of their deviations
     peak = strong[: last + 1].max() - LARGEST * noise / np.sqrt(smooth)
+    rest_n = float(force[:first].mean()) if first else 0.0
+    got = f"{strong[: last + 1].max():.3g} N at most, {rest_n:.3g} N before the touch"
+    accepted = "a largest one above 0 and above that in air: compression is positive"
+    require(bool(peak > max(rest_n, 0.0)), "force_n", got, accepted)
     felt = int(np.argmax(strong >= PRESSED_FORCE * peak))
     ramp = max(first + 1, min(reached, felt, least, last))
+    if test.protocol is not Protocol.INDENTATION:
+        ramp_s, hold_s = time[ramp] - time[first], time[last] - time[ramp]
+        got, accepted = f"{hold_s:.3g} s", f"one as long as the ramp, {ramp_s:.3g} s, or longer"
+        require(hold_s >= ramp_s, "hold", got, accepted)
     edges = [first, *_even(time, first, ramp, RAMP_PARTS)]
     edges += _growing(time, ramp, last + 1, (time[ramp] - time[first]) / RAMP_PARTS)
     turn = len(edges) - 2

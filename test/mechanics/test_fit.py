@@ -131,3 +131,44 @@ def test_a_way_that_goes_back_is_refused():
     depth[(test.time_s > 5) & (test.time_s < 6)] *= 0.5
     with pytest.raises(ValueError, match="depth_m: got .* back.*; accepted is"):
         fit_indentation(replace(test, depth_m=depth))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda test: {"force_n": -test.force_n}, "force_n: got .* N at most, .* accepted is a largest"),
+        (lambda test: {"force_n": 0 * test.force_n}, "force_n: got '0 N at most"),
+        (lambda test: {"force_n": np.full(test.time_s.size, 0.01)}, "0.01 N at most, 0.01 N before"),
+        (lambda test: {"force_n": np.where(test.time_s > 1, np.nan, test.force_n)}, "nan at sample"),
+        (lambda test: {"time_s": test.time_s[::-1]}, "time_s: got '.* s after .* s'; accepted is asc"),
+        (lambda test: {"ball": BallTip(np.inf)}, "radius_m: got inf; accepted is a number above 0"),
+    ],
+)
+def test_what_is_no_contact_is_refused_by_field(change, message):
+    test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
+    with pytest.raises(ValueError, match=message):
+        fit_indentation(replace(test, **change(test)))
+
+
+def test_a_relaxation_without_a_hold_says_nothing_of_the_equilibrium():
+    test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
+    short = test.time_s < 0.21
+    columns = {name: getattr(test, name)[short] for name in ("time_s", "force_n", "depth_m")}
+    with pytest.raises(ValueError, match="hold: got .*; accepted is one as long as the ramp, 0.1"):
+        fit_indentation(replace(test, **columns))
+
+
+def test_a_drift_that_the_record_does_not_show_is_noted():
+    """Without the air at its end a drift of the zero passes for relaxation."""
+    test = relaxation(STANDARD, np.random.default_rng(1), hold_s=10.0)
+    assert fit_indentation(test).status == ()
+    held = test.time_s < 10.0
+    columns = {name: getattr(test, name)[held] for name in ("time_s", "force_n", "depth_m")}
+    assert any("taken not to drift" in note for note in fit_indentation(replace(test, **columns)).status)
+
+
+@pytest.mark.parametrize("thickness_m", [0.0, -1e-3, np.inf])
+def test_a_thickness_is_above_zero(thickness_m):
+    test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
+    with pytest.raises(ValueError, match="thickness_m: got .*; accepted is a number above 0"):
+        fit_indentation(test, thickness_m=thickness_m)

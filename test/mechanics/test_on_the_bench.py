@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance import cli
+from tactile_resonance.commands.mechanics import COLUMNS
 from tactile_resonance.mechanics.fit import fit_indentation
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.sensor import sensor_named
@@ -56,3 +57,9 @@ def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path
     assert cli.main([*command, "--rigid", "--json", str(out)]) == 0
     (wrong,) = json.loads(out.read_text())
     assert wrong["modulus_pa"]["1"][0] < 0.7 * tissue.relaxation_modulus(1.0)
+    # what a run holds would be written anew: wrong options are refused before anything is read
+    assert cli.main([*command, "--rigid", "--terms", "0"]) == 1
+    assert capsys.readouterr().err.endswith("most_terms: got 0; accepted is 1 to 6\n")
+    np.savez(tmp_path / "complex.npz", **dict(zip(COLUMNS, columns.T + 1j, strict=True)))
+    assert cli.main(["mechanics", str(tmp_path / "complex.npz"), *command[2:], "--rigid"]) == 1
+    assert "complex.npz: time_s: got 'complex numbers'" in capsys.readouterr().err
