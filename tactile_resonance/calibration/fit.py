@@ -9,6 +9,7 @@ estimated along.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -39,6 +40,8 @@ MOST_STEPS, STEPS_ABOVE = 200, 20
 """Of the fit; of that with a mode above the band, which needs many where there is none."""
 NOTABLE = 2.0
 """Mean square of residuals over that of noise from which a reader is told."""
+CONTRADICT = 4.0
+"""Deviations by which known loads may differ from what the records say of each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +75,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     Raises
     ------
     ValueError
-        If there is no record in air, or it shows fewer modes.
+        If there is no record in air, it shows fewer modes, or the first load moves the modes the wrong way.
     """
     records = tuple(records)
     air = [record for record in records if record.load is Load.AIR]
@@ -100,8 +103,9 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     # what repeats in every period, as the steps of a converter do, no variance over periods shows
     excess = np.maximum(1.0, problem.mean_squares(begun.residual))
     problem.widen(excess)
+    contradiction = problem.widen_loads(begun)
     solved = problem.solved(problem.start(SensorModel.of_values(begun.values)))
-    return _fitted(problem, solved, excess, bool(loopback), bool(loaded))
+    return _fitted(problem, solved, excess, contradiction, bool(loopback))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +207,29 @@ class _Records:
         """Multiply the variance of each record (R,)."""
         self._root = [root * np.sqrt(e) for root, e in zip(self._root, excess, strict=True)]
 
+    def widen_loads(self, solved: _Solved) -> str:
+        """Make known loads that contradict each other as uncertain as they do; a note where they do.
+
+        Birge's ratio: the root of their mean squared deviation, by one less than their number.
+        """
+        count = len(self.known)
+        if count < 2:
+            return ""
+        off = solved.residual[-count:]
+        ratio = math.sqrt(float(np.sum(off**2)) / (count - 1))
+        if ratio < CONTRADICT:
+            return ""
+        fitted = [
+            f"{record.value:.6g} of {record.name or record.load.value} fits as "
+            f"{record.value * math.exp(part * std):.4g}"
+            for record, part, std in zip(self.known, off, self._known_stds, strict=True)
+        ]
+        self._known_stds = self._known_stds * ratio
+        return (
+            f"the known loads contradict each other ({', '.join(fitted)}): their deviations are taken "
+            f"{ratio:.1f} times as large"
+        )
+
     def residual(self, x: FloatArray) -> FloatArray:
         """(2 F,) real and imaginary parts of all records, then deviations of known loads."""
         sensor = SensorModel.of_values(self.natural(x))
@@ -282,7 +309,7 @@ def derivatives(
 
 
 def _fitted(
-    problem: _Records, solved: _Solved, excess: FloatArray, has_loopback: bool, has_tip: bool
+    problem: _Records, solved: _Solved, excess: FloatArray, contradiction: str, has_loopback: bool
 ) -> Fitted:
     n = problem.modes
     residuals, start, notes = [], 0, []
@@ -302,7 +329,9 @@ def _fitted(
     determined = problem.free & (np.sqrt(np.diag(solved.covariance)) < limit)
     if not has_loopback:
         notes.append("gain of the channels taken as 1, and their delay not measured: no loop-back")
-    if not has_tip:
+    if contradiction:
+        notes.append(contradiction)
+    if not problem.known:
         notes.append("nothing is known of the tip: no record with a mass or spring")
     air = next(record for record in problem.records if record.load is Load.AIR)
     band = air.frf.frequency_hz

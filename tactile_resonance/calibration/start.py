@@ -116,10 +116,14 @@ def start_tip(loaded: Sequence[CalibrationRecord], air: SensorModel, shown: int)
     record = loaded[0]
     s = record.s_rad_s
     g = record.frf.g * np.exp(s * air.delay_s) / air.gain
-    moved = _peaks(s, 1 / (1 - g), shown, record.name or record.load.value)[0]
+    name = record.name or record.load.value
+    moved = _peaks(s, 1 / (1 - g), shown, name)[0]
     natural = air.natural_rad_s[:shown]
     of = (natural / moved) ** 2 - 1
     if record.load is Load.SPRING:
         of = moved**2 - natural**2
+    got = f"{(moved[0] / natural[0] - 1) * 100:+.2g} % of the first mode"
+    accepted = "modes that a mass lowers and a spring raises: are records in air and loaded ones swapped?"
+    require(bool(of.max() > 0), f"{name}: modes", got, accepted)
     tip = np.sqrt(np.maximum(of, 1e-6 * np.abs(of).max()) / record.value)
     return np.append(tip, np.full(air.modes - shown, tip[-1]))

@@ -24,6 +24,8 @@ from tactile_resonance.sensor import sensor_named
 SKEW_S = 3e-6
 """Of the channels of the simulated bench."""
 MASS_KG = 5e-5
+MOST_KG = 1e-3
+"""A mass at the tip is less: tens of milligrams. What is more was given in other units."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -92,6 +94,7 @@ def run(options: argparse.Namespace) -> int:
     about = {"sensor": options.sensor, "date": f"{datetime.date.today():%Y-%m-%d}"}
     truth = None
     if options.simulated is not None:
+        require(options.simulated >= 0, "--simulated", options.simulated, "0 or above")
         given = [name for name in ("air", "mass", "spring", "loopback") if getattr(options, name)]
         require(not given, "--simulated", given, "no record beside it")
         records, truth, radius_m = _simulated(options.simulated)
@@ -99,6 +102,8 @@ def run(options: argparse.Namespace) -> int:
     else:
         records = _records(options)
     if options.check is not None:
+        good = options.output is None and options.plot is None
+        require(good, "--check", str(options.check), "neither --output nor --plot beside it")
         return _check(read_calibration(options.check).calibration, records)
     fitted = calibrate(records, options.modes)
     made = fitted.calibration
@@ -138,6 +143,8 @@ def _records(options: argparse.Namespace) -> list[CalibrationRecord]:
             known = number(float(value), f"--{load.value}")
         except ValueError as error:
             raise ValueError(f"--{load.value}: got {value!r}; accepted is a number") from error
+        light = load is not Load.MASS or known < MOST_KG
+        require(light, "--mass", known, f"kilograms, less than {MOST_KG:g}: 50 mg are 5e-5")
         records.append(
             CalibrationRecord.of_samples(
                 recording.u,

@@ -111,3 +111,18 @@ def test_a_mass_needs_a_value(records):
         replace(of_loads(records, "mass")[0], value=0.0)
     with pytest.raises(ValueError, match="mass std"):
         replace(of_loads(records, "mass")[0], value_std=1.0)
+
+
+def test_masses_that_contradict_each_other_are_declared_and_make_the_tip_uncertain(records, truth):
+    """One mass, once stated as it is and once as 2/5 of it: either may be wrong."""
+    of_air_and_mass = of_loads(records, "air", "mass", "loopback")
+    lighter = [
+        replace(record, value=2e-5, name="other")
+        for record in of_air_and_mass
+        if record.load is Load.MASS
+    ]
+    found = calibrate([*of_air_and_mass, *lighter]).calibration
+    n = found.model.modes
+    assert "the known loads contradict each other (5e-05 of mass fits as " in found.message
+    off = (found.model.tip_deflection - truth.tip_deflection) / found.std[3 * n : 4 * n]
+    assert np.abs(off).max() < 4

@@ -119,3 +119,13 @@ def test_the_command_names_what_it_refuses(files, capsys):
     assert "--mass: got 'heavy'" in capsys.readouterr().err
     assert main(["calibrate", "--air", files["air"], "--simulated", "1"]) == 1
     assert "--simulated" in capsys.readouterr().err
+    swapped = ["calibrate", "--air", files["mass"], "--mass", "5e-5", files["air"]]
+    assert main(swapped) == 1
+    assert "air.npz: modes: got '+" in capsys.readouterr().err
+    in_mg = ["calibrate", "--air", files["air"], "--mass", "50", files["mass"]]
+    assert main(in_mg) == 1
+    assert "--mass: got 50.0; accepted is kilograms, less than 0.001" in capsys.readouterr().err
+    assert main(["calibrate", "--simulated", "-1"]) == 1
+    assert "--simulated: got -1; accepted is 0 or above" in capsys.readouterr().err
+    assert main(["calibrate", "--air", files["air"], "--check", "x.yaml", "--output", "y.yaml"]) == 1
+    assert "--check: got 'x.yaml'; accepted is neither --output" in capsys.readouterr().err
