@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 
+from tactile_resonance.fields import require
 from tactile_resonance.processes import ENDING
 
 PORT = 8765
@@ -37,6 +38,14 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.report.live_server import LiveServer
 
     require_packages("rclpy", "tactile_resonance.msg")
+    from rclpy.exceptions import InvalidNamespaceException
+    from rclpy.validate_namespace import validate_namespace
+
+    try:
+        validate_namespace(f"/{options.namespace.strip('/')}")
+    except InvalidNamespaceException as error:
+        accepted = "a ROS namespace, of letters, digits, _ and /, without a digit at its parts' beginning"
+        require(not error, "--namespace", options.namespace, accepted)
     from tactile_resonance.nodes.live_listener import LiveListener
 
     for number in ENDING:  # also where a shell began it in the background, interrupts ignored

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance import cli
 from tactile_resonance.report.live_run import MOST_OF_A_MAP, LiveRun
 from tactile_resonance.report.live_server import LOOPBACK, MOST_READERS, LiveServer
 from tactile_resonance.report.page_data import point_entry
@@ -311,3 +312,10 @@ def test_the_live_page_shows_points_as_they_come(served, tmp_path):
         assert page.value("document.querySelectorAll('script, img').length") == 3
         assert page.console == []
         assert set(page.requests) == {server.url, f"{server.url}events"}
+
+
+def test_a_namespace_that_is_none_is_refused(capsys):
+    pytest.importorskip("rclpy")
+    assert cli.main(["live", "--port", "0", "--namespace", "bad name!"]) == 1
+    message = "tactile_resonance: --namespace: got 'bad name!'; accepted is a ROS namespace"
+    assert capsys.readouterr().err.startswith(message)

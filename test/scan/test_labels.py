@@ -273,6 +273,10 @@ def test_refusals(tmp_path, capsys):
     message = called([*compare, "--spread", "-1", "1e-3"], capsys, status=1)
     assert "--spread: got [-1.0, 0.001]; accepted is two finite numbers" in message
     assert not list(tmp_path.glob("x.*"))
+    check = ["references", "check", run, other, "--library", NOMINAL]
+    check += ["--labels", tmp_path / "all.csv", "--figure", tmp_path / "x.docx"]
+    message = called(check, capsys, status=1)
+    assert "x.docx: got '.docx'; accepted is .png, .svg or .pdf" in message
     arguments = ["references", "build", run, "--labels", "scene", "--output", tmp_path / "x.yaml"]
     damaged = next((other / "recording").glob("point-00001*"))
     damaged.write_bytes(damaged.read_bytes()[:50])
