@@ -184,6 +184,12 @@ class _Records:
             prior = np.eye(int(self.free.sum()), z.size) / LOOSE
             return np.concatenate([j, prior])
 
+        names = [record.name or record.load.value for record in self.records]
+        accepted = (
+            "responses of sensor over actuator at which a fit can begin: are channels swapped, is the sample "
+            "rate right?"
+        )
+        require(bool(np.isfinite(self.residual(start)).all()), "records", names, accepted)
         found = optimize.least_squares(
             residual, np.zeros(scale.size), jacobian, x_scale="jac", method="trf", max_nfev=steps
         )

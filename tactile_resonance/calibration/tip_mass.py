@@ -26,6 +26,8 @@ def tip_mass(calibration: Calibration) -> tuple[float, float, str]:
     if known.size < 3:
         return nan, nan, "three modes of known shape at the tip, or more, are needed"
     values = np.concatenate([model.natural_rad_s[known], model.tip_deflection[known]])
+    if not values.min() > 0:
+        return nan, nan, "deflections at the tip are not all above 0"
     index = np.concatenate([known, 3 * n + known])
     covariance = calibration.covariance[np.ix_(index, index)] / np.outer(values, values)
     covariance = covariance + THEORY_STD**2 * np.eye(values.size)

@@ -68,13 +68,17 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.mechanics.fit import check_options
 
     check_options(options.terms, options.thickness_m)  # before a run's mechanics.csv is written anew
-    tests = [one for path in options.paths for one in _tests(path, options)]
+    found = {path: list(_tests(path, options)) for path in options.paths}
+    tests = [one for of_path in found.values() for one in of_path]
     if not tests:
         raise ValueError(
             f"{options.paths[0]}: no mechanical test; a scene asks for them by protocols"
         )
-    for one in tests:
-        print("\n".join(_lines(one)))
+    for path, of_path in found.items():
+        for one in of_path:
+            print("\n".join(_lines(one)))
+        if not of_path:
+            print(f"{path}: no mechanical test")
     if options.json is not None:
         text = json.dumps([one.as_json() for one in tests], indent=1, allow_nan=False)
         write_whole(options.json, (text + "\n").encode())
@@ -100,8 +104,6 @@ def _tests(path: Path, options: argparse.Namespace) -> Iterator[TissueTest]:
     tests = list(fits_of(content, most_terms=terms, thickness_m=thickness_m))
     if tests:
         write_fits(content.path, tests)
-    else:
-        print(f"{path}: no mechanical test")
     yield from tests
 
 

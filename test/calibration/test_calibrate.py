@@ -126,3 +126,13 @@ def test_masses_that_contradict_each_other_are_declared_and_make_the_tip_uncerta
     assert "the known loads contradict each other (5e-05 of mass fits as " in found.message
     off = (found.model.tip_deflection - truth.tip_deflection) / found.std[3 * n : 4 * n]
     assert np.abs(off).max() < 4
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_channels_that_are_swapped_are_refused_by_name(records):
+    swapped = [
+        replace(record, frf=replace(record.frf, g=1 / record.frf.g))
+        for record in of_loads(records, "air")
+    ]
+    with pytest.raises(ValueError, match="records: got .'air'.*are channels swapped"):
+        calibrate(swapped)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration in a file, and the command that writes it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,8 +56,6 @@ def test_the_tip_mass_is_that_of_the_ball(fitted, bench):
 
 
 def test_without_known_shapes_there_is_no_tip_mass(fitted):
-    from dataclasses import replace
-
     made = fitted.calibration
     determined = made.determined.copy()
     determined[3 * made.model.modes : 4 * made.model.modes] = False
@@ -65,13 +65,19 @@ def test_without_known_shapes_there_is_no_tip_mass(fitted):
 
 
 def test_modes_that_are_of_no_uniform_beam_give_no_tip_mass(fitted):
-    from dataclasses import replace
-
     made = fitted.calibration
     odd = made.model.natural_rad_s * np.where(np.arange(made.model.modes) % 2, 1.05, 1.0)
     mass_kg, _, why = tip_mass(replace(made, model=replace(made.model, natural_rad_s=odd)))
     assert np.isnan(mass_kg)
     assert "uniform" in why
+
+
+def test_a_tip_that_goes_against_the_force_gives_no_tip_mass(fitted):
+    made = fitted.calibration
+    against = replace(made.model, tip_deflection=-made.model.tip_deflection)
+    mass_kg, _, why = tip_mass(replace(made, model=against))
+    assert np.isnan(mass_kg)
+    assert why == "deflections at the tip are not all above 0"
 
 
 def stored(path, u, y, harmonics, rate_hz):
