@@ -49,16 +49,20 @@ def calibrated_poles(
     if not reason:
         assert frf.bins is not None  # see `_impossible`
         record = ContactRecord.of_bins(frf.bins, Start.REST)
-        found = estimator(record, force_n, force_std_n)
-        poles = found.poles
-        if abs(found.stiffness_n_per_m) < IN_AIR_N_PER_M:
+        try:
+            found = estimator(record, force_n, force_std_n)
+        except np.linalg.LinAlgError:  # its parameters ran away: no contact explains such a record
+            found = None
+        if found is None:
+            reason = "the fit through it does not converge: the data contradict the calibration"
+        elif abs(found.stiffness_n_per_m) < IN_AIR_N_PER_M:
             # a pole in air is to show whether the sensor is as calibrated, so that it must not be taken from it
             reason = "nothing is touched"
-        elif poles.status is PolesStatus.OK:
+        elif found.poles.status is PolesStatus.OK:
             further = poles_of_bands(frf, bands, method).further if len(bands) > 1 else ()
-            return replace(poles, further=further)
+            return replace(found.poles, further=further)
         else:
-            reason = poles.message
+            reason = found.poles.message
     poles = poles_of_bands(frf, bands, method)
     note = f"without the calibrated sensor: {reason}"
     return replace(poles, message="; ".join(filter(None, [poles.message, note])))

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 from calibration.played import BAND_HZ, SKEW_S, excitation
 
+from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.frf_poles import calibrated_poles
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import PoleBand
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun
+from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.known_loads import another_sensor, true_sensor
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 BANDS = (PoleBand(*BAND_HZ, 2, 6),)
@@ -71,3 +74,22 @@ def test_poles_in_air_are_measured_and_not_taken_from_the_calibration(estimator,
     poles = calibrated_poles(frf_of(bench, None, excitation(0.1), 4), BANDS, estimator)
     assert "calibrated sensor" not in poles.method
     assert "without the calibrated sensor" in poles.message
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_another_sensor_in_air_is_fitted_without_the_calibration(library):
+    """Its fit runs away, and must not take the reference in air with it."""
+    bench, other = (
+        SimulatedBench(sensor, library.contact)
+        for sensor in (read_sensor(), another_sensor(read_sensor(), 3))
+    )
+    size = true_sensor(other, SKEW_S).values.size
+    given = Calibration(
+        true_sensor(other, SKEW_S), np.zeros((size, size)), np.ones(size, bool), (10.0, 12e3), 3e-6, 1.0
+    )
+    wrong = CalibratedEstimator(given, bench.sensor.tip.radius_m)
+    poles = calibrated_poles(frf_of(bench, None, excitation(0.1), 4), BANDS, wrong)
+    assert poles.main.found
+    assert "without the calibrated sensor: " in poles.message
+    assert "contradict the calibration" in poles.message
+    assert abs(poles.main.f0_hz - couple(bench.sensor, None).mode_near(250.0).f0_hz) < 0.1
