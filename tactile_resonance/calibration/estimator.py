@@ -36,6 +36,9 @@ CONTRADICTED = 1e-4
 """Probability of so large residuals by chance, below which data contradict a calibration."""
 FEWEST_BETWEEN = 30
 """Bins between lines from which the level of the noise is estimated."""
+LOUDEST = 9.0
+"""Of the noise of the calibration, as power: what is more than that between lines is a transient that does not
+fit, as of another sensor, and must not widen the deviations until nothing contradicts the calibration."""
 _STEPS = 60
 _ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
 _NEAR = (0.2, 5.0)
@@ -196,7 +199,7 @@ class _Fit:
         count = self._excited.size
         real = self.residual(p)[: 2 * count].reshape(2, count)[:, between]
         level = np.sum(real**2) / (2 * np.count_nonzero(between) - self.directions)
-        self.noise *= float(np.sqrt(level))
+        self.noise *= float(np.sqrt(min(level, LOUDEST)))
         return self._descend(p)
 
     def _descend(self, p: FloatArray) -> tuple[FloatArray, bool]:

@@ -119,6 +119,19 @@ def test_a_changed_sensor_is_contradicted(bench, given, library, field, mode, fa
     assert "contradict" in found.message
 
 
+@pytest.mark.parametrize(("times", "status"), [(2, ContactStatus.OK), (20, ContactStatus.CONTRADICTED)])
+def test_what_is_far_above_the_noise_is_no_noise(known, given, bench, library, times, status):
+    """A transient of another sensor fills the bins between lines: deviations that grow with it hide nothing."""
+    record = played(
+        bench, contact_of(bench, library["gel10"]), 0.02, seed=5, periods=5, skew_s=SKEW_S
+    )
+    rng = np.random.default_rng(2)
+    std = given.noise_v_per_root_hz * np.sqrt(record.sample_rate_hz / 4 / record.samples)
+    noise = times * std * rng.standard_normal((record.y.size, 2)).view(complex)[:, 0]
+    found = known(replace(record, y=record.y + noise), FORCE_N)
+    assert found.status is status
+
+
 def test_fluid_on_the_tip_is_contradicted(known, bench, library):
     """Ten milligrams of it, where the tissue itself moves one."""
     contact = contact_of(bench, library["gel12"])
