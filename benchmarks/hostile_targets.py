@@ -58,6 +58,19 @@ base_frame: base
 table_in_base: [0.3, 0.0, 0.1, 0.0, 0.0, 0.0]
 covariance: [[1.0e-8, 0.0, 0.0], [0.0, 1.0e-8, 0.0], [0.0, 0.0, 1.0e-8]]
 """
+CONFIGURATION: dict[str, Callable[[Path], object]] = {
+    "contact.yaml": read_contact,
+    "devices/nidaqmx.yaml": read_nidaq_config,
+    "devices/twist.yaml": read_twist_config,
+    "devices/ur5e.yaml": read_ur_config,
+    "force/*.yaml": read_force_config,
+    "force/frames/*.yaml": read_can_description,
+    "load_cells/*.yaml": CellParameters.from_yaml,
+    "scenes/*.yaml": read_scan_scene,
+    "sensors/*.yaml": read_sensor,
+    "tissues.yaml": read_tissues,
+}
+"""Readers of the files in config/, by pattern."""
 WANTED = ("u", "y", "sample_rate_hz", "samples_per_period")
 
 
@@ -127,20 +140,7 @@ def _file(path: Path, read: Callable[[Path], object]) -> Read:
 
 def _configuration(folder: Path) -> Iterable[Target]:
     library = read_tissues()
-    readers: dict[str, Callable[[Path], object]] = {
-        "contact.yaml": read_contact,
-        "devices/nidaqmx.yaml": read_nidaq_config,
-        "devices/twist.yaml": read_twist_config,
-        "devices/ur5e.yaml": read_ur_config,
-        "force/*.yaml": read_force_config,
-        "force/frames/*.yaml": read_can_description,
-        "load_cells/*.yaml": CellParameters.from_yaml,
-        "nodes.yaml": read_parameter_file,
-        "scenes/*.yaml": read_scan_scene,
-        "sensors/*.yaml": read_sensor,
-        "tissues.yaml": read_tissues,
-    }
-    for pattern, reader in readers.items():
+    for pattern, reader in {**CONFIGURATION, "nodes.yaml": read_parameter_file}.items():
         seeds = [path.read_bytes() for path in _config(pattern)]
         name = f"config/{pattern}"
         yield Target(name, seeds, _file(folder / "configuration.yaml", reader), 0.005)
@@ -264,8 +264,6 @@ class _Robot:
             for _ in range(3):
                 select.select([stream], [], [], 0.02)
                 stream.read()
-        except ConnectionError:
-            pass  # what a driver reports
         finally:
             stream.close()
 

@@ -17,9 +17,10 @@ from scipy.stats import binom
 from tqdm import tqdm
 
 from tactile_resonance.mechanics.course import course_of
-from tactile_resonance.mechanics.fit import Fit, Known, fit_indentation
+from tactile_resonance.mechanics.fit import fit_indentation
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.result import Fit, Known
 from tactile_resonance.report.drawing import save_figure
 from tactile_resonance.report.mechanics_figure import draw_tests
 from tactile_resonance.scan.tissue_tests import TissueTest, fitted

@@ -8,35 +8,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.hostile_targets import CONFIGURATION
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.can_frames import read_can_description
-from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.twist import read_twist_config
-from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.fields import LONGEST
-from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.strict_yaml import dump_yaml, parse_yaml
 
 LIBRARY = read_tissues()
-READERS = {
-    "contact.yaml": read_contact,
-    "devices/nidaqmx.yaml": read_nidaq_config,
-    "devices/twist.yaml": read_twist_config,
-    "devices/ur5e.yaml": read_ur_config,
-    "force/*.yaml": read_force_config,
-    "force/frames/*.yaml": read_can_description,
-    "load_cells/*.yaml": CellParameters.from_yaml,
-    "scenes/*.yaml": read_scan_scene,
-    "./scenes/*.yaml": lambda path: read_scene(LIBRARY, path),
-    "sensors/*.yaml": read_sensor,
-    "tissues.yaml": read_tissues,
-}
+READERS = {**CONFIGURATION, "./scenes/*.yaml": lambda path: read_scene(LIBRARY, path)}
 CASES = [
     pytest.param(reader, path, id=f"{pattern.split('/')[0]}-{path.name}")
     for pattern, reader in READERS.items()

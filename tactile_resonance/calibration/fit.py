@@ -39,7 +39,7 @@ WORTH_A_MODE = 50.0
 MOST_STEPS, STEPS_ABOVE = 200, 20
 """Of the fit; of that with a mode above the band, which needs many where there is none."""
 NOTABLE = 2.0
-"""Mean square of residuals over that of noise from which a reader is told."""
+"""Mean square of residuals over that of noise from which on the result carries a note."""
 CONTRADICT = 4.0
 """Deviations by which known loads may differ from what the records say of each other."""
 

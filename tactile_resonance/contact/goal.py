@@ -55,7 +55,7 @@ class ContactGoal:
     press_speed_m_s : float
         Towards the surface and into it, at most [m/s]; those of the parameters are never raised.
     hold_s : float
-        The tip is drawn back by itself after it was held so long [s]; infinite: when that is asked for.
+        Time after which contact_node draws the held tip back without a request [s]; infinite: only on request.
     unload_speed_m_s : float
         With which it is then drawn back while it presses [m/s]; 0: as after any contact.
     """

@@ -91,7 +91,7 @@ class LiveServer:
             for reader in list(self._readers):
                 try:
                     reader.put_nowait(event)
-                except queue.Full:  # it comes again, and gets all of the run
+                except queue.Full:  # too slow: its page connects again and then receives the whole run
                     self._readers.discard(reader)
                     reader.get_nowait()
                     reader.put_nowait(None)
@@ -197,8 +197,8 @@ class _Handler(BaseHTTPRequestHandler):
                 if event is None:
                     return
                 self.wfile.write(event)
-        except OSError:
-            pass  # the page was closed
+        except OSError:  # the page was closed
+            return
         finally:
             live._end(reader)
 

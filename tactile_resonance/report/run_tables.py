@@ -132,7 +132,7 @@ def truth_columns(truths: Truths) -> Columns:
 
 
 def bands_table(results: Sequence[PointResult]) -> str:
-    """Poles of the bands beyond the first; empty where there are none."""
+    """Table of the poles in the second and further bands; an empty text where a run has one band only."""
     names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
     for result in results:
         for band in result.further:

@@ -169,14 +169,14 @@ def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSprea
         E M_i = S_i + sum over inner levels j of a_ij S_j + sum over points k of b_ik C_k
 
     with the spread S_i of each source and the known covariance C_k of each point, which are taken off from
-    inside to outside. A remainder that is not positive has its negative part set to 0. A source of which
-    each group has one member only cannot be told from the next outer one, and is part of it; the outermost
-    one is then not determined at all. The mean squares M_i follow Wishart's distribution about, with n_i
-    degrees of freedom. A sum of t_i M_i beside known covariances then has tr(W) / tr(V W)
-    (Satterthwaite), with W the sum of (t_i R_i)^2, V that of (t_i R_i)^2 / n_i and R_i the mean square in units
-    of the covariance of the next measurement: a direction counts by how much of it is estimated. For one mean
-    square alone that is exact; simulated, classes of few preparations are up to three times as rarely wrong as
-    they state.
+    inside to outside. A remainder that is not positive has its negative part set to 0. A source with
+    one member in each group cannot be distinguished from the next outer one, and is counted there; where that
+    is the outermost one it is not determined at all. The mean squares M_i follow approximately Wishart's
+    distribution, with n_i degrees of freedom. A sum of t_i M_i beside known covariances then has tr(W) / tr(V
+    W) (Satterthwaite), with W the sum of (t_i R_i)^2, V that of (t_i R_i)^2 / n_i and R_i the mean square in
+    units of the covariance of the next measurement: a direction counts by how much of it is estimated. For one
+    mean square alone that is exact; simulated, classes of few preparations are up to three times as rarely
+    wrong as they state.
     """
     names = list(dict.fromkeys(points.tissue.tolist()))
     require(bool(names), "points", 0, "one reference point or more")

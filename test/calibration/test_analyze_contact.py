@@ -5,9 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from calibration.played import BAND_HZ, SKEW_S, excitation
+from calibration.played import SKEW_S
 
 import tactile_resonance as tr
+from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.file import CalibratedSensor
 from tactile_resonance.cli import main
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects

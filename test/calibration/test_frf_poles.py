@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.played import BAND_HZ, SKEW_S, excitation
+from calibration.played import SKEW_S
 
+from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.frf_poles import calibrated_poles

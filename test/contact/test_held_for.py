@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A contact that ends by itself: held for a time, drawn back at an even speed; what is recorded of it."""
+"""Contacts of limited duration: held for a time, drawn back at constant speed, and recorded."""
 
 import sys
 from dataclasses import replace

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from tactile_resonance.mechanics.fit import Known, fit_indentation
+from tactile_resonance.mechanics.fit import fit_indentation
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.result import Known
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 sys.path.insert(0, str(Path(__file__).parent))
