@@ -75,17 +75,6 @@ class TissueContact:
         """k*(s)."""
         return self.prior.stiffness(self.parameters)
 
-    def stiffness_at(self, frequency_hz: float) -> tuple[complex, FloatArray]:
-        """k* at a frequency of the band [N/m], and the total covariance (2, 2) of its parts."""
-        s = np.array([2j * np.pi * frequency_hz])
-
-        def parts(p: FloatArray) -> FloatArray:
-            k = self.prior.stiffness(p).at(np.broadcast_to(s, (*p.shape[:-1], 1)))[..., 0]
-            return np.stack([k.real, k.imag], axis=-1)
-
-        value, slope = parts(self.parameters), slope_of(parts, self.parameters)
-        return complex(*value), slope @ self.total_covariance @ slope.T
-
 
 @dataclass(frozen=True)
 class Moduli:

@@ -145,15 +145,6 @@ class SensorModel:
         gamma, leak = (np.asarray(getattr(self, name))[..., None] for name in SINGLE[:2])
         return (gamma - 1 - leak / poles) / (dx - leak / poles**2)
 
-    def pole_near(
-        self, frequency_hz: float, contact: ContactStiffness
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """(...) pole [rad/s] and residue [rad/s] of the resonance that is nearest to a frequency [Hz]."""
-        poles = self.poles(contact)
-        away = np.where(poles.imag > 0, np.abs(np.abs(poles) / (2 * np.pi) - frequency_hz), np.inf)
-        pole = np.take_along_axis(poles, np.argmin(away, axis=-1)[..., None], axis=-1)
-        return pole[..., 0], self.residues(pole, contact)[..., 0]
-
     def _denominators(self, s: ComplexArray) -> ComplexArray:
         s = np.asarray(s)[..., None]  # (..., S, 1)
         w, zeta = self.natural_rad_s[..., None, :], self.damping_ratio[..., None, :]

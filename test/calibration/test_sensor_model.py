@@ -43,7 +43,8 @@ def test_in_air_the_contact_is_not_there(bench):
     s = 2j * np.pi * np.geomspace(5, 12e3, 50)
     np.testing.assert_allclose(model.response(s), air.response(s), rtol=1e-10)
     np.testing.assert_allclose(model.response(s, AIR.at(s)), air.response(s), rtol=1e-10)
-    pole, _ = model.pole_near(250.0, AIR)
+    poles = model.poles(AIR)
+    pole = poles[np.argmin(np.abs(poles - 2j * np.pi * 250))]
     np.testing.assert_allclose(pole, air.mode_near(250.0).pole_rad_s, rtol=1e-9)
 
 
