@@ -125,9 +125,9 @@ def read_stl(path: Path) -> FloatArray:
     except ImportError as error:
         need = "trimesh, which reads STL: pip install trimesh"
         raise ValueError(f"file: got {path.name!r}; accepted with {need}") from error
-    log = logging.getLogger("trimesh")
+    log = trimesh.util.log
     try:
-        log.addFilter(_nothing)  # with a damaged file it writes tracebacks to stderr
+        log.addFilter(_nothing)  # of damaged files it logs tracebacks, which appear on stderr
         mesh = trimesh.load_mesh(path, file_type="stl", process=False)
     except Exception as error:  # whatever its readers meet in a damaged file
         raise ValueError(f"file: {path} cannot be read as STL ({cut(str(error))})") from error

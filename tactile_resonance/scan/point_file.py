@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -269,7 +270,7 @@ def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[in
 
 # What reading a cut or overwritten file has been seen to raise.
 _DAMAGE = (ReaderError, SerdeError, TypesysError, OSError, ValueError, TypeError, KeyError,
-           IndexError, AssertionError, EOFError, MemoryError, OverflowError)  # fmt: skip
+           IndexError, AssertionError, EOFError, MemoryError, OverflowError, struct.error)  # fmt: skip
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

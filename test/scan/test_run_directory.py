@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import struct
 import sys
 import time
 from dataclasses import replace
@@ -20,7 +21,7 @@ from rosbags.rosbag2 import Reader
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
-from tactile_resonance.scan.point_file import offered_qos
+from tactile_resonance.scan.point_file import offered_qos, read_content
 from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome
 from tactile_resonance.scan.results_file import as_csv
 from tactile_resonance.scan.run_content import read_run
@@ -243,6 +244,21 @@ def test_a_damaged_file_is_named_and_its_point_measured_again(tmp_path):
         assert run.content.next_point.index == 3
     with AnyReader([tmp_path / "run" / "recording"]) as reader:
         assert reader.message_count == 3 * 4
+
+
+def test_a_summary_with_a_record_of_no_length_is_refused_in_one_line(tmp_path):
+    with create(tmp_path / "run") as run:
+        record_point(run, 0)
+    path = tmp_path / "run" / "recording" / "point-00000-00.mcap"
+    content = bytearray(path.read_bytes())
+    # the footer, before the magic: begin of the summary, begin of its offsets, checksum
+    (summary,) = struct.unpack_from("<Q", content, len(content) - 8 - 20)
+    assert content[summary] == 0x03  # a schema
+    content[summary + 1 : summary + 9] = bytes(8)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{path.name}: damaged or foreign file") as error:
+        read_content(path)
+    assert "\n" not in str(error.value)
 
 
 def test_summaries_are_made_anew_from_the_files(tmp_path):

@@ -103,7 +103,7 @@ def test_stl_text_and_binary_are_the_same(tmp_path, caplog):
         lines += ["facet normal 0 0 0", "outer loop"]
         lines += ["vertex " + " ".join(f"{v:.9g}" for v in corner) for corner in t]
         lines += ["endloop", "endfacet"]
-    text.write_text("\n".join([*lines, "endsolid cap"]))
+    text.write_text("\n".join([*lines, "endsolid cap"]).replace("normal 0 0 0", "normal 0 0 ?", 1))
     np.testing.assert_array_equal(read_stl(binary), triangles.astype(float))
     np.testing.assert_array_equal(read_stl(text).astype(np.float32), triangles)
     surface = read_surface({"mesh": {"file": "b.stl", "unit_m": 0.001}}, tmp_path, "surface")
