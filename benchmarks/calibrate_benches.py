@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.skip_point import SimulatedPoint, pole_of
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.contact import TissueContact
 from tactile_resonance.calibration.contact_record import ContactRecord
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.fit import calibrate
+from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.tip_mass import tip_mass
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.record import Record

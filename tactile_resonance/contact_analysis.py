@@ -93,7 +93,7 @@ def estimate_contact(
     >>> import numpy as np
     >>> import tactile_resonance as tr
     >>> from tactile_resonance.calibration.file import CalibratedSensor
-    >>> from tactile_resonance.calibration.calibration import Calibration
+    >>> from tactile_resonance.calibration.model import Calibration
     >>> from tactile_resonance.calibration.model import SensorModel
     >>> model = SensorModel.of_values(
     ...     [236, 1540, 0.012, 0.012, 48.9, 170.7, 60.9, 46.4, 0.02, 3.5, 1.0, 0.0]

@@ -18,12 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.contact import ContactStatus, TissueContact, slope_of
 from tactile_resonance.calibration.contact_record import ContactRecord, Start
-from tactile_resonance.calibration.law import ContactPrior, Law
-from tactile_resonance.calibration.model import ComplexArray, FloatArray, SensorModel
-from tactile_resonance.calibration.stiffness import ContactStiffness
+from tactile_resonance.calibration.law import ContactPrior, ContactStiffness, Law
+from tactile_resonance.calibration.model import Calibration, ComplexArray, FloatArray, SensorModel
 from tactile_resonance.fields import require
 from tactile_resonance.poles.result import (
     Poles,

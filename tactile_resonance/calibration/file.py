@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.calibration.calibration import Calibration
-from tactile_resonance.calibration.model import PER_MODE, SINGLE, SensorModel
+from tactile_resonance.calibration.model import PER_MODE, SINGLE, Calibration, SensorModel
 from tactile_resonance.fields import (
     check_above_zero,
     check_not_negative,

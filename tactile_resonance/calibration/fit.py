@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.model import (
     PER_MODE,
+    Calibration,
     ComplexArray,
     FloatArray,
     SensorModel,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bimorph with a tip in modal parameters, in air or on any contact: response, poles, residues.
+"""A bimorph with a tip in modal parameters, in air or on any contact, and what is known of one by calibration.
 
 With ``D_i = s^2 + 2 zeta_i w_i s + w_i^2``, ``A = sum chi_i^2 / D_i``, ``B = sum chi_i phi_i / D_i``,
 ``C = sum phi_i^2 / D_i`` and the stiffness k(s) of the contact::
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.calibration.stiffness import ContactStiffness
+from tactile_resonance.calibration.law import ContactStiffness
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -157,3 +157,49 @@ class SensorModel:
         chi, phi = self.coupling_rad_s[..., None, :], self.tip_deflection[..., None, :]
         weights = (chi**2, chi * phi, phi**2)
         return tuple((slope * weight).sum(axis=-1) for weight in weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Parameters of one sensor, with what is known of them.
+
+    Attributes
+    ----------
+    model : SensorModel
+    covariance : (p, p) float
+        Of `SensorModel.values`.
+    determined : (p,) bool
+        Which the records determine; the others keep a value and a wide deviation.
+    band_hz : (float, float)
+        First and last line in air.
+    noise_v_per_root_hz : float
+        Of the sensor channel, one-sided; NaN where unknown.
+    excess : float
+        Mean square of the residuals over that of noise, of the record where it is largest; 1 where none is
+        larger.
+    message : str
+        What a reader should know; empty where there is nothing to say.
+    """
+
+    model: SensorModel
+    covariance: FloatArray
+    determined: npt.NDArray[np.bool_]
+    band_hz: tuple[float, float]
+    noise_v_per_root_hz: float
+    excess: float
+    message: str = ""
+
+    @property
+    def std(self) -> FloatArray:
+        """(p,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,) of the parameters."""
+        return parameter_names(self.model.modes)
+
+    def knows_tip(self) -> bool:
+        """Whether the first two mode shapes at the tip are determined, without which no contact is."""
+        n = self.model.modes
+        return bool(self.determined[3 * n : 3 * n + min(2, n)].all())

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize, stats
 
-from tactile_resonance.calibration.calibration import Calibration
+from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.cantilever import cantilever_eigenvalues, tip_shape
 
 THEORY_STD = 1e-3

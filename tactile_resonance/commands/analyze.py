@@ -264,13 +264,13 @@ def _run(options: argparse.Namespace) -> int:
         outputs[options.json] = analysis_as_json(analysis).encode()
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
-        from tactile_resonance.report.analysis_figure import draw_analysis
         from tactile_resonance.report.drawing import figure_bytes
+        from tactile_resonance.report.frf_figures import draw_analysis
 
         figure = draw_analysis(analysis, options.record.name)
         outputs[options.plot] = figure_bytes(figure, options.plot.suffix)
         if analysis.distortion is not None:
-            from tactile_resonance.report.distortion_figure import draw_distortion
+            from tactile_resonance.report.frf_figures import draw_distortion
 
             figure = draw_distortion({options.record.name: analysis.distortion}, "Distortion")
             path = options.plot.with_stem(f"{options.plot.stem}_distortion")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.fit import Fitted, calibrate
+from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.tip_mass import tip_mass
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.fields import number, require
@@ -115,8 +115,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"tip mass: {1e6 * mass_kg:.2f} +- {1e6 * mass_std_kg:.2g} mg, of a uniform beam")
     if options.plot is not None:
         # drawing libraries take half a second to load
-        from tactile_resonance.report.calibration_figure import draw_calibration
         from tactile_resonance.report.drawing import SIMULATED, save_figure
+        from tactile_resonance.report.frf_figures import draw_calibration
 
         title = f"calibration of {about['sensor']}" + (
             f" ({SIMULATED})" if truth is not None else ""

@@ -71,8 +71,8 @@ def run(options: argparse.Namespace) -> int:
 
     from tactile_resonance.commands.references import print_left_out, read_runs
     from tactile_resonance.fields import require
-    from tactile_resonance.report.compare_figure import draw_comparison
     from tactile_resonance.report.drawing import save_figure
+    from tactile_resonance.report.tissue_figures import draw_comparison
     from tactile_resonance.scan.labels import nominal_of, read_nominal, referred, run_names
     from tactile_resonance.scan.point_result import PointKind
     from tactile_resonance.tissue.clusters import find_clusters

@@ -82,8 +82,8 @@ def _simulation(output: Path) -> None:
 def _distortion(output: Path) -> None:
     from tactile_resonance.frf.distortion import estimate_distortion
     from tactile_resonance.frf.spectra import Spectrum
-    from tactile_resonance.report.distortion_figure import draw_distortion, draw_distortion_levels
     from tactile_resonance.report.drawing import SIMULATED, save_figure
+    from tactile_resonance.report.frf_figures import draw_distortion, draw_distortion_levels
     from tactile_resonance.simulation.sensor.experiments import records_at_levels
 
     cases = {
@@ -111,7 +111,7 @@ def _variance(output: Path) -> None:
     from tactile_resonance.frf.spectra import Spectrum
     from tactile_resonance.frf.variance_analysis import analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.report.variance_figure import draw_variance
+    from tactile_resonance.report.frf_figures import draw_variance
     from tactile_resonance.simulation.sensor.experiments import repeated_records
 
     u, y, harmonics, rate_hz = repeated_records(progress=_progress)

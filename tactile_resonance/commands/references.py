@@ -106,7 +106,7 @@ def _add_runs(parser: argparse.ArgumentParser) -> None:
 
 def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.report.references_figure import draw_references
+    from tactile_resonance.report.tissue_figures import draw_references
     from tactile_resonance.scan.labels import nominal_of, read_nominal, reference_points
     from tactile_resonance.tissue.references import library_text
     from tactile_resonance.tissue.spread import spreads_of
@@ -164,7 +164,7 @@ def _build(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     from tactile_resonance.report.drawing import new_figure, save_figure
-    from tactile_resonance.report.references_figure import draw_reliability
+    from tactile_resonance.report.tissue_figures import draw_reliability
     from tactile_resonance.scan.labels import read_nominal, reference_points
     from tactile_resonance.tissue.references import read_classes
     from tactile_resonance.tissue.trial import call_points, reliability
@@ -190,7 +190,7 @@ def _variance(options: argparse.Namespace) -> int:
 
     from tactile_resonance.frf.variance_analysis import analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.report.variance_figure import draw_variance
+    from tactile_resonance.report.frf_figures import draw_variance
     from tactile_resonance.scan.labels import labelled_frfs
     from tactile_resonance.scan.reidentify import scene_band
 

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.calibration.calibration import Calibration
+from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import poles_from_message

@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.fit import Fitted, calibrate
-from tactile_resonance.calibration.model import SensorModel
+from tactile_resonance.calibration.model import Calibration, SensorModel
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects
 from tactile_resonance.simulation.sensor.bench import SimulatedBench

@@ -8,9 +8,9 @@ import pytest
 from calibration.played import SKEW_S
 
 from benchmarks.calibrate_benches import BAND_HZ, excitation
-from tactile_resonance.calibration.calibration import Calibration
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.frf_poles import calibrated_poles
+from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.result import PolesStatus
